@@ -1150,7 +1150,7 @@ class TestProgram:
     def test_everything_that_prints_has_json(self) -> None:
         assert len(COMMANDS) > 20
         for command in sorted(
-            {*COMMANDS} - {"view", "replay", "serve", "help", "version"}
+            {*COMMANDS} - {"view", "replay", "browse", "serve", "help", "version"}
         ):  # which show something
             assert "--json" in ok(command, "--help")
 

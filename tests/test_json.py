@@ -28,7 +28,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "json.md").read_text()
-WITHOUT_JSON = {"view", "serve", "help", "version"}
+WITHOUT_JSON = {"view", "browse", "serve", "help", "version"}
 
 
 def tables(page: str) -> dict[str, tuple[bool, dict[str, str]]]:

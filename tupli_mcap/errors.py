@@ -10,7 +10,7 @@ import difflib
 import errno
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 __all__ = [
     "FilterError",
@@ -83,7 +83,18 @@ class NotFoundError(StorageError, KeyError):
 
 
 class FilterError(TupliError, ValueError):
-    """A filter that has no meaning: an unknown key, a value that cannot be compared, bad syntax."""
+    """A filter that has no meaning: an unknown key, a value that cannot be compared, bad syntax.
+
+    Attributes:
+        position: the character (from 0) of the filter's text where that is; None where it has no text.
+    """
+
+    position: int | None = None
+
+    def at(self, position: int) -> Self:
+        """The same error, which says where it is."""
+        self.position = position
+        return self
 
 
 class UntrustedError(TupliError):

@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
-from tupli_mcap.cli.share import account, bundle, exchange, serve, trust
+from tupli_mcap.cli.share import account, browse, bundle, exchange, serve, trust
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -229,6 +229,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "info": info.info,
         "episodes": lists.episodes,
         "view": replay.replay,
+        "browse": browse.browse,
         "plot": render.plot,
         "render": render.render,
     },
@@ -301,6 +302,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "episodes lab/ --limit 20 --json",
     ),
     "view": ("view run.mcap", "view run.mcap --episodes best,worst --compare", "view lab/ --web"),
+    "browse": ("browse runs/", "browse run.mcap", "browse lab/ --port 8000 --no-open"),
     "plot": ("plot run.mcap -o report.html", "plot runs/ --x steps -o compared.pdf"),
     "render": ("render run.mcap -o best.mp4", "render run.mcap -o first.gif --episodes first --rerun"),
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning", "doctor run.mcap --episodes best,worst"),

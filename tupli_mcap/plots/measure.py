@@ -21,7 +21,7 @@ from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["INFO", "METADATA", "SUCCESS", "Measured", "Trace", "measure", "trace"]
+__all__ = ["INFO", "METADATA", "SUCCESS", "Measured", "Trace", "measure", "numbers_in", "thinned", "trace"]
 
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
@@ -151,14 +151,14 @@ def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array
         if texts[position] == "{}":
             continue
         said = jsonvalue.loads(texts[position])
-        found = {SUCCESS: success_of(said), **{METADATA + key: value for key, value in _numeric(said)}}
+        found = {SUCCESS: success_of(said), **{METADATA + key: value for key, value in numbers_in(said)}}
         for key, value in found.items():
             if value is not None and (key in numbers or len(numbers) < _MOST_KEYS):
                 numbers.setdefault(key, np.full(len(positions), np.nan))[at] = float(value)
     return numbers
 
 
-def _numeric(said: Any) -> Iterator[tuple[str, float]]:
+def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
     """The entries of an info or of metadata that are numbers, but for those that say success."""
     for key, value in said.items() if isinstance(said, Mapping) else ():
         if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
@@ -190,7 +190,7 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
         for body in file.store.bodies(number, first, each):
             episode, _, info = decoder.decode(body)
-            for key, value in _numeric(info) if episode in at else ():
+            for key, value in numbers_in(info) if episode in at else ():
                 if INFO + key in sums or len(sums) < _MOST_KEYS:
                     sums.setdefault(INFO + key, np.zeros((2, len(at))))[:, at[episode]] += value, 1
     measured.info_steps, measured.read_infos = channel.messages, each * places
@@ -247,25 +247,25 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     rewards = np.concatenate([columns[leaf.leaf.name] for leaf in measured.rewards], axis=1)
     totals = drawable_numbers(rewards.astype(np.float64).sum(axis=1).cumsum())
     values = {
-        leaf.leaf.name: _thinned(drawable_numbers(columns[leaf.leaf.name][:, leaf.elements]), width)
+        leaf.leaf.name: thinned(drawable_numbers(columns[leaf.leaf.name][:, leaf.elements]), width)
         for leaf in measured.leaves
         if len(leaf.elements)
     }
     infos: dict[str, Array] = {}
     if measured.info_steps and measured.read_infos == measured.info_steps:
         for step, info in enumerate(recording.infos(position) or ()):
-            for key, value in _numeric(info):
+            for key, value in numbers_in(info):
                 infos.setdefault(INFO + key, np.full(length, np.nan))[step] = value
     return Trace(
         int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
-        recording.episode_start(position).seed_number, width, _thinned(np.arange(steps)[:, None], width)[:, 0],
-        values, {key: _thinned(column[:steps, None], width)[:, 0] for key, column in infos.items()},
-        _thinned(totals[:, None], width)[:, 0],
+        recording.episode_start(position).seed_number, width, thinned(np.arange(steps)[:, None], width)[:, 0],
+        values, {key: thinned(column[:steps, None], width)[:, 0] for key, column in infos.items()},
+        thinned(totals[:, None], width)[:, 0],
         [_pictures(recording, position, length, leaf.leaf) for leaf in measured.leaves if leaf.kind == "picture"],
     )  # fmt: skip
 
 
-def _thinned(values: Array, width: int) -> Array:
+def thinned(values: Array, width: int) -> Array:
     """(steps, elements) to (points, elements): the smallest and the largest of every `width` steps; NaN is neither."""
     if width == 1:
         return values

@@ -16,7 +16,7 @@ from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.replay.movie import check_movie, write_movie
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["film", "has_pictures"]
+__all__ = ["as_picture", "film", "has_pictures"]
 
 _KINDS = (".mp4", ".gif")
 _FPS = 30.0
@@ -96,10 +96,10 @@ def _of_states(episode: Episode, leaf: Leaf) -> Iterator[Picture]:
     for first in range(0, len(episode), _BLOCK):
         values = leaf.get(episode[first : first + _BLOCK].states)
         for value in values:
-            yield _as_picture(value, leaf)
+            yield as_picture(value, leaf)
 
 
-def _as_picture(value: Array, leaf: Leaf) -> Picture:
+def as_picture(value: Array, leaf: Leaf) -> Picture:
     """An image, or the newest frame of a stack, as height x width x 3."""
     if leaf.kind == "stack":
         value = value[..., -1] if leaf.frames_last else value[-1]

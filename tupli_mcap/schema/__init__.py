@@ -32,7 +32,7 @@ from tupli_mcap.schema.models import (
     EpisodeMetadataCallback,
     RLTuple,
 )
-from tupli_mcap.schema.parse import format_filter, parse_filter
+from tupli_mcap.schema.parse import format_filter, parse_bound, parse_filter
 from tupli_mcap.schema.people import (
     RIGHT,
     ApiToken,
@@ -91,6 +91,7 @@ __all__ = [
     "filter_keys",
     "format_filter",
     "join_key",
+    "parse_bound",
     "parse_filter",
     "split_key",
 ]

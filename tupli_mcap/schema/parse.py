@@ -22,10 +22,13 @@ import ast
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from pydantic import BaseModel
+
 from tupli_mcap.errors import FilterError
+from tupli_mcap.schema.facts import bound, comparisons
 from tupli_mcap.schema.filters import (
     BaseFilter,
     FilterAND,
@@ -137,6 +140,25 @@ def parse_filter(text: str) -> BaseFilter:
     return _filter(ast.parse(python, "<filter>", "eval").body, tokens)
 
 
+def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+    """The filter that a text describes, `bound` to items of a model, or with these fields.
+
+    Raises:
+        FilterError: as `parse_filter` and `bound`; it has the position, also of a key that there is not.
+    """
+    parsed = parse_filter(text)
+    try:
+        return bound(parsed, fields)
+    except FilterError as err:
+        keys = (token.position for token in _checked_tokens(text) if token.kind == "key")
+        for position, comparison in zip(keys, comparisons(parsed), strict=True):
+            try:
+                bound(comparison, fields)
+            except FilterError:
+                raise err.at(position) from None
+        raise
+
+
 def format_filter(filter: BaseFilter) -> str:
     """The text that `parse_filter` makes this filter of.
 
@@ -152,7 +174,8 @@ def _checked_tokens(text: str) -> list[_Token]:
     expected, parentheses, negations = "key", 0, 0
     for token in _tokens(text):
         if parentheses + negations > _MAX_PARENTHESES:
-            raise FilterError(f"filter nests deeper than {_MAX_PARENTHESES} at character {token.position}")
+            deep = f"filter nests deeper than {_MAX_PARENTHESES} at character {token.position}"
+            raise FilterError(deep).at(token.position)
         if token.kind not in _NEXT[expected] or token.kind == (")", "end")[parentheses > 0]:
             if expected in ("value", "item") and token.kind in ("key", "unknown"):
                 raise _unquoted(text, token)
@@ -219,7 +242,8 @@ def _filter(node: ast.expr, tokens: Sequence[_Token]) -> BaseFilter:
             return FilterNOT(filters=[chosen]) if sign.kind == "not" else chosen
         return _COMPARISON[sign.text](key=key.text, value=tokens[first + 2].value)
     except FilterError as err:
-        raise FilterError(f"{err} (at character {key.position} of the filter)") from err
+        where = f"{err} (at character {key.position} of the filter)"
+        raise FilterError(where).at(key.position) from err
 
 
 def _unquoted(text: str, token: _Token) -> FilterError:
@@ -231,12 +255,13 @@ def _unquoted(text: str, token: _Token) -> FilterError:
     before, after = text[: token.position], text[token.position + len(unquoted) :]
     right = f"{before}{json.dumps(unquoted, ensure_ascii=False)}{after}"
     error = _error(text, _A_VALUE, token._replace(text=unquoted))
-    return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}")
+    return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}").at(token.position)
 
 
 def _error(text: str, expected: str, token: _Token) -> FilterError:
     found = "the end" if token.kind == "end" else repr(token.text[:40])
-    return FilterError(f"filter {text!r:.200} needs {expected} at character {token.position}, found {found}")
+    needs = f"filter {text!r:.200} needs {expected} at character {token.position}, found {found}"
+    return FilterError(needs).at(token.position)
 
 
 def _format(filter: BaseFilter, outer: bool) -> str:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from sqlalchemy import Connection
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording, write_recording
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
 __all__ = ["FileStorage"]
+
+_T = TypeVar("_T")
 
 
 class _Settings(BaseModel):
@@ -258,6 +261,15 @@ class FileStorage(TupliStorage):
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
         return self._recordings.count(filter)
 
+    def ask(self, question: Callable[[Connection], _T]) -> _T:
+        """What a question, such as those of `catalog.queries`, finds in the catalog, which is up to date."""
+        return self._recordings.ask(question)
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """The recordings that the last query left out, and why: damaged ones, and copies of others."""
+        return self._recordings.skipped
+
     def explain(self, filter: BaseFilter | None) -> str:
         """The SQL that a filter over episodes becomes, and SQLite's plan for it."""
         return self._recordings.explain(filter)
@@ -294,6 +306,14 @@ class FileStorage(TupliStorage):
 
     def ingest(self, path: Path) -> None:
         self._recordings.ingest(path)
+
+    def recording_path(self, recording: str) -> Path:
+        """The file of a recording that a header names.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+        return self._recordings.path(recording)
 
     def open_recording(self, recording: str) -> Recording:
         path = self._recordings.path(recording)

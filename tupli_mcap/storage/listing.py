@@ -24,6 +24,7 @@ from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
 __all__ = [
+    "LIVE",
     "Compactable",
     "FoundRecording",
     "ListedRecording",
@@ -55,6 +56,10 @@ class RecordingStamp(NamedTuple):
     size: int
     mtime_ns: int
     mixed: int
+
+
+LIVE = -1
+"""In place of `RecordingStamp.mixed` where somebody writes to the recording: the stamp must not be believed again."""
 
 
 class FoundRecording(NamedTuple):

@@ -14,6 +14,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
+from sqlalchemy import Connection
+
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
@@ -32,12 +34,11 @@ from tupli_mcap.storage.catalog.catalog import (
 )
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
 from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
-from tupli_mcap.storage.listing import scan, stamp_of
+from tupli_mcap.storage.listing import LIVE, scan, stamp_of
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles", "episode_id"]
 
-_LIVE = -1  # in place of a stamp that must not be believed next time
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
 _RESTLESS = f"the catalog of {{!r}} was replaced during each of {_ATTEMPTS} attempts; try again later"
 _TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
@@ -62,6 +63,8 @@ class RecordingFiles:
         self._synced = -1  # the catalog that has been brought up to date
         self._undeclared = True  # its keys are still to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
+        self.skipped: dict[str, str] = {}
+        """Recordings that are not listed, and why, as of the last query."""
 
     def close(self) -> None:
         if self._opened is not None:
@@ -86,6 +89,10 @@ class RecordingFiles:
 
     def count(self, filter: BaseFilter | None) -> int:
         return self._settled(lambda: self._catalog.count(filter))
+
+    def ask(self, question: Callable[[Connection], _T]) -> _T:
+        """What a question finds in the tables of the catalog, which is up to date."""
+        return self._settled(lambda: self._catalog.ask(question))
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
         """Asks a catalog that is up to date, again if somebody has replaced it meanwhile."""
@@ -264,6 +271,7 @@ class RecordingFiles:
 
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
+        self.skipped = {}  # they are no part of the catalog, and so are met again
         if not self._changes():
             self._declare_keys()
             return True
@@ -325,19 +333,20 @@ class RecordingFiles:
             if _is_exhausted(err):
                 raise StorageError(f"cannot list the recordings below {str(self._root)!r}: {err}") from err
             self._catalog.remove_recording(relative)
-            self._warn_once(relative, stamp, f"skipped a recording: {err}")
+            self._skip(relative, stamp, str(err))
 
-    def _warn_once(self, relative: str, stamp: RecordingStamp, message: str) -> None:
+    def _skip(self, relative: str, stamp: RecordingStamp, why: str) -> None:
+        self.skipped[relative] = why
         if (relative, stamp) not in self._warned:
             self._warned.add((relative, stamp))
-            warnings.warn(message, stacklevel=6)
+            warnings.warn(f"skipped a recording: {why}", stacklevel=6)
 
     def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
         if not self._is_copy(relative, entry):
             self._catalog.put_recording(
                 relative,
-                entry.stamp._replace(mixed=_LIVE) if entry.live else entry.stamp,
+                entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
                 uuid=entry.uuid,
                 benchmark_id=entry.benchmark_id,
                 runs=entry.runs,
@@ -355,9 +364,7 @@ class RecordingFiles:
                     self._catalog.remove_recording(relative)
                     path, original = self._root / relative, f"holds episodes of {header.recording} again"
                     advice = "that one is listed, whatever they hold; verify both, and delete one"
-                    self._warn_once(
-                        relative, entry.stamp, f"skipped a recording: {path} {original}; {advice}"
-                    )
+                    self._skip(relative, entry.stamp, f"{path} {original}; {advice}")
                     return True
         return False
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import weakref
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from sqlalchemy import Connection, select
 
@@ -36,6 +36,7 @@ __all__ = [
 ]
 
 _ROWS_AT_ONCE: Final = 20_000
+_T = TypeVar("_T")
 
 
 class Catalog:
@@ -161,6 +162,11 @@ class Catalog:
         """How many episodes a filter is true of. Raises as `episodes` does."""
         with self._read() as connection:
             return queries.count_episodes(connection, filter)
+
+    def ask(self, question: Callable[[Connection], _T]) -> _T:
+        """What a question, such as those of `queries`, finds in one transaction."""
+        with self._read() as connection:
+            return question(connection)
 
     def explain(self, filter: BaseFilter | None) -> str:
         """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""

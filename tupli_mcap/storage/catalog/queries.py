@@ -280,8 +280,9 @@ def _add_recording(
 
 
 def _environment(runs: str) -> str:
-    """The environment that the first of some runs names."""
-    named = jsonvalue.loads(runs)[0].get("environment", "")
+    """The environment that the first of some runs names; a recording without episodes has none."""
+    first: dict[str, Any] = next(iter(jsonvalue.loads(runs)), {})
+    named = first.get("environment", "")
     return named if isinstance(named, str) else ""
 
 

@@ -1,0 +1,312 @@
+"""The page: datasets, tables and episodes as HTML and JSON, and nothing of a file that acts."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import httpx
+import numpy as np
+import pytest
+from pages import EVIL, browsing, carts, robot, serving_app
+
+import tupli_mcap
+from tupli_mcap.jsonvalue import dumps_plain
+from tupli_mcap.page.app import create_app
+from tupli_mcap.page.directory import FileShelf
+from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.catalog.catalog import EpisodeRow, RecordingStamp
+
+ACTING = re.compile("<script>|<img src=x", re.IGNORECASE)
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("lab")
+    carts(root)
+    robot(root / "robot.mcap")
+    return root
+
+
+@pytest.fixture(scope="module")
+def web(lab: Path) -> Iterator[httpx.Client]:
+    with browsing(lab) as address, httpx.Client(base_url=address) as client:
+        yield client
+
+
+def told(client: httpx.Client, address: str, **params: Any) -> Any:
+    answer = client.get(address, params={**params, "format": "json"})
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/json"
+    return answer.json()
+
+
+def addresses(client: httpx.Client) -> list[str]:
+    """A page of each kind."""
+    episodes = told(client, "/episodes")["episodes"]
+    keys = [dataset["key"] for dataset in told(client, "/")["datasets"]]
+    ids = {episode["recording"]: episode["id"] for episode in episodes}.values()
+    return [
+        "/",
+        "/?q=cart",
+        "/episodes",
+        "/episodes?filter=steps+%3E",
+        *(f"/episodes?dataset={key}&sort=-return" for key in keys),
+        *(f"/dataset/{key}" for key in keys),
+        *(f"/episode/{uri}?step=3" for uri in ids),
+        "/episode/nope",
+        "/nowhere",
+    ]
+
+
+class TestDatasets:
+    def test_they_are_put_together_by_environment(self, web: httpx.Client, lab: Path) -> None:
+        found = {dataset["name"]: dataset for dataset in told(web, "/")["datasets"]}
+        assert set(found) == {"CartPole-v1", "recordings"}
+        carts = tupli_mcap.open(str(lab / "ppo*.mcap"))
+        told_of = found["CartPole-v1"]
+        assert (told_of["recordings"], told_of["episodes"], told_of["steps"]) == (2, 24, carts.n_steps)
+        assert told_of["return"]["mean"] == pytest.approx(carts.returns.mean())
+        assert told_of["return"]["max"] == carts.returns.max()
+        assert found["recordings"]["success"] == 0.5
+
+    def test_search(self, web: httpx.Client) -> None:
+        assert [d["name"] for d in told(web, "/", q="CART baseline")["datasets"]] == ["CartPole-v1"]
+        assert told(web, "/", q="hopper")["datasets"] == []
+        assert "No dataset holds" in web.get("/?q=hopper").text
+
+    def test_a_dataset_opens_with_an_episode(self, web: httpx.Client) -> None:
+        facts = told(web, "/dataset/CartPole-v1", show="best")
+        best = told(web, "/episodes", dataset="CartPole-v1", sort="-return")["episodes"][0]
+        assert facts["episode"] == best["id"]
+        text = web.get("/dataset/CartPole-v1?show=best").text
+        assert f'data-episode="{best["id"]}"' in text
+        for said in ("Cart Position", "Pole Angle", "ppo-seed1", "Return of episodes over time", "gymnasium"):
+            assert said in text
+
+    def test_benchmarks_are_datasets(self, tmp_path: Path) -> None:
+        storage = FileStorage(tmp_path)
+        env = tupli_mcap.TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage)
+        uri = env.store(name="balance", description="a pole on a cart")
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            (empty,) = told(client, "/")["datasets"]
+            assert (empty["key"], empty["name"], empty["episodes"]) == (uri, "balance", 0)
+            assert "a pole on a cart" in client.get(f"/dataset/{uri}").text
+            env.reset(seed=1)
+            env.step(0)
+            env.close()
+            (dataset,) = told(client, "/")["datasets"]  # what is new is there when the page is reloaded
+            assert (dataset["episodes"], dataset["environment"]) == (1, "CartPole-v1")
+
+    @pytest.mark.parametrize("benchmark_id", ["", "no hash"])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "ALE/Breakout-v5",
+            "..",
+            "a b",
+            "x/../../y",
+            "über",
+            "\ud800\x00",
+            "",
+            "f" * 64,
+            "~",
+            "~eAA",
+            "a" * 999,
+        ],
+    )
+    def test_any_name_has_an_address(self, name: str, benchmark_id: str) -> None:
+        shelf = FileShelf(Path("gone.mcap"))
+        shelf._follow = lambda: None  # type: ignore[method-assign]
+        runs = dumps_plain([{"environment": name}])
+        row = EpisodeRow(0, 0, 1, "terminal", 1.0, 7, 1, "me", '["me"]', "{}")
+        stamp = RecordingStamp(1, 2, 3)
+        shelf._catalog.put_recording(
+            "gone.mcap", stamp, uuid="u", benchmark_id=benchmark_id, rows=[row], runs=runs
+        )
+        with serving_app(create_app(shelf)) as address, httpx.Client(base_url=address) as client:
+            (link,) = set(re.findall(r'href="(/dataset/[^"]*)"', client.get("/").text))
+            answer = client.get(html.unescape(link))
+            assert answer.status_code == 200
+            assert "This episode cannot be read" in answer.text
+
+
+class TestTables:
+    def test_pages_and_order(self, web: httpx.Client) -> None:
+        first = told(web, "/episodes", sort="-return")
+        returns = [episode["episode_return"] for episode in first["episodes"]]
+        assert returns == sorted(returns, reverse=True)
+        assert first["count"] == 26
+        assert (first["before"], first["after"]) == (None, None)
+
+    def test_paging_forth_and_back(self, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=120)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            pages, page = [], told(client, "/episodes", sort="steps")
+            pages.append(page)
+            while page["after"]:
+                page = told(client, "/episodes", sort="steps", after=page["after"])
+                pages.append(page)
+            assert [len(page["episodes"]) for page in pages] == [50, 50, 20]
+            back = [pages[-1]]
+            while back[-1]["before"]:
+                back.append(told(client, "/episodes", sort="steps", before=back[-1]["before"]))
+            ids = [[episode["id"] for episode in page["episodes"]] for page in pages]
+            assert [[episode["id"] for episode in page["episodes"]] for page in back] == ids[::-1]
+
+    def test_filters(self, web: httpx.Client) -> None:
+        found = told(web, "/episodes", filter='run.name == "ppo-seed1" and steps > 20')["episodes"]
+        assert found
+        assert all(e["run"]["name"] == "ppo-seed1" and e["n_tuples"] > 20 for e in found)
+
+    @pytest.mark.parametrize(
+        ("text", "position", "said"),
+        [
+            ("steps >", 7, "needs a value"),
+            ("steps > 3 and retrun < 4", 14, "did you mean &#39;return&#39;"),
+            ("end == 'lost'", 0, "terminal, timeout or interrupted"),
+            ("a b", 2, "needs one of"),
+        ],
+    )
+    def test_an_error_is_shown_where_it_is(
+        self, web: httpx.Client, text: str, position: int, said: str
+    ) -> None:
+        answer = web.get("/episodes", params={"filter": text, "format": "json"})
+        assert (answer.status_code, answer.json()["position"]) == (400, position)
+        shown = web.get("/episodes", params={"filter": text}).text
+        marked = re.search(r"<pre>(.*)<mark>(.*)</mark></pre>", shown)
+        assert marked and html.unescape(marked[1]) == text[:position]
+        assert said in shown
+        assert 'aria-invalid="true"' in shown
+
+    def test_a_key_that_has_no_order(self, web: httpx.Client) -> None:
+        assert "cannot sort by" in web.get("/episodes?sort=run.name").text
+
+
+class TestEpisodes:
+    def test_what_is_known_of_it(self, web: httpx.Client, lab: Path) -> None:
+        with tupli_mcap.Recording(lab / "robot.mcap") as recording:
+            episode = recording.episodes[1]
+            facts = told(web, f"/episode/{episode.id}", step=7)
+            assert facts["reset"]["seed"] == 1
+            assert facts["cameras"] == [{"name": "wrist", "steps": list(range(20))}]
+            assert facts["step"]["state"]["joints[0]"] == f"{episode.states['joints'][7, 0]:.6g}"
+            assert facts["step"]["state"]["open the drawer"] == "open the drawer"
+            assert facts["step"]["action"]["action"] == "open the drawer (1)"
+            assert facts["step"]["info"] == {"force": "3.5", "said": "open the drawer"}
+            assert facts["step"]["reward"] == {"reward": "0.7", "return so far": "2.8"}
+
+    def test_values_of_a_step(self, web: httpx.Client) -> None:
+        uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
+        last = web.get(f"/episode/{uri}/step/19").json()
+        assert last["end"] == {"end": "terminal"}
+        assert web.get(f"/episode/{uri}/step/20").status_code == 404
+
+    def test_pictures(self, web: httpx.Client) -> None:
+        uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
+        picture = web.get(f"/episode/{uri}/picture/0/3")
+        assert picture.headers["content-type"] == "image/png"
+        assert picture.content.startswith(b"\x89PNG")
+        assert web.get(f"/episode/{uri}/picture/0/20").status_code == 404
+        assert web.get(f"/episode/{uri}/picture/1/0").status_code == 404
+
+    def test_neighbours(self, web: httpx.Client) -> None:
+        listed = told(web, "/episodes", dataset="CartPole-v1", sort="-return")["episodes"]
+        context = {"dataset": "CartPole-v1", "sort": "-return"}
+        for at in (0, 5, len(listed) - 1):
+            facts = told(web, f"/episode/{listed[at]['id']}", **context)
+            assert facts["before"] == (listed[at - 1]["id"] if at else None)
+            assert facts["after"] == (listed[at + 1]["id"] if at + 1 < len(listed) else None)
+        own = told(web, f"/episode/{listed[0]['id']}")
+        for uri in filter(None, (own["before"], own["after"])):
+            assert uri.startswith(listed[0]["id"].partition("-")[0])
+
+    def test_covers(self, web: httpx.Client) -> None:
+        assert web.get("/cover/-").headers["content-type"] == "image/png"
+        drawn = web.get("/cover/CartPole-v1")
+        assert drawn.headers["content-type"] == "image/svg+xml"
+        assert "default-src 'none'" in drawn.headers["content-security-policy"]
+
+
+class TestOneFile:
+    def test_it_is_shown_alone(self, lab: Path) -> None:
+        with browsing(lab / "ppo1.mcap") as address, httpx.Client(base_url=address) as client:
+            assert told(client, "/")["datasets"][0]["recordings"] == 1
+            assert told(client, "/episodes")["count"] == 12
+            assert "ppo1.mcap" in client.get("/").text
+
+    def test_what_is_being_recorded(self, tmp_path: Path) -> None:
+        path = tmp_path / "live.mcap"
+        box = gym.spaces.Box(-1, 1, (1,), np.float32)
+        zero = np.zeros(1, np.float32)
+        with tupli_mcap.EpisodeWriter(path, box, box) as writer, browsing(tmp_path) as below:
+            with (
+                browsing(path) as alone,
+                httpx.Client(base_url=below) as a,
+                httpx.Client(base_url=alone) as b,
+            ):
+                for ended in range(3):
+                    for client in (a, b):
+                        datasets = told(client, "/")["datasets"]
+                        assert [d["episodes"] for d in datasets] == ([ended] if ended else [])
+                    writer.begin()
+                    writer.step(zero, zero, reward=1.0, terminal=True)
+                    writer.end(zero)
+                assert '<span class="live">recording</span>' in a.get("/").text
+                writer.begin()
+                writer.step(zero, zero, reward=1.0)
+        assert not (tmp_path / "catalog.sqlite").exists()
+
+    def test_looking_writes_nothing(self, lab: Path) -> None:
+        assert sorted(path.name for path in lab.iterdir()) == ["ppo0.mcap", "ppo1.mcap", "robot.mcap"]
+
+    def test_a_damaged_file_is_said(self, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=1)
+        (tmp_path / "bad.mcap").write_bytes(b"no recording <b>at all</b>")
+        with browsing(tmp_path) as address, pytest.warns(UserWarning, match="skipped a recording"):
+            with httpx.Client(base_url=address) as client:
+                text = client.get("/").text
+                assert "1 file cannot be shown" in text
+                assert "bad.mcap" in told(client, "/")["skipped"]
+                (tmp_path / "bad.mcap").unlink()
+                assert told(client, "/")["skipped"] == {}
+
+
+class TestNothingActs:
+    @pytest.fixture(scope="class")
+    def evil(self, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+        root = tmp_path_factory.mktemp("evil")
+        robot(root / "<b>evil<b>.mcap", text=EVIL)
+        carts(root, seeds=1, episodes=1)
+        with browsing(root) as address, httpx.Client(base_url=address) as client:
+            yield client
+
+    def test_texts_of_files_are_texts(self, evil: httpx.Client) -> None:
+        seen = 0
+        for address in addresses(evil):
+            answer = evil.get(address)
+            assert answer.headers["content-type"].startswith("text/html"), address
+            assert not ACTING.search(answer.text), address
+            seen += EVIL in html.unescape(answer.text)
+        assert seen >= 4
+
+    def test_headers_of_every_page(self, evil: httpx.Client) -> None:
+        for address in addresses(evil):
+            headers = evil.get(address).headers
+            policy = headers["content-security-policy"]
+            assert "default-src 'self'" in policy and "unsafe" not in policy
+            assert "frame-ancestors 'none'" in policy
+            assert headers["x-content-type-options"] == "nosniff"
+
+    def test_addresses_of_other_hosts_are_refused(self, evil: httpx.Client) -> None:
+        for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example"):
+            assert evil.get("/", headers={"Host": host}).status_code == 400
+        assert evil.get("/", headers={"Host": "localhost:1234"}).status_code == 200
+
+    def test_nothing_can_be_changed(self, evil: httpx.Client) -> None:
+        for method in ("POST", "PUT", "DELETE", "PATCH"):
+            assert evil.request(method, "/episodes").status_code == 405

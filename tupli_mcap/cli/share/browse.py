@@ -1,0 +1,38 @@
+"""The command that shows recordings in a browser: browse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tupli_mcap.cli.terminal import flush, say
+from tupli_mcap.errors import missing_extra
+
+__all__ = ["browse"]
+
+
+def browse(
+    path: Annotated[
+        Path, typer.Argument(metavar="[PATH]", help="A directory, a storage, or a recording.")
+    ] = Path(),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="By default, one that is free.")] = 0,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only print the address.")] = False,
+) -> None:
+    """Look through recordings in a browser.
+
+    Datasets, tables of episodes, films and curves. The page is served on 127.0.0.1 until Ctrl-C. It changes nothing,
+    asks no other server for anything, and shows what is new when it is reloaded, also what is being recorded. Every
+    page is JSON too, with ?format=json.
+    """
+    try:
+        from tupli_mcap.page.app import browse as serve
+    except ImportError as err:
+        raise missing_extra("`tupli-mcap browse` needs FastAPI, Jinja2 and uvicorn", "browse") from err
+
+    def tell(address: str) -> None:
+        say(f"{path} at {address} (Ctrl-C ends it)")
+        flush()
+
+    serve(path, port, tell, show=not no_open)

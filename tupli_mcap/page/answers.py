@@ -1,0 +1,141 @@
+"""What a browser is sent: pages as HTML or JSON, errors too, and the headers that keep what is in files from acting."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Annotated, Any, Final
+from urllib.parse import quote, urlencode
+
+from fastapi import Depends, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from starlette.exceptions import HTTPException
+
+import tupli_mcap
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FilterError, MissingExtraError, NotFoundError, TupliError
+from tupli_mcap.page import texts
+from tupli_mcap.page.shelf import Shelf
+from tupli_mcap.schema import FilterEQ, format_filter, join_key
+
+__all__ = ["PageRoute", "Shown", "address", "error_page", "page"]
+
+_POLICY: Final = (
+    "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
+_HEADERS: Final = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "private, no-cache",
+}
+
+
+def _shelf(request: Request) -> Shelf:
+    shelf: Shelf = request.app.state.shelf_of(request)
+    return shelf
+
+
+Shown = Annotated[Shelf, Depends(_shelf)]
+"""The shelf, as who asks may see it."""
+
+
+class PageRoute(APIRoute):
+    """A route whose errors are pages, and whose answers have the headers of pages."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        answered = super().get_route_handler()
+
+        async def handler(request: Request) -> Response:
+            try:
+                return _with_headers(await answered(request))
+            except (TupliError, RequestValidationError, HTTPException) as err:
+                return error_page(request, err)
+
+        return handler
+
+
+def _with_headers(response: Response) -> Response:
+    for name, value in _HEADERS.items():
+        response.headers.setdefault(name, value)
+    return response
+
+
+def page(
+    request: Request,
+    template: str,
+    facts: Mapping[str, Any],
+    *,
+    status: int = 200,
+    shelf: Shelf | None = None,
+    **drawn: Any,
+) -> Response:
+    """A page: its facts as JSON where `?format=json` asks for it, else a template made of them and of what is drawn."""
+    if request.query_params.get("format") == "json":
+        return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
+    made = (
+        _templates()
+        .get_template(template)
+        .render(
+            request=request,
+            shelf=shelf,
+            facts=facts,
+            here=request.url.path,
+            params=request.query_params,
+            **drawn,
+        )
+    )
+    # A text of a file may hold what UTF-8 does not.
+    return Response(made.encode("utf-8", "replace"), status, media_type="text/html")
+
+
+def address(*path: object, **params: Any) -> str:
+    """The address of a page; parameters that are None or empty are left out."""
+    given = {key: value for key, value in params.items() if value not in (None, "", [], False)}
+    parts = (
+        quote(str(part), safe="@:+/" if i else "", errors="surrogatepass") for i, part in enumerate(path)
+    )
+    query = urlencode(given, doseq=True, errors="surrogatepass")
+    return "/" + "/".join(parts) + (f"?{query}" if query else "")
+
+
+@functools.cache
+def _templates() -> Environment:
+    made = Environment(
+        loader=PackageLoader("tupli_mcap.page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {name: getattr(texts, name) for name in texts.__all__}
+    made.globals |= {
+        "address": address,
+        "metadata_key": lambda key: join_key(["metadata", key]),
+        "recording_filter": lambda name: format_filter(FilterEQ(key="recording", value=name)),
+        "same_query": lambda params, **changes: urlencode({**params, **changes}, errors="surrogatepass"),
+        "version": tupli_mcap.__version__,
+    }
+    return made
+
+
+def error_page(request: Request, err: Exception) -> Response:
+    """What is said of an error."""
+    if isinstance(err, HTTPException):
+        status, text = err.status_code, str(err.detail)
+    elif isinstance(err, RequestValidationError):
+        first = err.errors()[0]
+        status, text = 400, f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"
+    else:
+        kinds = ((NotFoundError, 404), (FilterError, 400), (MissingExtraError, 501))
+        status, text = next((code for kind, code in kinds if isinstance(err, kind)), 500), str(err)
+    title = _TITLES.get(status, "This did not work")
+    return _with_headers(page(request, "error.html", {"error": text}, status=status, title=title))
+
+
+_TITLES: Final = {400: "This cannot be shown", 404: "Not here", 501: "Something is not installed"}

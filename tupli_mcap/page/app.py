@@ -1,0 +1,70 @@
+"""The page of a directory or a file on this machine, as an application of its own."""
+
+from __future__ import annotations
+
+import socket
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+from starlette.exceptions import HTTPException
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+from tupli_mcap.errors import StorageError, os_reason
+from tupli_mcap.page.answers import error_page
+from tupli_mcap.page.directory import shelf_of
+from tupli_mcap.page.routes import PAGES
+from tupli_mcap.page.shelf import Shelf
+
+__all__ = ["browse", "create_app"]
+
+_HOST = "127.0.0.1"
+
+
+def create_app(shelf: Shelf) -> FastAPI:
+    """The application that shows a shelf, to programs of this machine only."""
+    app = FastAPI(title="tupli-mcap", docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.shelf_of = lambda request: shelf
+    for router in PAGES:
+        app.include_router(router)
+    app.add_exception_handler(HTTPException, error_page)  # an address that there is not
+    # A page of somebody else, whose name is made to mean this machine, must not read what is shown.
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
+    return app
+
+
+def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) -> None:
+    """Shows a directory or a recording at an address of this machine, until Ctrl-C.
+
+    Args:
+        port: 0 takes one that is free.
+        tell: called with the address.
+        show: whether to open it in a browser.
+
+    Raises:
+        RecordingError: there is no such file.
+        StorageError: the port is taken.
+    """
+    app = create_app(shelf_of(path))
+    listening = _listen(port)
+    address = f"http://{_HOST}:{listening.getsockname()[1]}"
+    tell(address)
+    if show:
+        webbrowser.open(address)
+    config = uvicorn.Config(app, log_level="warning", server_header=False, timeout_graceful_shutdown=2)
+    uvicorn.Server(config).run([listening])
+
+
+def _listen(port: int) -> socket.socket:
+    listening = socket.socket()
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((_HOST, port))
+    except OSError as err:
+        raise StorageError(
+            f"port {port} cannot be used: {os_reason(err)}; choose another one (--port), or none"
+        ) from err
+    listening.listen(100)
+    return listening

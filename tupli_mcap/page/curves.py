@@ -1,0 +1,184 @@
+"""What is drawn of an episode: a track for each number of its states, actions, rewards and infos, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.messages.topics import INFO
+from tupli_mcap.page.texts import said
+from tupli_mcap.plots.measure import numbers_in, thinned
+from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording.blocks import step_bytes
+from tupli_mcap.spaces.element_names import short_path
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["Curves", "Track", "curves_of", "values_at"]
+
+SO_FAR: Final = "return so far"
+_POINTS: Final = 800  # of a track
+_READ_BYTES: Final = 64 << 20  # of the steps of an episode that are read at most
+_MOST_TRACKS: Final = 48  # of a leaf
+_MOST_INFOS: Final = 50_000  # of a recording, all of which have to be read for those of one episode
+_MOST_KEYS: Final = 24
+
+
+@dataclass(frozen=True)
+class Track:
+    """One number over the steps of an episode.
+
+    field: "state", "action", "reward" or "info". at, values: the steps and what is drawn there (float64; NaN: nothing).
+    names: of the values of a choice, from `start` on.
+    """
+
+    field: str
+    name: str
+    at: Array
+    values: Array
+    names: Sequence[str] = ()
+    start: int = 0
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The smallest and the largest value, NaN where there is none."""
+        known = self.values[np.isfinite(self.values)]
+        return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The tracks of an episode. read: how many of its steps they show. notes: what is left out; sentences."""
+
+    tracks: Sequence[Track]
+    read: int
+    notes: Sequence[str]
+
+    def of(self, field: str) -> list[Track]:
+        """The tracks of a field."""
+        return [track for track in self.tracks if track.field == field]
+
+
+def curves_of(episode: Episode) -> Curves:
+    """Reads an episode, or the beginning of a long one.
+
+    Raises:
+        FormatError: the recording is damaged.
+    """
+    recording, layout = episode.recording, episode.recording.layout
+    most = max(1, _READ_BYTES // step_bytes(layout, images=False))
+    read = min(len(episode), most)
+    columns = recording.read_steps(episode.position, 0, read, ("states", "actions", "rewards"), images=False)
+    tracks: list[Track] = []
+    notes: list[str] = []
+    for field, leaves, values in (
+        ("state", layout.state, columns.states),
+        ("action", layout.action, columns.actions),
+        ("reward", layout.reward, columns.rewards),
+    ):
+        for leaf in leaves:
+            if leaf.kind == "variable" or leaf.apart:  # a picture of its own, or no number
+                notes += [] if leaf.apart else LeafValues(leaf, recording.labels, None).notes()
+                continue
+            column = np.asarray(leaf.get(values)).reshape(read, leaf.size)
+            tracks += _tracks(field, leaf, recording.labels, column, notes)
+            if field == "reward" and leaf.size == 1:
+                so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
+                tracks.append(_track("reward", SO_FAR, np.arange(read, dtype=np.float64), so_far))
+    tracks += _info_tracks(recording, episode, read, notes)
+    if read < len(episode):
+        notes.append(f"Of its {len(episode):,} steps, the first {read:,} are shown.")
+    return Curves(tracks, read, notes)
+
+
+def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
+    """What there was at a step, as text by field and name: what has a track by the track's name, and all else.
+
+    Raises:
+        FormatError: the recording is damaged.
+    """
+    recording, layout = episode.recording, episode.recording.layout
+    columns = recording.read_steps(episode.position, step, step + 1, images=False)
+    told = {
+        "reward": _told(layout.reward, recording.labels, columns.rewards),
+        "action": _told(layout.action, recording.labels, columns.actions),
+        "state": _told(layout.state, recording.labels, columns.states),
+    }
+    if layout.reward[0].size == 1:
+        rewards = recording.read_steps(episode.position, 0, step + 1, ("rewards",)).rewards
+        told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.6g}"
+    if columns.terminals[0] or columns.timeouts[0]:
+        told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
+    if _few_infos(recording):
+        info = (episode.infos or [None] * len(episode))[step] or {}
+        told["info"] = {str(key): said(value) for key, value in info.items()}
+    return told
+
+
+def _told(leaves: Sequence[Leaf], labels: Labels, columns: Any) -> dict[str, str]:
+    told = {}
+    for leaf in leaves:
+        if leaf.kind == "variable":
+            told[short_path(leaf)] = said(leaf.get(columns)[0])
+        elif not leaf.apart:
+            values = LeafValues(leaf, labels, np.asarray(leaf.get(columns)).reshape(1, leaf.size))
+            for name, value in zip(values.names, values.values, strict=False):
+                told[name] = _value_text(value[0], values)
+    return told
+
+
+def _value_text(value: Any, of: LeafValues) -> str:
+    if of.counts and of.value_names:
+        place = int(value) - int(of.starts[0])
+        if 0 <= place < len(of.value_names):
+            return f"{of.value_names[place]} ({int(value)})"
+    return f"{value:.6g}" if isinstance(value, np.floating) else str(value)
+
+
+def _tracks(field: str, leaf: Leaf, labels: Labels, column: Array, notes: list[str]) -> Iterator[Track]:
+    values = LeafValues(leaf, labels, column)
+    if values.kind == "picture":
+        notes.append(
+            f"{short_path(leaf)} is a picture ({' x '.join(map(str, leaf.shape))}) and has no curves."
+        )
+        return
+    notes += values.notes()
+    if len(values.elements) > _MOST_TRACKS:
+        notes.append(f"Of {short_path(leaf)}, {_MOST_TRACKS} curves are shown.")
+    at = np.arange(column.shape[0], dtype=np.float64)
+    start = int(values.starts[0]) if values.counts and values.value_names else 0
+    for i, name in enumerate(values.names[:_MOST_TRACKS]):
+        yield _track(field, name, at, drawable_numbers(values.values[i]), values.value_names, start)
+
+
+def _track(
+    field: str, name: str, at: Array, values: Array, names: Sequence[str] = (), start: int = 0
+) -> Track:
+    width = 1 if len(at) <= _POINTS else -(-len(at) // (_POINTS // 2))
+    return Track(
+        field, name, thinned(at[:, None], width)[:, 0], thinned(values[:, None], width)[:, 0], names, start
+    )
+
+
+def _few_infos(recording: Recording) -> bool:
+    channel = recording.file.topics.get(INFO)
+    return channel is None or recording.file.store.count(channel) <= _MOST_INFOS
+
+
+def _info_tracks(recording: Recording, episode: Episode, read: int, notes: list[str]) -> Iterator[Track]:
+    if not _few_infos(recording):
+        notes.append(f"Infos of a recording that has more than {_MOST_INFOS:,} are not drawn.")
+        return
+    found: dict[str, Array] = {}
+    for step, info in enumerate((episode.infos or [])[:read]):
+        for key, value in numbers_in(info):
+            if key in found or len(found) < _MOST_KEYS:
+                found.setdefault(key, np.full(read, np.nan))[step] = value
+    at = np.arange(read, dtype=np.float64)
+    for key, values in found.items():
+        yield _track("info", key, at, values)

@@ -1,0 +1,231 @@
+"""Datasets: the recordings of a benchmark, or those without one that name the same environment."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+from sqlalchemy import ColumnElement, Connection, and_, select
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.page.shelf import Shelf
+from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader
+from tupli_mcap.schema.times import time_ns
+from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
+from tupli_mcap.storage.catalog.tallies import Tally, tallies
+from tupli_mcap.storage.listing import LIVE
+from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
+
+__all__ = ["Dataset", "all_datasets", "dataset_of", "find_dataset", "of_dataset", "of_recording"]
+
+_PLAIN: Final = re.compile(r"\w[\w.@:+ -]{0,100}(/\w[\w.@:+ -]{0,100}){0,3}", re.ASCII)
+_NAMELESS: Final = "-"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """What is known of a dataset without a look at its episodes.
+
+    key: what it is called in addresses. benchmark: None for recordings without one, or where it may not be read.
+    recordings: at least one, but for a benchmark that nothing was recorded of.
+    """
+
+    key: str
+    benchmark_id: str
+    environment: str
+    benchmark: BenchmarkHeader | None
+    recordings: Sequence[Tally]
+
+    @property
+    def name(self) -> str:
+        """The benchmark's name, else the environment's."""
+        named = self.benchmark.metadata.name if self.benchmark else ""
+        unnamed = f"benchmark {self.benchmark_id[:8]}" if self.benchmark_id else "recordings"
+        return named or self.environment or unnamed
+
+    @property
+    def description(self) -> str:
+        return self.benchmark.metadata.description if self.benchmark else ""
+
+    @property
+    def episodes(self) -> int:
+        return sum(item.episodes for item in self.recordings)
+
+    @property
+    def steps(self) -> int:
+        return sum(item.steps for item in self.recordings)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the files."""
+        return sum(item.size for item in self.recordings)
+
+    @property
+    def return_mean(self) -> float | None:
+        """Of the episodes whose return is a number."""
+        known = sum(item.returns for item in self.recordings)
+        return sum(item.return_sum or 0.0 for item in self.recordings) / known if known else None
+
+    @property
+    def return_least(self) -> float | None:
+        return min(
+            (item.return_least for item in self.recordings if item.return_least is not None), default=None
+        )
+
+    @property
+    def return_most(self) -> float | None:
+        return max(
+            (item.return_most for item in self.recordings if item.return_most is not None), default=None
+        )
+
+    @property
+    def success(self) -> tuple[int, int]:
+        """How many episodes succeeded, of how many that say it."""
+        return sum(item.succeeded for item in self.recordings), sum(item.told for item in self.recordings)
+
+    @property
+    def first(self) -> int:
+        """When its first episode ended (ns); of a benchmark without any, when it was stored."""
+        return min((item.first for item in self.recordings), default=self._stored)
+
+    @property
+    def last(self) -> int:
+        return max((item.last for item in self.recordings), default=self._stored)
+
+    @property
+    def _stored(self) -> int:
+        return (time_ns(self.benchmark.created_at) or 0) if self.benchmark else 0
+
+    @property
+    def live(self) -> bool:
+        """Whether somebody is recording."""
+        return any(item.mixed == LIVE for item in self.recordings)
+
+    @cached_property
+    def runs(self) -> list[dict[str, Any]]:
+        """The runs of its recordings, in the order of their files."""
+        return [run for item in self.recordings for run in item.runs]
+
+    def holds(self, words: Sequence[str]) -> bool:
+        """Whether each of some words (in lower case) is somewhere in what is said of it."""
+        said = [self.name, self.description, self.environment, self.benchmark_id]
+        said += [self.benchmark.created_by] if self.benchmark else []
+        for run in self.runs:
+            said += [str(run.get("name", "")), *map(str, run.get("tags", ()))]
+        text = "\n".join(said).lower()
+        return all(word in text for word in words)
+
+    def facts(self) -> dict[str, Any]:
+        """The same as JSON has it."""
+        succeeded, told = self.success
+        return {
+            "key": self.key,
+            "name": self.name,
+            "description": self.description,
+            "environment": self.environment,
+            "benchmark_id": self.benchmark_id or None,
+            "owner": self.benchmark.created_by if self.benchmark else None,
+            "published_in": self.benchmark.published_in if self.benchmark else None,
+            "recordings": len(self.recordings),
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "bytes": self.size,
+            "return": {"mean": self.return_mean, "min": self.return_least, "max": self.return_most},
+            "success": succeeded / told if told else None,
+            "first_ns": self.first,
+            "last_ns": self.last,
+            "live": self.live,
+        }
+
+
+def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
+    """All of a shelf, the last recorded first."""
+    found = _grouped(_tallies(shelf, connection), {header.id: header for header in shelf.benchmarks()})
+    return sorted(found, key=lambda dataset: (-dataset.last, dataset.name))
+
+
+def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
+    """A dataset by its key.
+
+    Raises:
+        NotFoundError: there is none that may be read.
+    """
+    benchmarks = {header.id: header for header in shelf.benchmarks() if header.id == key}
+    found = _grouped(_tallies(shelf, connection, of_dataset(key)), benchmarks)
+    if not found:
+        raise NotFoundError(f"there is no dataset {key[:80]!r} here")
+    return found[0]
+
+
+def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:
+    """The dataset that an episode is of."""
+    found = select(RECORDING.c.benchmark_id, RECORDING.c.environment).where(of_recording(header.recording))
+    benchmark_id, environment = connection.execute(found).one()
+    return find_dataset(shelf, connection, _key(unescape_text(benchmark_id), unescape_text(environment)))
+
+
+def of_recording(name: str) -> ColumnElement[bool]:
+    """A condition on RECORDING: the one of this name."""
+    return RECORDING.c.path == escape_text(name)
+
+
+def of_dataset(key: str) -> ColumnElement[bool]:
+    """A condition on RECORDING: those of the dataset with a key."""
+    benchmark_id, environment = _meant(key)
+    if benchmark_id:
+        return RECORDING.c.benchmark_id == escape_text(benchmark_id)
+    return and_(RECORDING.c.benchmark_id == "", RECORDING.c.environment == escape_text(environment))
+
+
+def _tallies(shelf: Shelf, connection: Connection, of: ColumnElement[bool] | None = None) -> list[Tally]:
+    return list(tallies(connection, shelf.seen(TALLY.c.created_by, TALLY.c.published_in), of))
+
+
+def _grouped(found: Iterable[Tally], benchmarks: Mapping[str, BenchmarkHeader]) -> list[Dataset]:
+    groups: dict[str, list[Tally]] = {uri: [] for uri in benchmarks}
+    for item in found:
+        groups.setdefault(_key(item.benchmark_id, item.environment), []).append(item)
+    made = []
+    for key, items in groups.items():
+        header = benchmarks.get(key)
+        environment = items[0].environment if items else ""
+        made.append(
+            Dataset(
+                key=key,
+                benchmark_id=header.id if header else items[0].benchmark_id,
+                environment=environment or (header.environment if header else ""),
+                benchmark=header,
+                recordings=items,
+            )
+        )
+    return made
+
+
+def _key(benchmark_id: str, environment: str) -> str:
+    """What an address calls a dataset: a benchmark's id, an environment's name, or what stands for an odd one."""
+    if is_hash(benchmark_id):
+        return benchmark_id
+    if not benchmark_id and not environment:
+        return _NAMELESS
+    if not benchmark_id and _PLAIN.fullmatch(environment) and not is_hash(environment):
+        return environment
+    text = (benchmark_id or environment).encode("utf-8", "surrogatepass")
+    return f"~{'b' if benchmark_id else 'e'}{base64.urlsafe_b64encode(text).decode().rstrip('=')}"
+
+
+def _meant(key: str) -> tuple[str, str]:
+    """The benchmark's id, or else the environment's name, that a key stands for."""
+    if is_hash(key):
+        return key, ""
+    if not key.startswith("~"):
+        return "", "" if key == _NAMELESS else key
+    try:
+        text = base64.urlsafe_b64decode(key[2:] + "=" * (-len(key[2:]) % 4)).decode("utf-8", "surrogatepass")
+    except (binascii.Error, ValueError) as err:
+        raise NotFoundError(f"there is no dataset {key[:80]!r} here") from err
+    return (text, "") if key[1:2] == "b" else ("", text)

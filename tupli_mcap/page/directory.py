@@ -1,0 +1,152 @@
+"""Shelves of this machine: a directory, a storage, one file. Looking writes nothing into them."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from sqlalchemy import ColumnElement, Connection, true
+
+from tupli_mcap.errors import NotFoundError, RecordingError
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import BenchmarkHeader
+from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.entries import entry_of
+from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
+
+__all__ = ["DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
+
+T = TypeVar("T")
+_MOST_OPEN = 16
+_CACHE_BYTES = 64 << 20  # of each
+
+
+def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
+    """A directory, or one recording.
+
+    Raises:
+        RecordingError: there is no such file.
+    """
+    if path.is_dir():
+        return DirectoryShelf(path)
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
+    return FileShelf(path)
+
+
+class OpenedRecordings:
+    """Keeps a few recordings open, from any thread: a picture of an episode takes a moment, opening its file longer."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[str, object], Recording] = OrderedDict()
+        self._turn = threading.Lock()
+
+    def get(self, place: str | os.PathLike[str], version: object) -> Recording:
+        """The recording at a place. `version` tells it from what was there before; None: it changes all the time.
+
+        It is closed when nobody holds it any more.
+        """
+        key = os.fspath(place), version
+        with self._turn:
+            if version is not None and key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        opened = Recording(place, cache_bytes=_CACHE_BYTES)
+        if version is not None and opened.complete:
+            with self._turn:
+                self._kept[key] = opened
+                if len(self._kept) > _MOST_OPEN:
+                    self._kept.popitem(last=False)
+        return opened
+
+
+class _OpenToAll:
+    """What lies on this machine is read as a whole, by who runs the program."""
+
+    user = ""
+
+    def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
+        return true()
+
+
+class DirectoryShelf(_OpenToAll):
+    """The recordings below a directory, and the benchmarks if it is a storage."""
+
+    def __init__(self, root: Path) -> None:
+        self._storage = FileStorage(root)
+        self._opened = OpenedRecordings()
+        self.title = self._storage.root.name or str(self._storage.root)
+        self.opened_by = str(self._storage.root)
+
+    @property
+    def skipped(self) -> Mapping[str, str]:
+        return self._storage.skipped
+
+    def ask(self, question: Callable[[Connection], T]) -> T:
+        return self._storage.ask(question)
+
+    def open(self, recording: str) -> Recording:
+        path = self._storage.recording_path(recording)
+        return self._opened.get(path, _stamp(self._storage.root, recording))
+
+    def benchmarks(self) -> Sequence[BenchmarkHeader]:
+        return self._storage.list_benchmarks()
+
+
+class FileShelf(_OpenToAll):
+    """One recording."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.absolute()
+        self._catalog = Catalog(None)
+        self._known: RecordingStamp | None = None
+        self._turn = threading.Lock()
+        self._opened = OpenedRecordings()
+        self.skipped: Mapping[str, str] = {}
+        self.title = self._path.name
+        self.opened_by = str(self._path)
+
+    def ask(self, question: Callable[[Connection], T]) -> T:
+        with self._turn:
+            self._follow()
+        return self._catalog.ask(question)
+
+    def _follow(self) -> None:
+        """Brings the file as it is now into the catalog.
+
+        Raises:
+            RecordingError, FormatError: it is gone, or damaged.
+        """
+        name = self._path.name
+        if self._known is not None and self._known == _stamp(self._path.parent, name):
+            return
+        with entry_of(self._path.parent, name) as entry:
+            self._catalog.put_recording(
+                name,
+                entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
+                uuid=entry.uuid,
+                benchmark_id=entry.benchmark_id,
+                runs=entry.runs,
+                rows=entry.rows,
+            )
+        self._known = None if entry.live else entry.stamp
+
+    def open(self, recording: str) -> Recording:
+        if recording != self._path.name:
+            raise NotFoundError(f"there is no recording {recording[:200]!r} here")
+        return self._opened.get(self._path, _stamp(self._path.parent, recording))
+
+    def benchmarks(self) -> Sequence[BenchmarkHeader]:
+        return []
+
+
+def _stamp(root: Path, relative: str) -> RecordingStamp | None:
+    try:
+        return stamp_of(root, relative)
+    except FileNotFoundError:
+        return None

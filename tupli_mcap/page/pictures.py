@@ -1,0 +1,67 @@
+"""Pictures of an episode: recorded frames, and images of its states."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.messages.images.pictures import encode_pixels, format_of
+from tupli_mcap.recording import Episode
+from tupli_mcap.replay.recorded_film import as_picture
+from tupli_mcap.spaces.element_names import short_path
+from tupli_mcap.spaces.leaves import Leaf
+
+__all__ = ["Camera", "cameras_of", "picture_at"]
+
+
+class Camera(NamedTuple):
+    """What there are pictures of: a camera, or an image of the states (`leaf`).
+
+    steps: int64, what each picture shows: the state after so many steps.
+    """
+
+    name: str
+    steps: Array
+    leaf: Leaf | None = None
+
+    def place(self, step: int) -> int:
+        """Which picture shows a step: the last one up to it."""
+        return max(0, int(self.steps.searchsorted(step, side="right")) - 1)
+
+    def shows(self) -> str:
+        """For scripts, as JSON: the steps, or how many there are where each step has a picture."""
+        count = len(self.steps)
+        return json.dumps(count if np.array_equal(self.steps, np.arange(count)) else self.steps.tolist())
+
+
+def cameras_of(episode: Episode) -> list[Camera]:
+    """The cameras with pictures of an episode."""
+    recording = episode.recording
+    found = [Camera(name, recording.frames(episode.position, name).steps) for name in recording.cameras]
+    found += [Camera(short_path(leaf), np.arange(len(episode)), leaf) for leaf in recording.layout.images]
+    return [camera for camera in found if len(camera.steps)]
+
+
+def picture_at(episode: Episode, cameras: Sequence[Camera], camera: int, place: int) -> tuple[bytes, str]:
+    """The bytes and the media type of a picture: a frame as it was recorded, an image as PNG.
+
+    Raises:
+        NotFoundError: there is no such picture.
+        MissingExtraError: an image needs Pillow.
+    """
+    if not (0 <= camera < len(cameras) and 0 <= place < len(cameras[camera].steps)):
+        raise NotFoundError("there is no such picture")
+    chosen = cameras[camera]
+    if chosen.leaf is None:
+        data = bytes(episode.recording.frames(episode.position, chosen.name).encoded(place).data)
+        form = format_of(data)
+        if form is None:
+            raise NotFoundError("the bytes of the frame are no picture")
+        return data, f"image/{form}"
+    value = chosen.leaf.get(episode[place : place + 1].states)[0]
+    return encode_pixels(as_picture(value, chosen.leaf)), "image/png"

@@ -1,0 +1,243 @@
+"""One dataset: an episode of it first, then what all of them are like, and what they come from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from fastapi import APIRouter, Query, Request, Response
+from markupsafe import Markup
+from sqlalchemy import ColumnElement, Connection
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import TupliError
+from tupli_mcap.page import charts, texts
+from tupli_mcap.page.answers import PageRoute, Shown, page
+from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset, of_recording
+from tupli_mcap.page.routes.episode import Seen, look
+from tupli_mcap.page.samples import (
+    SampledEpisodes,
+    SampledValues,
+    sample_episodes,
+    sample_numbers,
+    sample_values,
+)
+from tupli_mcap.page.shelf import Shelf, seen_episodes
+from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.description import describe
+from tupli_mcap.schema import EpisodeHeader
+from tupli_mcap.storage.catalog.queries import Sort, find_episodes
+
+__all__ = ["router", "shown_first"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_RECORDINGS: Final = 100  # that are listed
+_HISTOGRAMS: Final = 24  # of a field
+_BINS: Final = 24
+_GROUPS: Final = 60  # of episodes, along the time
+_GROUPS_EACH: Final = 30
+_LINES: Final = 8  # recordings that have a line each
+_FEW: Final = 40  # episodes, each of which is a group of its own
+
+
+class Histogram(NamedTuple):
+    """How often values occur. name: of what."""
+
+    name: str
+    drawn: Markup
+
+
+@router.get("/dataset/{key:path}")
+def dataset(
+    request: Request,
+    shelf: Shown,
+    key: str,
+    show: Annotated[str, Query(pattern="newest|best|worst")] = "newest",
+) -> Response:
+    """A dataset. show: which of its episodes comes first."""
+
+    def ask(connection: Connection) -> tuple[Dataset, EpisodeHeader | None, SampledEpisodes, Any]:
+        found = find_dataset(shelf, connection, key)
+        header = shown_first(shelf, connection, found, show)
+        return (
+            found,
+            header,
+            sample_episodes(shelf, connection, found),
+            sample_numbers(shelf, connection, found),
+        )
+
+    of, header, episodes, numbers = shelf.ask(ask)
+    values = sample_values(shelf, numbers)
+    seen = None if header is None else _look(shelf, header)
+    facts = {
+        **of.facts(),
+        "files": [_file_facts(item) for item in of.recordings],
+        "episode": None if header is None else header.id,
+        "environment_facts": _environment(seen.episode.recording) if seen else {},
+    }
+    drawn: dict[str, Any] = {
+        "over_time": list(_over_time(episodes, _lines_apart(episodes, of))),
+        "seeds": _ends(episodes.seeds),
+        "histograms": _histograms(values),
+        "files": sorted(of.recordings, key=lambda item: -item.last)[:_RECORDINGS],
+    }
+    return page(
+        request, "dataset.html", facts, shelf=shelf, dataset=of, show=show, seen=seen, header=header,
+        episodes=episodes, values=values, **drawn,
+    )  # fmt: skip
+
+
+def _look(shelf: Shelf, header: EpisodeHeader) -> Seen | None:
+    try:
+        return look(shelf, header, 0)
+    except TupliError:  # a damaged file must not hide the others
+        return None
+
+
+def shown_first(shelf: Shelf, connection: Connection, dataset: Dataset, show: str) -> EpisodeHeader | None:
+    """The newest episode, or the one with the highest or the lowest return."""
+    known = [item for item in dataset.recordings if show == "newest" or item.return_most is not None]
+    if not known:
+        return None
+    if show == "newest":
+        chosen = max(known, key=lambda item: item.last)
+        order = Sort("ended", descending=True)
+    elif show == "best":
+        chosen = max(known, key=lambda item: item.return_most or 0.0)
+        order = Sort("return", descending=True)
+    else:
+        chosen = min(known, key=lambda item: item.return_least or 0.0)
+        order = Sort("return")
+    only: ColumnElement[bool] = seen_episodes(shelf, of_dataset(dataset.key), of_recording(chosen.recording))
+    return next(find_episodes(connection, None, limit=1, only=only, sort=order), None)
+
+
+def _ends(values: Array) -> str:
+    known = values[np.isfinite(values)]
+    return texts.spread(float(known.min()), float(known.max())) if len(known) else ""
+
+
+class Chart(NamedTuple):
+    """Numbers of episodes: one after another, and as a distribution."""
+
+    title: str
+    over_time: Markup
+    distribution: Markup
+
+
+def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[Chart]:
+    """names: of the runs, by recording, each of which gets a line of its own; empty for one line of all."""
+    for title, values in (
+        ("Return", episodes.returns),
+        ("Length", episodes.steps),
+        ("Success", episodes.success),
+    ):
+        drawable = np.where(np.isfinite(values), values, np.nan)
+        known = drawable[np.isfinite(drawable)]
+        if len(known):
+            what = f"{title} of episodes over time"
+            drawn = (
+                _by_recording(episodes, drawable, names, what) if names else _as_one(episodes, drawable, what)
+            )
+            edges, _ = bin_edges(known, _BINS)
+            counts, _ = np.histogram(known, edges)
+            ends = texts.number(float(known.min())), texts.number(float(known.max()))
+            told = f"Distribution of {title.lower()}, from {ends[0]} to {ends[1]}"
+            yield Chart(title, drawn, charts.histogram(counts, edges, ends, label=told))
+
+
+def _as_one(episodes: SampledEpisodes, values: Array, what: str) -> Markup:
+    at = np.arange(len(values), dtype=np.float64)
+    middle, mean, _, low, high, _ = bands(values, len(values) if len(values) <= _FEW else _GROUPS)
+    ends = texts.day(int(episodes.ended[0])), texts.day(int(episodes.ended[-1]))
+    ends = ends if ends[0] != ends[1] else ("first", "last")
+    if set(values[np.isfinite(values)].tolist()) <= {0.0, 1.0}:  # of flags, only the mean says something
+        return charts.over_time([(middle, mean)], ends, what)
+    return charts.over_time([(middle, mean)], ends, what, points=(at, values), band=(low, high))
+
+
+def _by_recording(episodes: SampledEpisodes, values: Array, names: Mapping[str, str], what: str) -> Markup:
+    of = np.array(episodes.recordings)
+    lines = []
+    for recording in names:
+        own = values[of == recording]
+        middle, mean, *_ = bands(own, min(len(own), _GROUPS_EACH))
+        lines.append((middle / max(1, len(own) - 1), mean))
+    return charts.over_time(lines, ("first", "last"), what, names=list(names.values()))
+
+
+def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
+    """The names of runs by recording, if those are few and each has enough episodes for a line."""
+    counts = Counter(episodes.recordings)
+    if (
+        not 1 < len(counts) <= _LINES
+        or min(counts.values()) < _FEW // 4
+        or len(counts) < len(dataset.recordings)
+    ):
+        return {}
+    return {
+        item.recording: str(item.runs[0].get("name") or item.recording)[:40] for item in dataset.recordings
+    }
+
+
+def _histograms(values: SampledValues) -> list[tuple[str, Sequence[Histogram], int]]:
+    """By field: its title, histograms, and how many more there would be."""
+    found: list[tuple[str, Sequence[Histogram], int]] = []
+    for title, leaves in (
+        ("States", values.states),
+        ("Actions", values.actions),
+        ("Rewards", values.rewards),
+    ):
+        drawn = [(leaf, i) for leaf in leaves for i in range(len(leaf.names)) if len(leaf.values)]
+        if drawn:
+            shown = [_histogram(leaf, i) for leaf, i in drawn[:_HISTOGRAMS]]
+            found.append((title, shown, len(drawn) - len(shown)))
+    return found
+
+
+def _histogram(leaf: LeafValues, i: int) -> Histogram:
+    name = leaf.names[i]
+    if leaf.kind == "choices":
+        start, counts = int(leaf.starts[i]), leaf.counts[i]
+        names = list(leaf.value_names) or [str(start + k) for k in range(len(counts))]
+        edges, label = np.arange(len(counts) + 1.0), f"How often each value of {name} was"
+        return Histogram(name, charts.histogram(counts, edges, (names[0], names[-1]), names, label))
+    column: Array = leaf.column(i)
+    edges, _ = bin_edges(column, _BINS)
+    counts, _ = np.histogram(column, edges)
+    ends = texts.number(float(leaf.least[i])), texts.number(float(leaf.most[i]))
+    return Histogram(name, charts.histogram(counts, edges, ends, label=f"Distribution of {name}"))
+
+
+def _file_facts(item: Any) -> dict[str, Any]:
+    return {
+        "recording": item.recording,
+        "uuid": item.uuid,
+        "bytes": item.size,
+        "episodes": item.episodes,
+        "steps": item.steps,
+        "return_mean": item.return_sum / item.returns if item.returns else None,
+        "runs": item.runs,
+    }
+
+
+def _environment(recording: Recording) -> Mapping[str, Any]:
+    """What a recording says of its environment and of what it was made with."""
+    facts = describe(recording, np.empty(0, np.int64))
+    return {
+        "observation": facts.observation,
+        "action": facts.action,
+        "step_seconds": recording.labels.step_seconds,
+        "num_envs": facts.num_envs,
+        "library": facts.library,
+        "command": facts.run.get("command", ()),
+        "git": facts.run.get("git", {}),
+        "host": facts.run.get("host", ""),
+        "versions": facts.run.get("versions", {}),
+        "attachments": facts.attachments,
+        "made_of": facts.made_of,
+        "signed_by": facts.signed_by,
+    }

@@ -1,0 +1,169 @@
+"""One episode: its pictures, its curves, and what is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fastapi import APIRouter, Request, Response
+from markupsafe import Markup
+from sqlalchemy import Connection
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.errors import FilterError, NotFoundError
+from tupli_mcap.page import charts
+from tupli_mcap.page.answers import PageRoute, Shown, page
+from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
+from tupli_mcap.page.datasets import Dataset, dataset_of, of_dataset, of_recording
+from tupli_mcap.page.pictures import Camera, cameras_of
+from tupli_mcap.page.shelf import Shelf, find_episode, seen_episodes
+from tupli_mcap.recording import Episode
+from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.storage.catalog.queries import After, Sort, find_episodes
+
+__all__ = ["Seen", "look", "opened", "router"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+
+
+class Neighbours(NamedTuple):
+    """The ids of the episodes before and after one, in the list that it was found in."""
+
+    before: str | None
+    after: str | None
+
+
+@router.get("/episode/{uri}")
+def episode(
+    request: Request,
+    shelf: Shown,
+    uri: str,
+    step: int = 0,
+    dataset: str = "",
+    filter: str = "",
+    sort: str = "",
+) -> Response:
+    """An episode. dataset, filter, sort: the list that its neighbours are of, by default its recording."""
+
+    def ask(connection: Connection) -> tuple[EpisodeHeader, Dataset, Neighbours]:
+        found = find_episode(shelf, connection, uri)
+        of = dataset_of(shelf, connection, found)
+        return found, of, _neighbours(shelf, connection, found, dataset, filter, sort)
+
+    header, of, neighbours = shelf.ask(ask)
+    seen = look(shelf, header, step)
+    facts = {
+        **dict(header),
+        "reset": {
+            "seed": seen.episode.seed,
+            "options": seen.episode.options,
+            "info": seen.episode.reset_info,
+        },
+        "cameras": [{"name": camera.name, "steps": camera.steps.tolist()} for camera in seen.cameras],
+        "step": {"number": seen.step, **seen.values},
+        **neighbours._asdict(),
+    }
+    context = {"dataset": dataset, "filter": filter, "sort": sort}
+    return page(
+        request, "episode.html", facts, shelf=shelf, header=header, seen=seen, dataset=of, around=neighbours,
+        context=context,
+    )  # fmt: skip
+
+
+@router.get("/episode/{uri}/step/{step}")
+def one_step(shelf: Shown, uri: str, step: int) -> Response:
+    """What there was at a step, as JSON: text by field and name."""
+    shown = opened(shelf, shelf.ask(lambda connection: find_episode(shelf, connection, uri)))
+    if not 0 <= step < len(shown):
+        raise NotFoundError(f"the episode has steps from 0 to {len(shown) - 1}")
+    return Response(jsonvalue.dumps(values_at(shown, step)), media_type="application/json")
+
+
+def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
+    """The episode of a header, open.
+
+    Raises:
+        NotFoundError: it is gone.
+    """
+    recording = shelf.open(header.recording)
+    found = recording.index["episode"].searchsorted(header.episode)
+    if found == len(recording.index) or recording.index["episode"][found] != header.episode:
+        raise NotFoundError(f"episode {header.id} is gone")
+    return recording.episodes[int(found)]
+
+
+class Seen(NamedTuple):
+    """What is shown of an episode. values: at the step, by field and name."""
+
+    episode: Episode
+    curves: Curves
+    cameras: Sequence[Camera]
+    step: int
+    values: Mapping[str, Mapping[str, str]]
+
+    @property
+    def groups(self) -> list[tuple[str, Sequence[Track]]]:
+        """The tracks by field, those that there are."""
+        names = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
+        found = ((title, self.curves.of(field)) for field, title in names.items())
+        return [(title, tracks) for title, tracks in found if tracks]
+
+    @property
+    def untracked(self) -> list[tuple[str, str, str]]:
+        """What there is at the step and has no track: field, name, value."""
+        tracked = {(track.field, track.name) for track in self.curves.tracks}
+        return [
+            (field, name, value)
+            for field, named in self.values.items()
+            for name, value in named.items()
+            if (field, name) not in tracked and field != "end"
+        ]
+
+    def drawn(self, track: Track) -> Markup:
+        """A track as SVG, over the steps that were read."""
+        low, high = track.ends
+        room = 0.04 * (high - low)
+        across = (0.0, max(1.0, self.curves.read - 1.0))
+        return charts.track((track.at, track.values), across, (low - room, high + room))
+
+
+def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:
+    """Reads what is shown of an episode.
+
+    Raises:
+        NotFoundError: it is gone.
+        FormatError: its recording is damaged.
+    """
+    episode = opened(shelf, header)
+    step = min(max(0, step), len(episode) - 1)
+    return Seen(episode, curves_of(episode), cameras_of(episode), step, values_at(episode, step))
+
+
+def _neighbours(
+    shelf: Shelf, connection: Connection, header: EpisodeHeader, dataset: str, filter: str, sort: str
+) -> Neighbours:
+    try:
+        wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
+        order = Sort.parse(sort)
+    except FilterError:
+        wanted, order = None, None
+    of: list[Any] = [of_dataset(dataset)] if dataset else []
+    if not (dataset or filter or sort):
+        of = [of_recording(header.recording)]
+    at = After(header.recording, header.episode)
+    found = (
+        next(
+            find_episodes(
+                connection,
+                wanted,
+                limit=1,
+                after=at,
+                only=seen_episodes(shelf, *of),
+                sort=order,
+                backwards=backwards,
+            ),
+            None,
+        )
+        for backwards in (True, False)
+    )
+    return Neighbours(*(None if item is None else item.id for item in found))

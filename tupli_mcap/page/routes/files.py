@@ -1,0 +1,77 @@
+"""Pictures of episodes, and what the pages themselves are made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastapi import APIRouter, Response
+from fastapi.responses import FileResponse
+from sqlalchemy import Connection
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.page import charts
+from tupli_mcap.page.answers import PageRoute, Shown
+from tupli_mcap.page.curves import curves_of
+from tupli_mcap.page.datasets import find_dataset
+from tupli_mcap.page.pictures import cameras_of, picture_at
+from tupli_mcap.page.routes.dataset import shown_first
+from tupli_mcap.page.routes.episode import opened
+from tupli_mcap.page.shelf import find_episode
+from tupli_mcap.recording import Episode
+from tupli_mcap.schema import EpisodeHeader
+
+__all__ = ["router"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_STATIC = {path.name: path for path in (Path(__file__).parent.parent / "static").iterdir()}
+_MOST_CURVES = 5
+_DRAWING = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+}
+_KEPT = {"Cache-Control": "private, max-age=3600"}
+
+
+@router.get("/static/{name}")
+def static(name: str) -> FileResponse:
+    """The style sheet, the script and the icon. Their address names the version."""
+    if name not in _STATIC:
+        raise NotFoundError(f"there is no file {name[:80]!r}")
+    return FileResponse(_STATIC[name], headers={"Cache-Control": "public, max-age=86400"})
+
+
+@router.get("/cover/{key:path}")
+def cover(shelf: Shown, key: str) -> Response:
+    """What a dataset looks like: a picture of its newest episode, else some of its curves."""
+
+    def ask(connection: Connection) -> EpisodeHeader | None:
+        return shown_first(shelf, connection, find_dataset(shelf, connection, key), "newest")
+
+    header = shelf.ask(ask)
+    if header is None:
+        raise NotFoundError("nothing was recorded of this benchmark yet")
+    episode = opened(shelf, header)
+    cameras = cameras_of(episode)
+    if cameras:
+        data, media = picture_at(episode, cameras, 0, len(cameras[0].steps) // 2)
+        return Response(data, media_type=media, headers=_KEPT)
+    return Response(charts.cover(_curves(episode)), media_type="image/svg+xml", headers=_KEPT | _DRAWING)
+
+
+def _curves(episode: Episode) -> list[charts.Line]:
+    """Some curves of an episode, each from 0 to 1."""
+    curves = curves_of(episode)
+    moving = [
+        track for field in ("state", "reward") for track in curves.of(field) if track.ends[1] > track.ends[0]
+    ]
+    return [
+        (track.at / max(1, curves.read - 1), (track.values - track.ends[0]) / (track.ends[1] - track.ends[0]))
+        for track in moving[:_MOST_CURVES]
+    ]
+
+
+@router.get("/episode/{uri}/picture/{camera}/{place}")
+def picture(shelf: Shown, uri: str, camera: int, place: int) -> Response:
+    """A picture of an episode: of which camera, and which of its pictures."""
+    shown = opened(shelf, shelf.ask(lambda connection: find_episode(shelf, connection, uri)))
+    data, media = picture_at(shown, cameras_of(shown), camera, place)
+    return Response(data, media_type=media, headers=_KEPT)

@@ -1,0 +1,166 @@
+"""The datasets of a shelf, and tables of episodes."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Query, Request, Response
+from markupsafe import Markup
+from sqlalchemy import Connection
+
+from tupli_mcap.errors import FilterError
+from tupli_mcap.page import charts
+from tupli_mcap.page.answers import PageRoute, Shown, address, page
+from tupli_mcap.page.datasets import Dataset, all_datasets, find_dataset, of_dataset
+from tupli_mcap.page.shelf import Shelf, find_episode, seen_episodes
+from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
+
+__all__ = ["Table", "router", "table_of"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_DATASETS: Final = 50  # on a page
+_ROWS: Final = 50
+_COUNTED: Final = 10_000  # episodes, beyond which a page says "more than"
+_KEYS: Final = 4  # of metadata that have a column
+
+
+@dataclass(frozen=True)
+class Table:
+    """A page of episodes.
+
+    error: why the filter has no meaning, and its character (from 0) where that is known. count: None where there are
+    more than `most`. keys: of the metadata that have a column. before, after: the ids that other pages begin at.
+    """
+
+    rows: Sequence[EpisodeHeader]
+    error: str = ""
+    position: int | None = None
+    count: int | None = 0
+    most: int = _COUNTED
+    keys: Sequence[str] = ()
+    before: str | None = None
+    after: str | None = None
+
+    def bar(self, row: EpisodeHeader) -> Markup:
+        """Where a return lies among those of the page."""
+        known = [
+            r.episode_return for r in self.rows if r.episode_return is not None and isfinite(r.episode_return)
+        ]
+        value = row.episode_return
+        if value is None or not isfinite(value) or min(known) == max(known):
+            return Markup("")
+        return charts.share((value - min(known)) / (max(known) - min(known)))
+
+
+@router.get("/")
+def datasets(
+    request: Request, shelf: Shown, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1
+) -> Response:
+    """All datasets, or those that hold some words."""
+    found = shelf.ask(lambda connection: all_datasets(shelf, connection))
+    chosen = [dataset for dataset in found if dataset.holds(q.lower().split())]
+    first = (number - 1) * _DATASETS
+    shown = chosen[first : first + _DATASETS]
+    facts = {
+        "datasets": [dataset.facts() for dataset in shown],
+        "count": len(chosen),
+        "skipped": dict(shelf.skipped),
+    }
+    return page(
+        request, "datasets.html", facts, shelf=shelf, datasets=shown, all=len(found), q=q, number=number,
+        more=len(chosen) > first + _DATASETS,
+    )  # fmt: skip
+
+
+@router.get("/episodes")
+def episodes(
+    request: Request,
+    shelf: Shown,
+    dataset: str = "",
+    filter: str = "",
+    sort: str = "",
+    after: str = "",
+    before: str = "",
+) -> Response:
+    """Episodes that a filter is true of, in some order, a page at a time."""
+
+    def ask(connection: Connection) -> tuple[Dataset | None, Table]:
+        of = find_dataset(shelf, connection, dataset) if dataset else None
+        return of, table_of(shelf, connection, dataset, filter, sort, after=after, before=before)
+
+    of, table = shelf.ask(ask)
+    facts = {
+        "episodes": [dict(row) for row in table.rows],
+        "count": table.count,
+        "error": table.error or None,
+        "position": table.position,
+        "after": table.after,
+        "before": table.before,
+    }
+    status = 400 if table.error else 200
+    link = functools.partial(_link, dataset=dataset, filter=filter, sort=sort)
+    return page(
+        request, "episodes.html", facts, status=status, shelf=shelf, dataset=of, table=table, filter=filter, sort=sort,
+        link=link,
+    )  # fmt: skip
+
+
+def _link(**params: str) -> str:
+    return address("episodes", **params)
+
+
+def table_of(
+    shelf: Shelf,
+    connection: Connection,
+    dataset: str,
+    filter: str,
+    sort: str,
+    *,
+    after: str = "",
+    before: str = "",
+    most: int = _ROWS,
+) -> Table:
+    """A page of a table, by default the first one. dataset: its key; all where it is empty."""
+    try:
+        wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
+        order = Sort.parse(sort)
+        only = seen_episodes(shelf, *([of_dataset(dataset)] if dataset else []))
+        at = find_episode(shelf, connection, after or before) if after or before else None
+        found = list(
+            find_episodes(
+                connection,
+                wanted,
+                limit=most + 1,
+                only=only,
+                sort=order,
+                after=None if at is None else After(at.recording, at.episode),
+                backwards=bool(before),
+            )
+        )
+    except FilterError as err:
+        return Table((), str(err), err.position)
+    more, rows = len(found) > most, found[:most]
+    if before:
+        rows.reverse()
+    count = count_episodes(connection, wanted, only=only, most=_COUNTED + 1)
+    return Table(
+        rows,
+        count=count if count <= _COUNTED else None,
+        keys=_common_keys(rows),
+        before=rows[0].id if rows and (after or (before and more)) else None,
+        after=rows[-1].id if rows and (before or more) else None,
+    )
+
+
+def _common_keys(rows: Sequence[EpisodeHeader]) -> list[str]:
+    """The keys of metadata that most rows have a short value at."""
+    said: Counter[str] = Counter()
+    for row in rows:
+        said.update(key for key, value in row.metadata.items() if isinstance(value, bool | int | float | str))
+    return [key for key, _ in said.most_common(_KEYS)]

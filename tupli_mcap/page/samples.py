@@ -1,0 +1,184 @@
+"""Samples of a dataset that are quick to take, however many episodes it has: of its episodes, and of their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from sqlalchemy import Connection, func, select
+
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import TupliError
+from tupli_mcap.page.datasets import Dataset, of_dataset
+from tupli_mcap.page.shelf import Shelf, seen_episodes
+from tupli_mcap.plots.statistics import LeafValues
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.blocks import step_bytes
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, episodes_of, of_one_recording
+from tupli_mcap.storage.catalog.tallies import Tally
+from tupli_mcap.storage.texts import escape_text, unescape_text
+
+__all__ = ["SampledEpisodes", "SampledValues", "sample_episodes", "sample_numbers", "sample_values"]
+
+_EPISODES: Final = 2_000
+_RECORDINGS: Final = 250  # that episodes are taken from
+_IDS_AT_ONCE: Final = 500
+_OPENED: Final = 5  # recordings whose steps are read
+_STEP_BYTES: Final = 2 << 20  # of each of them
+
+
+@dataclass(frozen=True)
+class SampledEpisodes:
+    """Facts of some episodes in the order of their ends.
+
+    recordings: their names. ended: ns since 1970 (int64). returns, steps, success, seeds: float64, NaN where there is
+    none. of: how many episodes there are.
+    """
+
+    recordings: Sequence[str]
+    ended: Array
+    returns: Array
+    steps: Array
+    success: Array
+    seeds: Array
+    of: int
+
+    @property
+    def is_all(self) -> bool:
+        """Whether they are all that there are."""
+        return len(self.ended) >= self.of
+
+
+@dataclass(frozen=True)
+class SampledValues:
+    """Values of some steps, leaf by leaf. steps, episodes: how many. notes: what is left out; sentences."""
+
+    states: Sequence[LeafValues]
+    actions: Sequence[LeafValues]
+    rewards: Sequence[LeafValues]
+    steps: int
+    episodes: int
+    notes: Sequence[str]
+
+
+def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> SampledEpisodes:
+    """All episodes of a dataset, or of many those at even distances in its recordings."""
+    facts = (EPISODE.c[name] for name in ("created_at", "episode_return", "n_tuples", "success", "seed"))
+    query = select(RECORDING.c.path, *facts).select_from(EPISODE.join(RECORDING, of_one_recording()))
+    if dataset.episodes <= _EPISODES:
+        rows = list(connection.execute(query.where(seen_episodes(shelf, of_dataset(dataset.key)))))
+    else:
+        recordings = _evenly(dataset.recordings, _RECORDINGS)
+        share = _EPISODES / sum(item.episodes for item in recordings)
+        rows = []
+        for ids in _batches(_ids(connection, recordings, share)):
+            rows += connection.execute(query.where(seen_episodes(shelf, EPISODE.c.id.in_(ids)))).all()
+    rows.sort(key=lambda row: row[1])
+    returns, steps, success, seeds = (np.array([row[i] for row in rows], np.float64) for i in range(2, 6))
+    names, ended = [unescape_text(row[0]) for row in rows], np.array([row[1] for row in rows], np.int64)
+    return SampledEpisodes(names, ended, returns, steps, success, seeds, dataset.episodes)
+
+
+def sample_values(shelf: Shelf, seen: Sequence[tuple[str, Sequence[int]]]) -> SampledValues:
+    """Values of steps of some episodes: (recording, numbers of episodes that may be read)."""
+    parts: list[tuple[Recording, dict[str, Array]]] = []
+    steps = episodes = 0
+    for name, numbers in seen:
+        try:
+            recording = shelf.open(name)
+            if recording.num_envs and (not parts or _alike(recording, parts[0][0])):
+                columns, read, count = _read(recording, numbers)
+                parts.append((recording, columns))
+                steps, episodes = steps + read, episodes + count
+        except TupliError:  # gone, or damaged: the others are a sample too
+            continue
+    if not parts:
+        return SampledValues((), (), (), 0, 0, ())
+    layout, labels = parts[0][0].layout, parts[0][0].labels
+    pooled = [
+        [
+            LeafValues.pooled([LeafValues(leaf, labels, columns[leaf.name]) for _, columns in parts])
+            for leaf in leaves
+            if leaf.name in parts[0][1]
+        ]
+        for leaves in (layout.state, layout.action, layout.reward)
+    ]
+    notes = [note for group in pooled for values in group for note in values.notes()]
+    return SampledValues(pooled[0], pooled[1], pooled[2], steps, episodes, notes)
+
+
+def _alike(a: Recording, b: Recording) -> bool:
+    return a.layout.to_metadata() == b.layout.to_metadata()
+
+
+def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array], int, int]:
+    """The columns of some of these episodes by leaf name, (steps, size); how many steps and episodes they are."""
+    layout = recording.layout
+    most = max(1, _STEP_BYTES // step_bytes(layout, images=False))
+    positions = np.flatnonzero(np.isin(recording.index["episode"], list(numbers)))
+    lengths = recording.index["length"][positions].astype(np.int64)
+    fitting = max(1, int(np.searchsorted(np.cumsum(lengths), most, side="right")))
+    positions, lengths = positions[:fitting], lengths[:fitting]
+    if len(positions) == 1 and lengths[0] > most:
+        columns = recording.read_steps(
+            int(positions[0]), 0, most, ("states", "actions", "rewards"), images=False
+        )
+    else:
+        columns = recording.read(positions, ("states", "actions", "rewards"), images=False)
+    found = {}
+    for leaves, values in (
+        (layout.state, columns.states),
+        (layout.action, columns.actions),
+        (layout.reward, columns.rewards),
+    ):
+        for leaf in leaves:
+            if leaf.kind != "variable" and not leaf.apart:
+                column = np.asarray(leaf.get(values))
+                found[leaf.name] = column.reshape(len(column), leaf.size)
+    return found, len(columns), len(positions)
+
+
+def sample_numbers(
+    shelf: Shelf, connection: Connection, dataset: Dataset, each: int = 12
+) -> list[tuple[str, list[int]]]:
+    """A few episodes of a few recordings of a dataset, by number."""
+    found = []
+    for item in _evenly(dataset.recordings, _OPENED):
+        ids = _ids(connection, [item], min(1.0, each / max(1, item.episodes)))
+        chosen = seen_episodes(shelf, EPISODE.c.id.in_(list(ids)))
+        joined = EPISODE.join(RECORDING, of_one_recording())
+        numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(chosen)).scalars()
+        found.append((item.recording, list(numbers)))
+    return found
+
+
+def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
+    """Some recordings at even distances, the first and the last among them."""
+    ordered = sorted(recordings, key=lambda item: (item.last, item.recording))
+    chosen = np.unique(np.linspace(0, len(ordered) - 1, min(most, len(ordered))).round().astype(int))
+    return [ordered[i] for i in chosen.tolist()]
+
+
+def _ids(connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
+    """Row ids of about that share of the episodes of some recordings; some of them may not be there."""
+    names = {escape_text(item.recording): item.episodes for item in recordings}
+    for paths in _batches(names):
+        found = connection.execute(
+            select(RECORDING.c.id, RECORDING.c.path).where(RECORDING.c.path.in_(paths))
+        )
+        for recording_id, path in found.all():
+            ends = select(func.min(EPISODE.c.id), func.max(EPISODE.c.id))
+            low, high = connection.execute(ends.where(episodes_of(recording_id, EPISODE.c.id))).one()
+            if low is not None:
+                count = max(1, round(names[path] * share))
+                yield from np.unique(
+                    np.linspace(0, high - low, count).round().astype(np.int64) + low
+                ).tolist()
+
+
+def _batches(items: Any) -> Iterator[list[Any]]:
+    given = list(items)
+    for first in range(0, len(given), _IDS_AT_ONCE):
+        yield given[first : first + _IDS_AT_ONCE]

@@ -1,0 +1,75 @@
+"""What the page shows: the one seam between it and a directory, a file, or what a server keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, TypeVar
+
+from sqlalchemy import ColumnElement, Connection, and_
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.recording import Recording
+from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterEQ
+from tupli_mcap.storage.catalog.queries import find_episodes
+from tupli_mcap.storage.catalog.tables import EPISODE
+
+__all__ = ["Shelf", "find_episode", "seen_episodes"]
+
+T = TypeVar("T")
+
+
+class Shelf(Protocol):
+    """Recordings as one reader sees them; from any thread.
+
+    Attributes:
+        title: what to call all of it.
+        opened_by: what `tupli_mcap.open` is given to open it.
+        user: who reads; empty where nobody signs in.
+        skipped: files that cannot be shown, and why, as of the last question.
+    """
+
+    title: str
+    opened_by: str
+    user: str
+
+    @property
+    def skipped(self) -> Mapping[str, str]: ...
+
+    def ask(self, question: Callable[[Connection], T]) -> T:
+        """What a question finds in the tables of a catalog that is up to date, in one transaction."""
+        ...
+
+    def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
+        """What may be read, as a condition on these columns of the table that is asked."""
+        ...
+
+    def open(self, recording: str) -> Recording:
+        """A recording of the catalog, which others use at the same time: do not close it.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+        ...
+
+    def benchmarks(self) -> Sequence[BenchmarkHeader]:
+        """The benchmarks that may be read."""
+        ...
+
+
+def seen_episodes(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
+    """The episodes that may be read, and that all conditions are true of."""
+    return and_(shelf.seen(EPISODE.c.created_by, EPISODE.c.published_in), *conditions)
+
+
+def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
+    """An episode by its id; of one that several people have stored, the reader's own.
+
+    Raises:
+        NotFoundError: there is none that may be read.
+    """
+    found = list(
+        find_episodes(connection, FilterEQ(key="id", value=uri), only=seen_episodes(shelf), limit=100)
+    )
+    if not found:
+        raise NotFoundError(f"there is no episode {uri[:80]!r} here")
+    return min(found, key=lambda header: header.created_by != shelf.user)

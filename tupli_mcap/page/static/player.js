@@ -1,0 +1,145 @@
+// An episode over its steps: one slider moves the pictures, the line through the tracks, and the values beside them.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+export function player(section) {
+  const slider = section.querySelector("input[type=range]");
+  const output = section.querySelector(".transport output");
+  const steps = Number(section.dataset.steps);
+  const films = [...section.querySelectorAll("[data-camera]")].map(film);
+  const cursor = cursorOver(section);
+  const show = () => {
+    const step = Number(slider.value);
+    output.textContent = `step ${step} of ${steps}`;
+    slider.setAttribute("aria-valuetext", output.textContent);
+    for (const move of films) move(step);
+    cursor(steps > 1 ? step / (steps - 1) : 0);
+    values(section, step);
+  };
+  slider.addEventListener("input", show);
+  section.querySelector(".transport").addEventListener("submit", (event) => event.preventDefault());
+  play(section, slider, steps, show);
+  seekByTracks(section, slider, steps, show);
+  addEventListener("resize", () => cursor(steps > 1 ? Number(slider.value) / (steps - 1) : 0));
+  cursor(steps > 1 ? Number(slider.value) / (steps - 1) : 0);
+}
+
+// A function that shows the picture of a step; one that is asked for while another one comes waits for it.
+function film(image) {
+  const shows = JSON.parse(image.dataset.shows); // the steps, or how many pictures there are, one a step
+  const base = image.src.replace(/\d+$/, "");
+  let wanted = null;
+  let busy = false;
+  const next = () => {
+    if (wanted === null) return;
+    const place = wanted;
+    wanted = null;
+    busy = true;
+    const coming = new Image();
+    coming.onload = coming.onerror = () => {
+      if (coming.naturalWidth) image.src = coming.src;
+      busy = false;
+      next();
+    };
+    coming.src = base + place;
+  };
+  return (step) => {
+    wanted = typeof shows === "number" ? Math.min(step, shows - 1) : lastUpTo(shows, step);
+    if (!busy) next();
+  };
+}
+
+function lastUpTo(shows, step) {
+  let low = 0;
+  let high = shows.length - 1;
+  while (low < high) {
+    const middle = (low + high + 1) >> 1;
+    if (shows[middle] <= step) low = middle;
+    else high = middle - 1;
+  }
+  return low;
+}
+
+function cursorOver(section) {
+  const tracks = section.querySelector(".tracks");
+  const plot = tracks.querySelector(".row .plot");
+  if (!plot) return () => {};
+  const drawing = document.createElementNS(SVG, "svg");
+  drawing.setAttribute("class", "cursor");
+  drawing.setAttribute("aria-hidden", "true");
+  const line = drawing.appendChild(document.createElementNS(SVG, "line"));
+  line.setAttribute("y1", "0");
+  line.setAttribute("y2", "100%");
+  tracks.append(drawing);
+  return (share) => {
+    const outer = tracks.getBoundingClientRect();
+    const inner = plot.getBoundingClientRect();
+    drawing.style.left = `${inner.left - outer.left}px`;
+    drawing.style.top = "0";
+    drawing.style.width = `${inner.width}px`;
+    drawing.style.height = `${outer.height}px`;
+    for (const end of ["x1", "x2"]) line.setAttribute(end, `${100 * share}%`);
+  };
+}
+
+function play(section, slider, steps, show) {
+  const button = section.querySelector("[data-play]");
+  const seconds = Number(section.dataset.seconds) || 1 / 30;
+  const pace = Math.max(seconds, 8 / Math.max(8, steps) / 4, 1 / 60); // a long episode takes no longer than it did
+  let began = null;
+  const frame = (now) => {
+    if (began === null) return;
+    const step = Math.min(steps - 1, began.step + Math.floor((now - began.time) / 1000 / pace));
+    if (step !== Number(slider.value)) {
+      slider.value = step;
+      show();
+    }
+    if (step >= steps - 1) stop();
+    else requestAnimationFrame(frame);
+  };
+  const stop = () => {
+    began = null;
+    section.classList.remove("playing");
+    button.setAttribute("aria-label", "Play");
+  };
+  button.addEventListener("click", () => {
+    if (began !== null) return stop();
+    const step = Number(slider.value) >= steps - 1 ? 0 : Number(slider.value);
+    began = { step, time: performance.now() };
+    section.classList.add("playing");
+    button.setAttribute("aria-label", "Pause");
+    requestAnimationFrame(frame);
+  });
+  slider.addEventListener("pointerdown", stop);
+}
+
+function seekByTracks(section, slider, steps, show) {
+  section.querySelector(".tracks").addEventListener("click", (event) => {
+    const plot = event.target.closest(".plot");
+    if (!plot) return;
+    const box = plot.getBoundingClientRect();
+    slider.value = Math.round(((event.clientX - box.left) / box.width) * (steps - 1));
+    show();
+  });
+}
+
+// The values of the last step that was asked for; those of steps passed by meanwhile are not fetched.
+const asked = new WeakMap();
+async function values(section, step) {
+  const busy = asked.has(section);
+  asked.set(section, step);
+  if (busy) return;
+  while (true) {
+    const now = asked.get(section);
+    const answer = await fetch(`/episode/${section.dataset.episode}/step/${now}`).catch(() => null);
+    if (answer?.ok) {
+      const told = await answer.json();
+      for (const place of section.querySelectorAll("output[data-name]")) {
+        const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
+        place.textContent = told[field]?.[place.dataset.name] ?? "";
+      }
+    }
+    if (asked.get(section) === now) break;
+  }
+  asked.delete(section);
+}
