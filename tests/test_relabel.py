@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from environments import Sampler, same
 from gymnasium import spaces
+from test_golden import NAMES, place
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError
+from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import made_of, merge_recordings, say_made_of, verify_recording
+from tupli_mcap.recording import made_of, merge_recordings, relabel_recording, say_made_of, verify_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMA = Path(__file__).parent.parent / "schemas" / "made_of.schema.json"
@@ -138,6 +139,49 @@ def test_of_steps_that_differ_in_size(tmp_path: Path) -> None:
     assert not (tmp_path / "b.mcap").exists()
 
 
+def reversed_arrays(column: Any) -> Any:
+    """The column with its arrays in the opposite order; lists, of values of variable size, likewise."""
+    if isinstance(column, dict):
+        return {key: reversed_arrays(part) for key, part in column.items()}
+    return tuple(map(reversed_arrays, column)) if isinstance(column, tuple) else column[::-1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_states_of_every_kind_of_recording(name: str, tmp_path: Path) -> None:
+    before = Recording(place(name, tmp_path))
+    relabel_recording(before, tmp_path / "new.mcap", lambda e: reversed_arrays(e.all_states), ["states"])
+    after = Recording(tmp_path / "new.mcap")
+    for old, new in zip(before.episodes, after.episodes, strict=True):
+        assert same(new.all_states, reversed_arrays(old.all_states))
+        assert (new.final_state is None) == (old.final_state is None)
+        for field in ("actions", "rewards", "terminals", "timeouts", "seed", "end", "return_"):
+            assert same(getattr(new, field), getattr(old, field))
+        assert jsonvalue.dumps([new.metadata, new.infos]) == jsonvalue.dumps([old.metadata, old.infos])
+    np.testing.assert_array_equal(after.read(fields=["times"]).times, before.read(fields=["times"]).times)
+    found = verify_recording(tmp_path / "new.mcap")
+    assert found.ok, found.problems
+
+
+def test_states_with_the_final_one(tmp_path: Path) -> None:
+    source = record(tmp_path / "r.mcap")
+    ds = tupli_mcap.open(source)
+    clipped = ds.map(
+        lambda e: e.all_states.clip(-0.5, 0.5), tmp_path / "clipped.mcap", fields=["observations"]
+    )
+    for old, new in zip(ds, tupli_mcap.open(clipped), strict=True):
+        np.testing.assert_array_equal(new.states, old.states.clip(-0.5, 0.5))
+        np.testing.assert_array_equal(new.next_states[-1], old.final_state.clip(-0.5, 0.5))
+        assert len(old.all_states) == len(old) + 1
+    both = ds.map(
+        lambda e: {"observations": e.all_states * 2, "rewards": e.rewards},
+        tmp_path / "both.mcap",
+        fields=["rewards", "states"],
+    )
+    np.testing.assert_array_equal(tupli_mcap.open(both).read().states, 2 * ds.read().states)
+    with pytest.raises(RecordingError, match=r"states of episode 0 of shape .* map episode\.all_states"):
+        ds.map(lambda e: e.states, tmp_path / "n.mcap", fields=["states"])
+
+
 @pytest.mark.parametrize(
     ("function", "fields"),
     [
@@ -157,9 +201,9 @@ def test_refuses_what_does_not_fit(function: Any, fields: list[str], tmp_path: P
 
 def test_replaces_nothing_by_itself(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap")
-    for place in (tmp_path, f"{tmp_path}/new/"):
+    for folder in (tmp_path, f"{tmp_path}/new/"):
         with pytest.raises(DatasetError, match="is a directory"):
-            tupli_mcap.open(source).map(lambda episode: episode.rewards, place)
+            tupli_mcap.open(source).map(lambda episode: episode.rewards, folder)
     with pytest.raises(DatasetError, match="exists"):
         tupli_mcap.open(source).map(lambda episode: episode.rewards, source)
 

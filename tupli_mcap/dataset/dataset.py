@@ -507,12 +507,13 @@ class Dataset(RandomAccess):
     ) -> Path:
         """Writes the episodes to a new recording, with new values of some fields; all else of them is kept.
 
-        `ds.map(lambda episode: episode.rewards - 1, "relabelled.mcap")` gives other rewards.
+        `ds.map(lambda episode: episode.rewards - 1, "relabelled.mcap")` gives other rewards,
+        `ds.map(lambda episode: episode.all_states.clip(-1, 1), "clipped.mcap", fields=["states"])` other states.
 
         Args:
-            function: from an `Episode` to its new column (a value for each step, nested as the space is); with several
-                fields, to a dict of columns.
-            fields: "rewards", "actions", or both.
+            function: from an `Episode` to its new column (a value for each step, nested as the space is; of states one
+                more where the final state is known); with several fields, to a dict of columns.
+            fields: some of "rewards", "actions", "states".
 
         Raises:
             DatasetError: there is no episode, or the target exists (and not `overwrite`).

@@ -193,6 +193,20 @@ class Episode(GymnasiumNames):
         return self._columns.states
 
     @property
+    def all_states(self) -> Any:
+        """The states, and behind them the final state where it is known: one more than there are steps."""
+        if self._row["final_row"] < 0:
+            return self.states
+        layout, finals = self._recording.layout, self._recording.final_states([self._position])
+        columns = [(leaf.get(self.states), leaf.get(finals)) for leaf in layout.state]
+        return layout.nest_state(
+            [
+                states + last if isinstance(states, list) else np.concatenate([states, last])
+                for states, last in columns
+            ]
+        )
+
+    @property
     def actions(self) -> Any:
         return self._columns.actions
 

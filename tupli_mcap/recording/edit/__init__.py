@@ -5,7 +5,7 @@ copy_episodes                     episodes of a recording into it
 copy_chunks                       chunks that can be copied as they are
 merge                             several recordings into one, with new numbers; one into several
 rewrite                           a recording with fewer episodes
-relabel, trim                     a recording with other rewards or actions; with fewer steps of episodes
+relabel, trim                     a recording with other values of steps; with fewer steps of episodes
 made_of                           what a recording was made of
 attach, annotate                  adds attachments; says more about episodes and the run
 carry_runs                        what recordings say of runs and episodes, for one made of them

@@ -35,15 +35,22 @@ class NewFrames(Protocol):
         ...
 
 
+class Column(Protocol):
+    """A value for each row of a channel: a list, or something that gives arrays."""
+
+    def __getitem__(self, rows: Any, /) -> Any: ...
+
+
 class NewValues(NamedTuple):
     """Values in place of those that were recorded.
 
-    columns: by step channel and leaf (ROS name), a value for each of the channel's rows. returns: of episodes, by
-    number.
+    columns: by channel and field of its messages, a value for each of the channel's rows. returns: of episodes, by
+    number. finals: final states, by number of the episode, as they follow `episode` and `env` in `/final_state`.
     """
 
-    columns: Mapping[int, Mapping[str, Array | list[Any]]]
+    columns: Mapping[int, Mapping[str, Column]]
     returns: Mapping[int, float]
+    finals: Mapping[int, bytes]
 
 
 class Trim(NamedTuple):
@@ -86,7 +93,7 @@ class EpisodeCopier:
     ) -> None:
         self._first_env = first_env
         self._trims = trims or {}
-        self._values = values or NewValues({}, {})
+        self._values = values or NewValues({}, {}, {})
         self._source, self._target, self._shift = source, target, shift
         self._channels = channels or {}
         self._cameras, self._new_frames = cameras, frames
@@ -269,6 +276,9 @@ class EpisodeCopier:
         channel, place = self._topics[FINAL_STATE], int(row["final_row"])
         if place < 0:
             return None
+        new = self._values.finals.get(int(row["episode"]))
+        if new is not None:
+            return self._time_of(channel, place), partial(bytes, numbers + new)
         return self._time_of(
             channel, place
         ), lambda: numbers + next(body for _, body in self._messages(channel, place, 1))[8:]

@@ -1,18 +1,24 @@
-"""A recording with other rewards or actions: everything else of it is kept."""
+"""A recording with other rewards, actions or states: everything else of it is kept."""
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap import files
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
+from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.copy_episodes import NewValues
 from tupli_mcap.recording.edit.made_of import say_made_of
 from tupli_mcap.recording.edit.replacing import replacing
@@ -20,11 +26,12 @@ from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["relabel_recording"]
 
-_FIELDS = ("rewards", "actions")
+_FIELDS = ("rewards", "actions", "states")
 
 
 def relabel_recording(
@@ -37,28 +44,27 @@ def relabel_recording(
 ) -> None:
     """Writes `target` (replaced in one rename) with new values of some fields.
 
-    States, flags, infos, frames, times, seeds, metadata, runs and the environment stay; returns follow the rewards. The
-    recording has a UUID of its own, and no signature.
+    All else of the steps, infos, frames, times, seeds, metadata, runs and the environment stay; returns follow the
+    rewards. The recording has a UUID of its own, and no signature.
 
     Args:
         function: from an episode to its new column; with several fields, to a dict of columns by field. A column has a
             value for each step, nested as the space is, which the recording's dtype holds exactly.
-        fields: "rewards", "actions", or both.
+            Of the states it has one more where the final state is known, as `Episode.all_states` has.
+        fields: some of "rewards", "actions" and "states".
         sources: what the recording is made of, where that is not `source`.
 
     Raises:
         RecordingError: another field; the function returns something else.
         StepError: a value of variable size is none of its space.
     """
-    for field in fields:
-        if field not in _FIELDS:
-            raise RecordingError(f"expected fields among {', '.join(_FIELDS)}, found {field!r:.80}")
-    values = _new_values(source, function, list(fields))
+    fields = field_names(fields, _FIELDS)
     name = (
         f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
     )
-    said = say_made_of(sources or [source], "map", function=name, fields=list(fields))
-    with replacing(target) as (fd, _):
+    said = say_made_of(sources or [source], "map", function=name, fields=fields)
+    with replacing(target) as (fd, new), _NewColumns(source, fields, new.parent) as columns:
+        values = _new_values(source, function, fields, columns)
         container = Container(fd, str(target), "zstd")
         write(
             source,
@@ -72,59 +78,126 @@ def relabel_recording(
         )
 
 
-def _new_values(source: Recording, function: Callable[[Episode], Any], fields: list[str]) -> NewValues:
-    layout, rows = source.layout, source.index
-    leaves = {field: field_leaves(field, layout) or [] for field in fields}
-    columns = {
-        channel: {
-            leaf.name: _empty(leaf, layout, source.file.store.count(channel))
-            for found in leaves.values()
-            for leaf in found
-        }
-        for channel in source.file.steps
-    }
+def _new_values(
+    source: Recording, function: Callable[[Episode], Any], fields: list[str], new: _NewColumns
+) -> NewValues:
     returns: dict[int, float] = {}
-    for episode, row in zip(source.episodes, rows, strict=True):
+    for episode, row in zip(source.episodes, source.index, strict=True):
         made = function(episode)
-        by_field: Mapping[str, Any] = {fields[0]: made} if len(fields) == 1 else made
+        by_field: Any = {fields[0]: made} if len(fields) == 1 else made
+        if isinstance(by_field, Mapping):
+            by_field = dict(zip(field_names(list(by_field), _FIELDS), by_field.values(), strict=True))
         if not isinstance(by_field, Mapping) or set(by_field) != set(fields):
             raise RecordingError(
                 f"expected a dict with {', '.join(fields)} of episode {episode.number}, found {made!r:.80}"
             )
-        first, channel = int(row["first_row"]), source.file.steps[int(row["env"])]
         for field in fields:
-            for leaf in leaves[field]:
-                column = _checked(by_field[field], leaf, layout, episode, field)
-                columns[channel][leaf.name][first : first + len(episode)] = column
+            new.put(episode, row, field, by_field[field])
         if "rewards" in fields:
-            returns[episode.number] = return_of(layout, by_field["rewards"], len(episode))
-    return NewValues(columns, returns)
+            returns[episode.number] = return_of(source.layout, by_field["rewards"], len(episode))
+    return NewValues(new.columns, returns, new.finals)
 
 
-def _empty(leaf: Leaf, layout: StepLayout, rows: int) -> Array | list[Any]:
-    return (
-        [None] * rows if leaf.kind == "variable" else np.zeros((rows, *leaf.shape), layout.dtypes[leaf.name])
-    )
+class _NewColumns:
+    """The columns of `NewValues`, episode by episode; those of constant size lie in files of the directory `spool`.
+
+    As a context manager it closes them.
+    """
+
+    def __init__(self, source: Recording, fields: Sequence[str], spool: Path) -> None:
+        self._layout, self._file = source.layout, source.file
+        self._spool, self._open = spool, ExitStack()
+        self._leaves = {field: field_leaves(field, source.layout) or [] for field in fields}
+        self._encode_final = final_encoder(source.layout)
+        self.columns: dict[int, dict[str, list[Any] | _Spool]] = {}
+        self.finals: dict[int, bytes] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def put(self, episode: Episode, row: Any, field: str, made: Any) -> None:
+        """Takes the values of a field. One more of the states than there are steps is the final state."""
+        first, channel, steps = int(row["first_row"]), self._file.steps[int(row["env"])], len(episode)
+        has_final = field == "states" and row["final_row"] >= 0
+        lasts = []
+        for leaf in self._leaves[field]:
+            told = f"{field} of episode {episode.number}"
+            values = _checked(made, leaf, self._layout, steps + has_final, told)
+            lasts.append(values[-1])
+            where, name = (self._image_channel(channel, leaf), "data") if leaf.apart else (channel, leaf.name)
+            if leaf.frames_last:
+                values = np.moveaxis(values, -1, 1)  # as they are stored
+            if leaf.kind == "variable" or leaf.size:
+                self._column(where, name, leaf)[first : first + steps] = values[:steps]
+        if has_final:
+            self.finals[episode.number] = self._encode_final(self._layout.nest_state(lasts))
+
+    def _image_channel(self, channel: int, leaf: Leaf) -> int:
+        return self._file.topics[Topics.of_step(self._file.contents.channels[channel].topic).image(leaf.name)]
+
+    def _column(self, channel: int, name: str, leaf: Leaf) -> list[Any] | _Spool:
+        columns = self.columns.setdefault(channel, {})
+        if name not in columns:
+            if leaf.kind == "variable":
+                columns[name] = [None] * self._file.store.count(channel)
+            else:
+                spool = _Spool(
+                    self._spool / f"{channel}.{name}", self._layout.dtypes[leaf.name], leaf.stored_shape
+                )
+                columns[name] = self._open.enter_context(spool)
+        return columns[name]
 
 
-def _checked(
-    made: Any, leaf: Leaf, layout: StepLayout, episode: Episode, field: str
-) -> Array | Sequence[Any]:
-    where = f"{field} of episode {episode.number}"
+class _Spool:
+    """Values of one dtype and shape in a file, written and read by their numbers."""
+
+    def __init__(self, path: Path, dtype: DType, shape: tuple[int, ...]) -> None:
+        self._file = os.fdopen(files.create(path), "w+b")
+        self._dtype, self._shape = dtype, shape
+        self._size = dtype.itemsize * math.prod(shape)
+
+    def __setitem__(self, rows: slice, values: Array) -> None:
+        self._file.seek(rows.start * self._size)
+        self._file.write(values.tobytes())
+
+    def __getitem__(self, rows: slice | int) -> Any:
+        first, stop = (rows.start, rows.stop) if isinstance(rows, slice) else (rows, rows + 1)
+        self._file.seek(first * self._size)
+        data = self._file.read((stop - first) * self._size)
+        values = np.frombuffer(data, self._dtype).reshape(stop - first, *self._shape)
+        return values if isinstance(rows, slice) else values[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+
+def _checked(made: Any, leaf: Leaf, layout: StepLayout, count: int, where: str) -> Any:
+    """`count` values of a leaf, as they are stored."""
     try:
         if leaf.kind == "variable":  # its values are looked at when they are encoded
             values: Sequence[Any] = leaf.get(made)
-            if len(values) != len(episode):
-                raise RecordingError(f"expected {len(episode)} {where}, found {len(values)}")
+            if len(values) != count:
+                raise RecordingError(f"expected {count} {where}, found {len(values)}{_hint(where)}")
             return values
         given = np.asarray(leaf.get(made))
     except (KeyError, IndexError, TypeError, ValueError) as err:
         raise RecordingError(f"expected {where} as {leaf.path} has them: {err}") from err
-    shape, dtype = (len(episode), *leaf.shape), layout.dtypes[leaf.name]
+    shape, dtype = (count, *leaf.shape), layout.dtypes[leaf.name]
     if given.shape != shape or given.dtype.kind not in "biuf":
-        raise RecordingError(f"expected {where} of shape {shape}, found {given.shape} of {given.dtype}")
+        found = f"{given.shape} of {given.dtype}"
+        raise RecordingError(f"expected {where} of shape {shape}, found {found}{_hint(where)}")
     with np.errstate(over="ignore", invalid="ignore"):
         stored = given.astype(dtype)
     if not np.array_equal(stored.astype(given.dtype), given, equal_nan=given.dtype.kind == "f"):
         raise RecordingError(f"expected {where} that {dtype} holds exactly, found {given.dtype}; cast them")
     return stored
+
+
+def _hint(where: str) -> str:
+    return "; the final state is the last one: map episode.all_states" if where.startswith("states") else ""
