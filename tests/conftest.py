@@ -13,6 +13,7 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
+    from postgres import Cluster
     from viewing import HeadlessViewer
 
 
@@ -47,6 +48,20 @@ def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeadlessViewer]
         pytest.skip(f"{err}; `tools/setup-viewer` says what is missing")
     with viewer:
         yield viewer
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Cluster]:
+    """One PostgreSQL for all tests, which make databases of their own in it. Skips where it is not installed."""
+    from postgres import NoPostgresError, cluster
+
+    try:
+        with cluster() as made:
+            yield made
+    except NoPostgresError as err:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(str(err))
 
 
 def pytest_configure() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from postgres import Cluster
 from serving import PASSWORD, serving
 from test_storage import StorageContract
 
@@ -16,10 +18,14 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 
 
-@pytest.fixture
-def url(tmp_path: Path) -> Iterator[str]:
-    with serving(Settings(tmp_path / "served")) as url:
-        yield url
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    with contextlib.ExitStack() as stack:
+        database = ""
+        if request.param == "postgresql":
+            postgres: Cluster = request.getfixturevalue("postgres")
+            database = stack.enter_context(postgres.database())
+        yield stack.enter_context(serving(Settings(tmp_path / "served", database=database)))
 
 
 @pytest.fixture

@@ -1,19 +1,21 @@
-"""One filter, one meaning: in memory, in SQLite, through JSON and as text."""
+"""One filter, one meaning: in memory, in SQLite and PostgreSQL, through JSON and as text."""
 
 from __future__ import annotations
 
+import contextlib
 import datetime
+import itertools
 import json
 import math
 import re
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
+from postgres import Cluster, ServerCatalog
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.jsonvalue import dumps_plain
@@ -168,6 +170,7 @@ FACTS: dict[str, st.SearchStrategy[Any]] = {
     "published_in": texts | st.just("me"),
 }
 """What each key that is no metadata may be compared with."""
+ORDERED = (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ)
 operations = st.sampled_from([FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ])
 
 
@@ -224,7 +227,7 @@ def header_of(number: int, row: dict[str, Any]) -> EpisodeHeader:
     )
 
 
-def fill(catalog: Catalog, headers: list[EpisodeHeader]) -> None:
+def fill(catalog: Catalog | ServerCatalog, headers: list[EpisodeHeader]) -> None:
     rows = [
         EpisodeRow(
             episode=h.episode,
@@ -243,24 +246,23 @@ def fill(catalog: Catalog, headers: list[EpisodeHeader]) -> None:
     catalog.put_recording("r.mcap", STAMP, uuid=UUID, benchmark_id="bench", rows=rows)
 
 
+KEYS = ("metadata.a", "metadata.a.b", 'metadata."a.b"', "metadata.0", "n_tuples", "episode_return", "end")
+
+
 @pytest.fixture(scope="module")
-def catalogs() -> Iterator[tuple[Catalog, Catalog]]:
-    """One catalog without declared keys and one with."""
-    with Catalog(None) as plain, Catalog(None) as declared:
-        for key in (
-            "metadata.a",
-            "metadata.a.b",
-            'metadata."a.b"',
-            "metadata.0",
-            "n_tuples",
-            "episode_return",
-            "end",
-        ):
-            declared.declare_key(key)
-        yield plain, declared
+def catalogs(postgres: Cluster) -> Iterator[list[Catalog | ServerCatalog]]:
+    """Of SQLite and PostgreSQL, one catalog without declared keys and one with."""
+    with contextlib.ExitStack() as stack:
+        made = [stack.enter_context(Catalog(None)) for _ in range(2)]
+        urls = [stack.enter_context(postgres.database()) for _ in range(2)]
+        of_server = [stack.enter_context(ServerCatalog(url)) for url in urls]
+        for key in KEYS:
+            made[1].declare_key(key)
+            of_server[1].declare_key(key)
+        yield [*made, *of_server]
 
 
-@contextmanager
+@contextlib.contextmanager
 def local_zone(name: str) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TZ", name)
@@ -277,10 +279,10 @@ def _zone() -> Iterator[None]:
 
 
 class TestOneMeaning:
-    @settings(max_examples=400, deadline=None)
+    @settings(max_examples=150, deadline=None)
     @given(data=st.lists(rows, min_size=1, max_size=4), filter=filters)
-    def test_memory_and_sqlite_agree(
-        self, catalogs: tuple[Catalog, Catalog], data: list[dict[str, Any]], filter: BaseFilter
+    def test_memory_and_databases_agree(
+        self, catalogs: list[Catalog | ServerCatalog], data: list[dict[str, Any]], filter: BaseFilter
     ) -> None:
         headers = [header_of(number, row) for number, row in enumerate(data)]
         predicate = compile_predicate(filter, EpisodeHeader)
@@ -300,8 +302,8 @@ class TestOneMeaning:
         kind=operations,
         value=wanted | own_texts | times,
     )
-    def test_what_is_refused_in_memory_is_refused_in_sqlite(
-        self, catalogs: tuple[Catalog, Catalog], key: str, kind: Any, value: Any
+    def test_what_is_refused_in_memory_is_refused_in_databases(
+        self, catalogs: list[Catalog | ServerCatalog], key: str, kind: Any, value: Any
     ) -> None:
         def refusal(ask: Any) -> str | None:
             try:
@@ -315,7 +317,7 @@ class TestOneMeaning:
         except FilterError:
             return
         said = refusal(lambda: compile_predicate(asked, EpisodeHeader))
-        assert said == refusal(lambda: catalogs[0].count(asked)) == refusal(lambda: catalogs[1].count(asked))
+        assert {said} == {refusal(lambda of=catalog: of.count(asked)) for catalog in catalogs}
         if key not in FACTS:
             assert said is not None
 
@@ -346,16 +348,17 @@ class TestOneMeaning:
         else:
             assert flat(parse_filter(format_filter(filter))) == flat(filter)
 
-    @pytest.mark.parametrize("value", COMPARED)
-    def test_numbers_compare_exactly_in_sqlite(self, value: float) -> None:
-        with Catalog(None) as catalog:
+    @pytest.mark.parametrize("of", ["sqlite", "postgresql"])
+    def test_numbers_compare_exactly_in_databases(self, of: str, postgres: Cluster) -> None:
+        with postgres.database() as url, Catalog(None) if of == "sqlite" else ServerCatalog(url) as catalog:
             fill(catalog, [header_of(i, base_row({"x": number}, number)) for i, number in enumerate(NUMBERS)])
-            for operation in (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ):
+            headers = catalog.episodes()
+            for value, operation in itertools.product(COMPARED, ORDERED):
                 real = ("metadata.x", "episode_return") if value == value else ("metadata.x",)
                 may_be_seed = value % 1 == 0 or (value == value and operation not in (FilterEQ, FilterNE))
                 for key in (*real, *(("seed",) if may_be_seed else ())):
                     asked = operation(key=key, value=value)
-                    expected = [h.episode for h in catalog.episodes() if compile_predicate(asked)(h)]
+                    expected = [h.episode for h in headers if compile_predicate(asked)(h)]
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
 
 

@@ -1,4 +1,7 @@
-"""The database of a server: its tables and those of the catalog, in SQLite or PostgreSQL."""
+"""The database of a server: its tables and those of the catalog, in SQLite or PostgreSQL.
+
+On both, one transaction writes at a time, and each that reads sees one state of all tables from beginning to end.
+"""
 
 from __future__ import annotations
 
@@ -9,43 +12,63 @@ import time
 from collections.abc import Iterator, Sequence
 
 from sqlalchemy import Connection, Engine, create_engine, delete, event, insert, select
-from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.exc import (
+    DataError,
+    DBAPIError,
+    IntegrityError,
+    InterfaceError,
+    OperationalError,
+    SQLAlchemyError,
+)
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.server import tables
-from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
+from tupli_mcap.server import migrations, tables
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["Database", "audience", "audit", "pend", "settle"]
+__all__ = ["Database", "UnavailableError", "audience", "audit", "pend", "settle"]
 
 _BUSY_MS = 30_000
+_WRITERS = 0x7475_706C  # the number of the lock that a writer holds on PostgreSQL
+_MOST_GROUPS_BYTES = 2000  # PostgreSQL indexes no longer texts
+
+
+class UnavailableError(StorageError):
+    """What the server keeps things in does not answer, or is busy; asked again later, it may."""
 
 
 class Database:
     """Transactions on the tables of a server, from any thread.
 
     Raises:
-        StorageError: the database cannot be opened.
+        StorageError: the database cannot be opened, or is of a later version.
     """
 
     def __init__(self, url: str) -> None:
         self._engine = _engine(url)
-        with self.writing() as connection:
-            tables.METADATA.create_all(connection)
-            CATALOG.create_all(connection)
+        try:
+            with self.writing() as connection:
+                migrations.upgrade(connection)
+        except BaseException:
+            self.close()
+            raise
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Connection]:
         """A transaction that changes nothing."""
-        with _translated(), self._engine.connect() as connection, connection.begin():
-            yield connection
+        with _translated(), self._engine.connect() as connection:
+            if connection.dialect.name == "postgresql":
+                connection.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+            with connection.begin():
+                yield connection
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[Connection]:
-        """A transaction: committed at the end, rolled back on an exception."""
+        """A transaction that no other one writes beside: committed at the end, rolled back on an exception."""
         with _translated(), self._engine.connect() as connection:
             connection.execution_options(tupli_write=True)
             with connection.begin():
+                if connection.dialect.name == "postgresql":
+                    connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_WRITERS})")
                 yield connection
 
     def close(self) -> None:
@@ -54,8 +77,17 @@ class Database:
 
 
 def audience(connection: Connection, groups: Sequence[str]) -> str:
-    """The text that stands for a list of groups in `published_in`; from then on, SQL finds it by each of them."""
+    """The text that stands for a list of groups in `published_in`; from then on, SQL finds it by each of them.
+
+    Raises:
+        StorageError: there are too many groups.
+    """
     text = json.dumps(list(groups))
+    if len(text) > _MOST_GROUPS_BYTES:
+        raise StorageError(
+            f"expected groups of at most {_MOST_GROUPS_BYTES} bytes in all, found {len(groups)} groups "
+            f"of {len(text)} bytes; unpublish some, or publish in 'global'"
+        )
     table = tables.AUDIENCE
     known = set(connection.execute(select(table.c.team).where(table.c.published_in == text)).scalars())
     new = [group for group in dict.fromkeys(map(escape_text, groups)) if group not in known]
@@ -84,13 +116,17 @@ def settle(connection: Connection, name: str) -> None:
 
 def _engine(url: str) -> Engine:
     try:
-        engine = create_engine(url)
+        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
     except (SQLAlchemyError, ImportError) as err:
         raise StorageError(
             f"the database cannot be used: {err}; give a URL such as postgresql+psycopg://…"
         ) from err
-    if engine.dialect.name == "sqlite":
-        _prepare_sqlite(engine)
+    if engine.dialect.name not in ("sqlite", "postgresql"):
+        raise StorageError(
+            f"expected a database of SQLite or PostgreSQL, found {engine.dialect.name}; "
+            "give a URL such as postgresql+psycopg://…"
+        )
+    (_prepare_sqlite if engine.dialect.name == "sqlite" else _prepare_postgresql)(engine)
     return engine
 
 
@@ -109,9 +145,22 @@ def _prepare_sqlite(engine: Engine) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
 
+def _prepare_postgresql(engine: Engine) -> None:
+    @event.listens_for(engine, "do_connect")
+    def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
+        kwargs.setdefault("connect_timeout", 10)
+        kwargs["options"] = f"{kwargs.get('options', '')} -c lock_timeout={_BUSY_MS}"
+
+
 @contextlib.contextmanager
 def _translated() -> Iterator[None]:
     try:
         yield
+    except (DataError, UnicodeEncodeError) as err:
+        raise StorageError("expected texts and numbers that a database can hold") from err
+    except IntegrityError as err:
+        raise StorageError(f"this contradicts what is stored: {str(err.orig).partition(chr(10))[0]}") from err
+    except (OperationalError, InterfaceError) as err:
+        raise UnavailableError(f"the server's database cannot be used: {err.orig}") from err
     except DBAPIError as err:
         raise StorageError(f"the server's database cannot be used: {err.orig}") from err

@@ -21,6 +21,7 @@ from tupli_mcap.errors import (
     TupliError,
 )
 from tupli_mcap.schema import BaseFilter
+from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.throttle import TooManyError
@@ -38,11 +39,18 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     GoneError: 410,
     BusyError: 423,
     ChecksumError: 460,  # as tus has it
+    UnavailableError: 503,
     FilterError: 400,
     SpaceError: 400,
     FormatError: 400,
     StorageError: 400,
     MissingExtraError: 501,
+}
+
+
+_FAILED: Final = {
+    500: "the server has failed; its log says more",
+    503: "the server cannot reach what it keeps things in; try again later",
 }
 
 
@@ -97,5 +105,5 @@ def tell_errors(app: FastAPI) -> None:
         if isinstance(err, TooManyError):
             headers["Retry-After"] = str(math.ceil(err.seconds))
         kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
-        text = str(err) if status != 500 else "the server has failed; its log says more"
+        text = _FAILED.get(status, str(err))
         return JSONResponse({"detail": text, "error": kind}, status, headers)

@@ -7,4 +7,5 @@ place               where it lies, for this user alone
 entries             what it holds of a recording, read here or by other processes
 rows                episodes as rows
 filter_sql          filters as SQL that finds what may match; Python looks at that again
+metadata_sql        what SQL finds in metadata
 """

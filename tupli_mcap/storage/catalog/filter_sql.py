@@ -5,8 +5,7 @@ floats, texts that SQL and Python may order differently not at all. Each compari
 all rows that match, and says whether it is exact, true of no others. What is found by a condition that is not exact is
 asked again in Python (`tupli_mcap.schema.predicate`), so that a filter means the same everywhere.
 
-All of it is SQL of any database, but for `json_extract` and `json_type`, which look into metadata where no key was
-declared: without them, all is asked again.
+All of it is SQL of any database, but for what looks into metadata where no key was declared: `metadata_sql`.
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ import json
 import math
 import operator
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import and_, false, func, not_, or_, select, true, union_all
+from sqlalchemy import and_, case, false, not_, or_, select, true, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.messages.episodes import END_NAMES
@@ -27,8 +27,9 @@ from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify
-from tupli_mcap.storage.catalog.rows import nearest_float
-from tupli_mcap.storage.catalog.tables import EPISODE, EPISODE_BITS, RECORDING, VALUE
+from tupli_mcap.storage.catalog.metadata_sql import kind_at, value_at
+from tupli_mcap.storage.catalog.rows import indexed_text, nearest_float
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE, first_of
 from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["Narrowed", "merged", "narrowed"]
@@ -43,6 +44,8 @@ _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII wi
 # SQLite reads a decimal number to within a few units in the last place.
 _READ_WITHIN: Final = 1e-12
 _SMALLEST: Final = 1e-300
+_LARGEST: Final = sys.float_info.max
+_LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
 
 _EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
 _OPERATORS: Final[Mapping[FilterType, Callable[[Any, Any], Any]]] = {
@@ -160,9 +163,9 @@ def _compared(filter: BaseFilter) -> Narrowed:
         chosen = (condition for choice, condition in _CHOICES[name].items() if test(choice))
         return Narrowed(or_(false(), *chosen), exact=True)
     if name in _TEXTS:
-        return _exactly(filter, _TEXTS[name], escape_text)
+        return _of_texts(filter, _TEXTS[name])
     if name in _INTEGERS:
-        return _exactly(filter, _INTEGERS[name], _bindable)
+        return _of_integers(filter, _INTEGERS[name])
     if name == "id":
         return _of_ids(filter)
     if name == "published_in":
@@ -174,25 +177,43 @@ def _compared(filter: BaseFilter) -> Narrowed:
     return Narrowed(_in_metadata(filter), exact=False)
 
 
-def _exactly(filter: BaseFilter, column: ColumnElement[Any], stored: Callable[[Any], Any]) -> Narrowed:
+def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
     if filter.type is FilterType.IN:
-        values = [stored(value) for value in filter.value]
-        return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
-    return Narrowed(_OPERATORS[filter.type](column, stored(filter.value)), exact=True)
+        return _one_of(column, [escape_text(value) for value in filter.value])
+    return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)), exact=True)
+
+
+def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
+    """A comparison of 64-bit integers with a number of any size; only in order may that have a fraction."""
+    if filter.type is FilterType.IN:
+        return _one_of(column, [int(v) for v in filter.value if _LEAST_INTEGER <= v <= _MOST_INTEGER])
+    kind, wanted = filter.type, filter.value
+    if not _LEAST_INTEGER <= wanted <= _MOST_INTEGER:
+        below = wanted < 0
+        above_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
+        return Narrowed(true() if above_all or kind is FilterType.NE else false(), exact=True)
+    rounded = math.ceil if kind in (FilterType.GEQ, FilterType.LT) else math.floor
+    return Narrowed(_OPERATORS[kind](column, rounded(wanted)), exact=True)
+
+
+def _one_of(column: ColumnElement[Any], values: Sequence[Any]) -> Narrowed:
+    return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
 
 
 def _near(
     filter: BaseFilter, number: ColumnElement[Any], text: ColumnElement[Any] | None = None
 ) -> Condition:
-    """A comparison, other than NE, with what is stored as the nearest float, or a text."""
+    """A comparison, other than NE, with what is stored as the nearest float, or the beginning of a text."""
     wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
     numbers = [nearest_float(scalar.value) for scalar in wanted if scalar.kind in ("number", "bool")]
-    texts = [escape_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
+    texts = [indexed_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
     if filter.type not in (FilterType.EQ, FilterType.IN):
         rising = filter.type in (FilterType.GT, FilterType.GEQ)
         if numbers:
             return number >= numbers[0] if rising else number <= numbers[0]
-        return false() if text is None or not texts else _OPERATORS[filter.type](text, texts[0])
+        if text is None or not texts:
+            return false()
+        return text >= texts[0] if rising else text <= texts[0]
     parts = [_any_of(number, numbers)]
     if any(scalar.kind == "null" for scalar in wanted):
         parts.append(number.is_(None))
@@ -202,7 +223,7 @@ def _near(
 
 
 def _in_metadata(filter: BaseFilter) -> Condition:
-    """A comparison, other than NE, with what JSON functions find in metadata."""
+    """A comparison, other than NE, with what SQL finds in metadata."""
     path = path_of(filter)[1:]
     wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
     texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
@@ -211,24 +232,30 @@ def _in_metadata(filter: BaseFilter) -> Condition:
         return true()
     if len(wanted) > _MOST_VALUES:
         return true()
-    where = "$" + "".join(f'."{segment}"' for segment in path)
-    value = func.json_extract(EPISODE.c.metadata, where)
-    parts = [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
+    value, parts = value_at(path), [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
     for scalar in wanted:
         if scalar.kind == "text":
             parts.append(value == scalar.value)
         elif scalar.kind == "null":
-            parts.append(func.json_type(EPISODE.c.metadata, where) == "null")
+            parts.append(kind_at(path) == "null")
+        elif scalar.kind == "bool":
+            parts.append(value == scalar.value)
         elif scalar.kind != "nan":
-            near = nearest_float(scalar.value)
-            room = 0.0 if math.isinf(near) else abs(near) * _READ_WITHIN + _SMALLEST
-            low, high = near - room, near + room
-            least = value >= low if filter.type not in (FilterType.LT, FilterType.LEQ) else true()
-            most = value <= high if filter.type not in (FilterType.GT, FilterType.GEQ) else true()
-            parts.append(and_(least, most))
+            parts.append(_number_in_metadata(filter.type, value, nearest_float(scalar.value)))
     if filter.type not in ORDERING:
-        parts.append(func.json_type(EPISODE.c.metadata, where) == "array")  # an element may be equal
-    return or_(*parts)
+        parts.append(kind_at(path) == "array")  # an element may be equal
+    return case((EPISODE.c.readable, or_(*parts)), else_=true())
+
+
+def _number_in_metadata(kind: FilterType, value: ColumnElement[Any], near: float) -> Condition:
+    room = 0.0 if math.isinf(near) else abs(near) * _READ_WITHIN + _SMALLEST
+    low, high = (min(max(bound, -_LARGEST), _LARGEST) for bound in (near - room, near + room))
+    parts: list[Condition] = [value.is_not(None)]
+    if kind not in (FilterType.LT, FilterType.LEQ) and near > -math.inf:
+        parts.append(value >= low)
+    if kind not in (FilterType.GT, FilterType.GEQ) and near < math.inf:
+        parts.append(value <= high)
+    return and_(*parts)
 
 
 def _of_groups(filter: BaseFilter) -> Narrowed:
@@ -254,7 +281,7 @@ def _of_ids(filter: BaseFilter) -> Narrowed:
     if not ids:
         return Narrowed(false() if filter.type is not FilterType.NE else true(), exact=True)
     named = RECORDING.alias("named")
-    first = named.c.id.op("<<")(EPISODE_BITS)
+    first = first_of(named.c.id)
     rows = union_all(*(select(first + number).where(named.c.uuid == uuid) for uuid, number in ids))
     found = EPISODE.c.id.in_(rows)
     return Narrowed(not_(found) if filter.type is FilterType.NE else found, exact=True)
@@ -265,10 +292,3 @@ def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:
     if len(values) <= _MOST_VALUES:
         return column.in_(values) if values else false()
     return column.between(min(values), max(values))
-
-
-def _bindable(number: float) -> float:
-    """A number that a database can be given, and that compares with every 64-bit integer as `number` does."""
-    if isinstance(number, int) and not -(2**63) <= number < 2**63:
-        return math.inf if number > 0 else -math.inf
-    return number

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, select, true
@@ -56,6 +56,7 @@ __all__ = [
 ]
 
 _ROWS_AT_ONCE: Final = 20_000
+_ROWS_OF_ANSWER: Final = 500  # as many recordings are named in a statement at most
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
 
@@ -134,15 +135,17 @@ def count_episodes(
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
-    """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""
+    """The SQL of a filter, its parameters, the database's plan for it, and whether Python looks at what that finds."""
     meant = _bound(filter)
     found = _narrowed(connection, meant, None)
     compiled = _query(meant, found, EPISODE.c.id).compile(
         connection, compile_kwargs={"render_postcompile": True}
     )
-    values = tuple(compiled.params[name] for name in compiled.positiontup or ())
-    plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {compiled}", values)
-    steps = [f"  {row.detail}" for row in plan]
+    values: Any = compiled.params
+    if compiled.positional:
+        values = tuple(compiled.params[name] for name in compiled.positiontup or ())
+    explain = "EXPLAIN QUERY PLAN" if connection.dialect.name == "sqlite" else "EXPLAIN"
+    steps = [f"  {row[-1]}" for row in connection.exec_driver_sql(f"{explain} {compiled}", values)]
     last = [] if found.exact else ["then each episode that was found is compared exactly"]
     return "\n".join([str(compiled), f"parameters: {values!r}", "plan:", *steps, *last])
 
@@ -161,8 +164,8 @@ def declare_key(connection: Connection, key: str) -> None:
     number = connection.execute(select(func.count()).select_from(DECLARED)).scalar_one()
     connection.execute(insert(DECLARED).values(key=escape_text(key), number=number))
     if is_indexed(path):
-        rows = connection.execute(select(*_COLUMNS).order_by(EPISODE.c.id))
-        for chunk in rows.partitions(_ROWS_AT_ONCE):
+        all_rows = select(*_COLUMNS).order_by(EPISODE.c.id)
+        for chunk in connection.execute(all_rows, execution_options={"yield_per": _ROWS_AT_ONCE}).partitions():
             _index(connection, [StoredRow(*row) for row in chunk], {path: number})
 
 
@@ -217,29 +220,32 @@ def _headers(
     by = [value.desc() if descending else value for value, descending in order]
     query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
     if limit is None:
-        rows = connection.execute(query.offset(offset or None))
+        rows = connection.execute(
+            query.offset(offset or None), execution_options={"yield_per": _ROWS_OF_ANSWER}
+        )
     else:  # first which ones they are: a database puts ids in order quicker than whole rows
         few = _query(filter, found, EPISODE.c.id).order_by(*by).limit(limit).offset(offset or None)
         rows = connection.execute(query.where(EPISODE.c.id.in_(few)))
     matches = None if filter is None or found.exact else bound_predicate(filter)
     width = len(_COLUMNS)
     runs: dict[int, list[dict[str, Any]]] = {}
-    for row in rows:
-        stored = StoredRow(*row[:width])
-        if stored.recording_id not in runs:
-            runs[stored.recording_id] = _runs_of(connection, stored.recording_id)
-        uuid, benchmark_id, path = row[width:]
-        made = header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
-        if matches is None or matches(made):
-            yield made
+    for page in rows.partitions(_ROWS_OF_ANSWER):
+        stored = [StoredRow(*row[:width]) for row in page]
+        _add_runs(connection, runs, {row.recording_id for row in stored})
+        for row, (*_, uuid, benchmark_id, path) in zip(stored, page, strict=True):
+            made = header(row, uuid, benchmark_id, path, runs[row.recording_id][row.run])
+            if matches is None or matches(made):
+                yield made
 
 
-def _runs_of(connection: Connection, recording_id: int) -> list[dict[str, Any]]:
-    """The runs that a recording's episodes are of, by their places."""
-    found: list[dict[str, Any]] = jsonvalue.loads(
-        connection.execute(select(RECORDING.c.runs).where(RECORDING.c.id == recording_id)).scalar_one()
-    )
-    return found
+def _add_runs(
+    connection: Connection, known: dict[int, list[dict[str, Any]]], recordings: Collection[int]
+) -> None:
+    """Adds the runs that the episodes of recordings are of, by their places."""
+    missing = [number for number in recordings if number not in known]
+    if missing:
+        found = select(RECORDING.c.id, RECORDING.c.runs).where(RECORDING.c.id.in_(missing))
+        known.update((number, jsonvalue.loads(runs)) for number, runs in connection.execute(found))
 
 
 def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:

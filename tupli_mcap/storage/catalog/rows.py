@@ -19,10 +19,22 @@ from tupli_mcap.schema.values import classify
 from tupli_mcap.storage.catalog.tables import EPISODE_BITS
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["EpisodeRow", "StoredRow", "header", "indexed_value", "is_indexed", "nearest_float", "store_row"]
+__all__ = [
+    "EpisodeRow",
+    "StoredRow",
+    "header",
+    "indexed_text",
+    "indexed_value",
+    "is_indexed",
+    "nearest_float",
+    "store_row",
+]
 
 _INT64_MIN: Final = -(2**63)
+_INDEXED_CHARACTERS: Final = 500
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
+# What PostgreSQL does not read: NUL in a text, and numbers that may be beyond its floats.
+_UNREADABLE: Final = re.compile(r"\\u0000|[eE][+-]?[0-9]{3}|[0-9]{100}")
 
 
 class EpisodeRow(NamedTuple):
@@ -61,6 +73,7 @@ class StoredRow(NamedTuple):
     created_by: str
     published_in: str
     metadata: str
+    readable: bool
     success: int | None
     run: int
     exact: str | None
@@ -100,6 +113,7 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
         metadata=metadata,
+        readable=not _UNREADABLE.search(metadata),
         success=None if succeeded is None else int(succeeded),
         run=row.run,
         exact=json.dumps(exact) if exact else None,
@@ -140,14 +154,20 @@ def indexed_value(row: StoredRow, metadata: object, path: tuple[str, ...]) -> tu
     """What `value` holds of an episode at a path (number, text); None if nothing is there."""
     if path[0] != "metadata":
         stored = getattr(row, path[0])
-        return (None, stored) if isinstance(stored, str) else (stored, None)
+        return (None, indexed_text(stored)) if isinstance(stored, str) else (stored, None)
     found = look_up(metadata, path[1:])
     if found is MISSING:
         return None
     scalar = classify(found)
     if scalar.kind == "text":
-        return None, escape_text(scalar.value)
+        return None, indexed_text(scalar.value)
     return (nearest_float(scalar.value), None) if scalar.kind in ("number", "bool") else (None, None)
+
+
+def indexed_text(text: str) -> str:
+    """What is indexed of a text: its beginning, as PostgreSQL indexes no long ones. In order as the texts are, but that
+    two texts may begin alike."""
+    return escape_text(text)[:_INDEXED_CHARACTERS]
 
 
 def nearest_float(number: float) -> float:

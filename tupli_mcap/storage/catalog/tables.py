@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from sqlalchemy import BigInteger, Column, Float, ForeignKey, Index, Integer, MetaData, Table, Text, and_
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    Table,
+    Text,
+    and_,
+    false,
+)
 from sqlalchemy.sql.elements import ColumnElement
 
 __all__ = [
@@ -13,59 +26,64 @@ __all__ = [
     "EPISODE",
     "EPISODE_BITS",
     "METADATA",
+    "NUMBER",
     "RECORDING",
     "TALLY",
+    "TEXT",
     "VALUE",
     "VERSION",
     "episodes_of",
+    "first_of",
     "in_order",
     "of_one_recording",
 ]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 6
+VERSION: Final = 7
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
 
 METADATA: Final = MetaData()
 
-_ID: Final = BigInteger().with_variant(
-    Integer, "sqlite"
-)  # SQLite numbers rows by themselves in an INTEGER only
+TEXT: Final = Text().with_variant(Text(collation="C"), "postgresql")
+"""A text that is ordered by code points."""
+NUMBER: Final = BigInteger().with_variant(Integer, "sqlite")
+"""A whole number of 64 bits. SQLite numbers rows by themselves in an INTEGER only."""
 
 RECORDING: Final = Table(
     "recording",
     METADATA,
-    Column("id", _ID, primary_key=True),
-    Column("path", Text, nullable=False, unique=True),
-    Column("size", BigInteger, nullable=False),
-    Column("mtime_ns", BigInteger, nullable=False),
-    Column("mixed", BigInteger, nullable=False),
-    Column("uuid", Text, nullable=False, index=True),
-    Column("benchmark_id", Text, nullable=False, index=True),
-    Column("environment", Text, nullable=False),  # that of its first run, "" if it does not say
-    Column("runs", Text, nullable=False),  # JSON: those that its episodes are of
+    Column("id", NUMBER, primary_key=True),
+    Column("path", TEXT, nullable=False, unique=True),
+    Column("size", NUMBER, nullable=False),
+    Column("mtime_ns", NUMBER, nullable=False),
+    Column("mixed", NUMBER, nullable=False),
+    Column("uuid", TEXT, nullable=False, index=True),
+    Column("benchmark_id", TEXT, nullable=False, index=True),
+    Column("environment", TEXT, nullable=False, server_default=""),  # that of its first run, "" if it does not say
+    Column("runs", TEXT, nullable=False),  # JSON: those that its episodes are of
 )
 
 EPISODE: Final = Table(
     "episode",
     METADATA,
-    Column("id", _ID, primary_key=True),
-    Column("recording_id", _ID, ForeignKey("recording.id"), nullable=False),
-    Column("episode", Integer, nullable=False),
-    Column("env", Integer, nullable=False),
-    Column("n_tuples", Integer, nullable=False),
-    Column("end", Text, nullable=False),
+    Column("id", NUMBER, primary_key=True),
+    Column("recording_id", NUMBER, ForeignKey("recording.id"), nullable=False),
+    Column("episode", NUMBER, nullable=False),
+    Column("env", NUMBER, nullable=False),
+    Column("n_tuples", NUMBER, nullable=False),
+    Column("end", TEXT, nullable=False),
     Column("episode_return", Float),  # NULL for NaN, too
     Column("seed", Float),  # the nearest one
-    Column("created_at", BigInteger, nullable=False),  # ns since 1970 in UTC, whole microseconds
-    Column("created_by", Text, nullable=False),
-    Column("published_in", Text, nullable=False),
-    Column("metadata", Text, nullable=False),
-    Column("success", Integer),  # 0 or 1 where the metadata say it
-    Column("run", Integer, nullable=False),  # its place among the recording's
-    Column("exact", Text),  # JSON of the fields of which the columns do not say all
+    Column("created_at", NUMBER, nullable=False),  # ns since 1970 in UTC, whole microseconds
+    Column("created_by", TEXT, nullable=False),
+    Column("published_in", TEXT, nullable=False),
+    Column("metadata", TEXT, nullable=False),
+    Column("readable", Boolean, nullable=False, server_default=false()),  # whether SQL may look into the metadata
+    Column("success", NUMBER),  # 0 or 1 where the metadata say it
+    Column("run", NUMBER, nullable=False),  # its place among the recording's
+    Column("exact", TEXT),  # JSON of the fields of which the columns do not say all
 )
 
 # Sums over the episodes of a recording that the same people see: what is shown of many recordings looks at no episode.
@@ -73,36 +91,36 @@ EPISODE: Final = Table(
 TALLY: Final = Table(
     "tally",
     METADATA,
-    Column("recording_id", _ID, ForeignKey("recording.id"), primary_key=True),
-    Column("created_by", Text, primary_key=True),
-    Column("published_in", Text, primary_key=True),
-    Column("episodes", BigInteger, nullable=False),
+    Column("recording_id", NUMBER, ForeignKey("recording.id"), primary_key=True),
+    Column("created_by", TEXT, primary_key=True),
+    Column("published_in", TEXT, primary_key=True),
+    Column("episodes", NUMBER, nullable=False),
     Column("steps", Float, nullable=False),  # a file may claim more than an integer of a database holds
-    Column("returns", BigInteger, nullable=False),  # how many are numbers
+    Column("returns", NUMBER, nullable=False),  # how many are numbers
     Column("return_sum", Float),  # of those
     Column("return_least", Float),
     Column("return_most", Float),
-    Column("told", BigInteger, nullable=False),  # how many say whether they succeeded
-    Column("succeeded", BigInteger, nullable=False),
-    Column("first", BigInteger, nullable=False),  # the least and greatest `created_at`
-    Column("last", BigInteger, nullable=False),
+    Column("told", NUMBER, nullable=False),  # how many say whether they succeeded
+    Column("succeeded", NUMBER, nullable=False),
+    Column("first", NUMBER, nullable=False),  # the least and greatest `created_at`
+    Column("last", NUMBER, nullable=False),
 )
 
 DECLARED: Final = Table(
     "declared",
     METADATA,
-    Column("key", Text, primary_key=True),
-    Column("number", Integer, nullable=False),
+    Column("key", TEXT, primary_key=True),
+    Column("number", NUMBER, nullable=False),
 )
 
 # What episodes hold at declared keys: the nearest float of a number or a flag, or a text; neither for anything else.
 VALUE: Final = Table(
     "value",
     METADATA,
-    Column("episode_id", _ID, primary_key=True, autoincrement=False),
-    Column("key", Integer, primary_key=True, autoincrement=False),  # its number in `declared`
+    Column("episode_id", NUMBER, primary_key=True, autoincrement=False),
+    Column("key", NUMBER, primary_key=True, autoincrement=False),  # its number in `declared`
     Column("number", Float),
-    Column("text", Text),
+    Column("text", TEXT),
     Index("ix_value", "key", "number", "text", "episode_id"),
     sqlite_with_rowid=False,
 )
@@ -121,5 +139,10 @@ def of_one_recording() -> ColumnElement[bool]:
 
 def in_order() -> ColumnElement[bool]:
     """The same join, cheap from recordings to their episodes only: SQLite then walks all in order."""
-    first = RECORDING.c.id.op("<<")(EPISODE_BITS)
+    first = first_of(RECORDING.c.id)
     return and_(EPISODE.c.id >= first, EPISODE.c.id < first + (1 << EPISODE_BITS))
+
+
+def first_of(recording: ColumnElement[int]) -> ColumnElement[int]:
+    """The id of the first episode that a recording may have."""
+    return recording * (1 << EPISODE_BITS)

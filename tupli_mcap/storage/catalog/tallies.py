@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, Float, case, cast, delete, func, insert, select, true
 
@@ -12,6 +13,8 @@ from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, episode
 from tupli_mcap.storage.texts import unescape_text
 
 __all__ = ["Tally", "tallies", "tally"]
+
+_LARGE: Final = 1e290
 
 
 class Tally(NamedTuple):
@@ -49,7 +52,7 @@ def tally(connection: Connection, recording_id: int) -> None:
         func.count(),
         func.sum(cast(EPISODE.c.n_tuples, Float)),
         func.count(EPISODE.c.episode_return),
-        func.sum(EPISODE.c.episode_return),
+        _sum_of_returns(),
         func.min(EPISODE.c.episode_return),
         func.max(EPISODE.c.episode_return),
         func.count(EPISODE.c.success),
@@ -59,6 +62,18 @@ def tally(connection: Connection, recording_id: int) -> None:
     )
     summed = select(*groups, *sums).where(episodes_of(recording_id, EPISODE.c.id)).group_by(*groups)
     connection.execute(insert(TALLY).from_select([column.name for column in TALLY.c], summed))
+
+
+def _sum_of_returns() -> ColumnElement[float]:
+    """Their sum, infinite if some are so large that PostgreSQL, which knows no infinite sums of numbers, might fail."""
+    found = EPISODE.c.episode_return
+    usual = func.sum(case((func.abs(found) < _LARGE, found), else_=0.0))
+    return case(
+        (func.count(found) == 0, None),
+        (func.max(found) >= _LARGE, math.inf),
+        (func.min(found) <= -_LARGE, -math.inf),
+        else_=usual,
+    )
 
 
 def tallies(

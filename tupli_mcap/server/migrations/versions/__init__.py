@@ -1,0 +1,1 @@
+"""Revisions of the tables of a server, in the order of their numbers. One that was released is never changed."""
