@@ -9,7 +9,7 @@ import pwd
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, LiteralString
 
@@ -18,7 +18,6 @@ import psycopg
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.server.database import Database
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
 _NAMES = itertools.count()
@@ -98,12 +97,15 @@ class ServerCatalog:
     def __init__(self, url: str) -> None:
         self._database = Database(url)
 
-    def put_recording(
-        self, relpath: str, stamp: RecordingStamp, *, uuid: str, benchmark_id: str, rows: Iterable[EpisodeRow]
-    ) -> None:
+        self._read = self._database.reading
+
+    def put_recording(self, relpath: str, stamp: RecordingStamp, *, runs: str = "[{}]", **told: Any) -> None:
         with self._database.writing() as connection:
-            told: dict[str, Any] = {"uuid": uuid, "benchmark_id": benchmark_id, "rows": rows, "runs": "[{}]"}
-            queries.put_recording(connection, relpath, stamp, **told)
+            queries.put_recording(connection, relpath, stamp, runs=runs, **told)
+
+    def remove_recording(self, relpath: str) -> None:
+        with self._database.writing() as connection:
+            queries.remove_recording(connection, relpath)
 
     def episodes(self, filter: BaseFilter | None = None, **page: Any) -> list[EpisodeHeader]:
         with self._database.reading() as connection:

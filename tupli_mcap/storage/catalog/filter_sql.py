@@ -190,8 +190,8 @@ def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
     kind, wanted = filter.type, filter.value
     if not _LEAST_INTEGER <= wanted <= _MOST_INTEGER:
         below = wanted < 0
-        above_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
-        return Narrowed(true() if above_all or kind is FilterType.NE else false(), exact=True)
+        of_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
+        return Narrowed(true() if of_all or kind is FilterType.NE else false(), exact=True)
     rounded = math.ceil if kind in (FilterType.GEQ, FilterType.LT) else math.floor
     return Narrowed(_OPERATORS[kind](column, rounded(wanted)), exact=True)
 
@@ -232,7 +232,10 @@ def _in_metadata(filter: BaseFilter) -> Condition:
         return true()
     if len(wanted) > _MOST_VALUES:
         return true()
-    value, parts = value_at(path), [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
+    value, parts = (
+        value_at(path),
+        [EPISODE.c.metadata.contains('"$', autoescape=True)],
+    )  # tags stand for other values
     for scalar in wanted:
         if scalar.kind == "text":
             parts.append(value == scalar.value)

@@ -1,8 +1,7 @@
 """What SQL finds at a path of metadata, where no key was declared: in SQLite as its JSON functions give it, in
 PostgreSQL as `jsonb`.
 
-Both are compared with texts, numbers and flags. A comparison may also be true of values of another kind, which SQLite
-and PostgreSQL order each in their own way.
+Only metadata that are `readable` are looked into: of others, PostgreSQL makes an error.
 """
 
 from __future__ import annotations
@@ -10,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import JSON, Dialect, Text, literal
+from sqlalchemy import JSON, Dialect, Float, Text, literal
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import NullType, TypeDecorator, TypeEngine
 
-from tupli_mcap.storage.catalog.tables import EPISODE
+from tupli_mcap.storage.catalog.tables import EPISODE, TEXT
 
-__all__ = ["kind_at", "value_at"]
+__all__ = ["kind_at", "number_at", "text_at", "value_at"]
 
 
 class _Scalar(TypeDecorator[Any]):
@@ -40,9 +39,26 @@ class _At(FunctionElement[Any]):
 
 
 class value_at(_At):  # noqa: N801 - it is used as a function
-    """The value, to be compared with a text, a number or a flag; NULL if there is none."""
+    """The value, to be compared with a text, a number or a flag; NULL if there is none.
+
+    A comparison may also be true of values of another kind: the databases order them each in their own way.
+    """
 
     type = _Scalar()
+    inherit_cache = True
+
+
+class number_at(_At):  # noqa: N801
+    """The value as a float, if it is a number or a flag; else NULL."""
+
+    type = Float()
+    inherit_cache = True
+
+
+class text_at(_At):  # noqa: N801
+    """The value, if it is a text; else NULL."""
+
+    type = TEXT
     inherit_cache = True
 
 
@@ -54,24 +70,52 @@ class kind_at(_At):  # noqa: N801
 
 
 @compiles(value_at)
-def _value_in_sqlite(element: value_at, compiler: SQLCompiler, **options: Any) -> str:
-    metadata, path, _ = element.clauses
-    return f"json_extract({compiler.process(metadata, **options)}, {compiler.process(path, **options)})"
+def _value(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    return f"json_extract({_in_sqlite(element, compiler, options)})"
 
 
 @compiles(kind_at)
-def _kind_in_sqlite(element: kind_at, compiler: SQLCompiler, **options: Any) -> str:
-    metadata, path, _ = element.clauses
-    return f"json_type({compiler.process(metadata, **options)}, {compiler.process(path, **options)})"
+def _kind(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    return f"json_type({_in_sqlite(element, compiler, options)})"
+
+
+@compiles(number_at)
+def _number(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    kind, value = (made(element, compiler, **options) for made in (_kind, _value))
+    return f"CASE WHEN {kind} IN ('integer', 'real', 'true', 'false') THEN CAST({value} AS REAL) END"
+
+
+@compiles(text_at)
+def _text(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    kind, value = (made(element, compiler, **options) for made in (_kind, _value))
+    return f"CASE WHEN {kind} = 'text' THEN {value} END"
 
 
 @compiles(value_at, "postgresql")
-def _value_in_postgresql(element: _At, compiler: SQLCompiler, **options: Any) -> str:
-    metadata, _, path = element.clauses
-    found = f"CAST({compiler.process(metadata, **options)} AS JSONB)"
-    return f"({found} #> CAST({compiler.process(path, **options)} AS TEXT[]))"
+def _jsonb_value(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    metadata, _, path = (compiler.process(clause, **options) for clause in element.clauses)
+    return f"(CAST({metadata} AS JSONB) #> CAST({path} AS TEXT[]))"
 
 
 @compiles(kind_at, "postgresql")
-def _kind_in_postgresql(element: kind_at, compiler: SQLCompiler, **options: Any) -> str:
-    return f"jsonb_typeof{_value_in_postgresql(element, compiler, **options)}"
+def _jsonb_kind(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    return f"jsonb_typeof{_jsonb_value(element, compiler, **options)}"
+
+
+@compiles(number_at, "postgresql")
+def _jsonb_number(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    kind, value = (made(element, compiler, **options) for made in (_jsonb_kind, _jsonb_value))
+    number = f"WHEN 'number' THEN CAST({value} AS DOUBLE PRECISION)"
+    flag = f"WHEN 'boolean' THEN CAST(CAST(CAST({value} AS BOOLEAN) AS INTEGER) AS DOUBLE PRECISION)"
+    return f"CASE {kind} {number} {flag} END"
+
+
+@compiles(text_at, "postgresql")
+def _jsonb_text(element: _At, compiler: SQLCompiler, **options: Any) -> str:
+    kind, value = (made(element, compiler, **options) for made in (_jsonb_kind, _jsonb_value))
+    return f"CASE {kind} WHEN 'string' THEN {value} #>> '{{}}' END COLLATE \"C\""
+
+
+def _in_sqlite(element: _At, compiler: SQLCompiler, options: dict[str, Any]) -> str:
+    metadata, path, _ = (compiler.process(clause, **options) for clause in element.clauses)
+    return f"{metadata}, {path}"

@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, and_, case, false, func, or_, 
 from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.schema import EpisodeHeader, join_key
 from tupli_mcap.schema.facts import path_in
+from tupli_mcap.storage.catalog.metadata_sql import number_at, text_at
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.texts import escape_text
 
@@ -24,6 +25,9 @@ _OF_RECORDING: Final = {"recording": RECORDING.c.path, "benchmark_id": RECORDING
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 
 
+_BY_RECORDING: Final = 2  # values decide: its path and the number of the episode
+
+
 class After(NamedTuple):
     """The last episode of a page: the path of its recording, and its number there."""
 
@@ -34,8 +38,8 @@ class After(NamedTuple):
 class Sort(NamedTuple):
     """What episodes are put in the order of: a key as filters name it, such as `return` or `metadata.score`.
 
-    What has no value comes last, also where the order falls. Episodes with the same value follow each other by
-    recording (path) and number.
+    Numbers come before texts, and what has neither comes last, also where the order falls; so do metadata that SQL
+    cannot look into. Episodes with the same value follow each other by recording (path) and number.
     """
 
     key: str
@@ -68,21 +72,27 @@ def places(sort: Sort | None, *, few: bool, backwards: bool = False) -> list[Pla
 
 
 def beyond(connection: Connection, order: Sequence[Place], after: After) -> ColumnElement[bool]:
-    """What comes after an episode.
+    """What comes after an episode, which need not be there any more where it is put in order by its recording alone.
 
     Raises:
         NotFoundError: it is not there any more.
     """
-    this = and_(RECORDING.c.path == escape_text(after.recording), EPISODE.c.episode == after.episode)
-    query = select(*(value for value, _ in order)).select_from(EPISODE.join(RECORDING, of_one_recording()))
-    values = connection.execute(query.where(this)).first()
-    if values is None:
+    reached: Sequence[Any] | None
+    if len(order) == _BY_RECORDING:
+        order = [order[0], Place(EPISODE.c.episode, order[1].descending)]
+        reached = (escape_text(after.recording), after.episode)
+    else:
+        this = and_(RECORDING.c.path == escape_text(after.recording), EPISODE.c.episode == after.episode)
+        values = select(*(value for value, _ in order)).join(RECORDING, of_one_recording()).where(this)
+        reached = connection.execute(values).first()
+    if reached is None:
         raise NotFoundError("the episode after which the page begins is gone; list from the beginning")
     condition: ColumnElement[bool] = false()
-    for (value, descending), reached in zip(reversed(order), reversed(values), strict=True):
-        further = value < reached if descending else value > reached
-        condition = or_(further, and_(value == reached, condition))
-    return condition
+    for (value, descending), limit in zip(reversed(order), reversed(reached), strict=True):
+        further = value < limit if descending else value > limit
+        condition = or_(further, and_(value == limit, condition))
+    (first, descending), limit = order[0], reached[0]
+    return and_(first <= limit if descending else first >= limit, condition)  # the former leads to an index
 
 
 def _of_key(sort: Sort) -> list[Place]:
@@ -96,8 +106,12 @@ def _of_key(sort: Sort) -> list[Place]:
             f"cannot sort by {join_key([name, *inside])!r}; sort by return, steps, ended, end, seed, env, episode, "
             "recording, or a key of the metadata such as metadata.score"
         )
-    value = func.json_extract(EPISODE.c.metadata, "$" + "".join(f'."{segment}"' for segment in inside))
-    return _last_where_missing(value, sort.descending)
+    number, text = (case((EPISODE.c.readable, at(inside))) for at in (number_at, text_at))
+    return [
+        *_last_where_missing(number, sort.descending),
+        Place(case((text.is_(None), 1), else_=0), False),
+        Place(func.coalesce(text, ""), sort.descending),
+    ]
 
 
 def _last_where_missing(value: ColumnElement[Any], descending: bool) -> list[Place]:

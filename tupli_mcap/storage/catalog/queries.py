@@ -5,6 +5,7 @@ The tables may lie in any SQL database: in the catalog of a directory, or in tha
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -165,7 +166,9 @@ def declare_key(connection: Connection, key: str) -> None:
     connection.execute(insert(DECLARED).values(key=escape_text(key), number=number))
     if is_indexed(path):
         all_rows = select(*_COLUMNS).order_by(EPISODE.c.id)
-        for chunk in connection.execute(all_rows, execution_options={"yield_per": _ROWS_AT_ONCE}).partitions():
+        for chunk in connection.execute(
+            all_rows, execution_options={"yield_per": _ROWS_AT_ONCE}
+        ).partitions():
             _index(connection, [StoredRow(*row) for row in chunk], {path: number})
 
 
@@ -229,13 +232,14 @@ def _headers(
     matches = None if filter is None or found.exact else bound_predicate(filter)
     width = len(_COLUMNS)
     runs: dict[int, list[dict[str, Any]]] = {}
-    for page in rows.partitions(_ROWS_OF_ANSWER):
-        stored = [StoredRow(*row[:width]) for row in page]
-        _add_runs(connection, runs, {row.recording_id for row in stored})
-        for row, (*_, uuid, benchmark_id, path) in zip(stored, page, strict=True):
-            made = header(row, uuid, benchmark_id, path, runs[row.recording_id][row.run])
-            if matches is None or matches(made):
-                yield made
+    with contextlib.closing(rows):
+        for page in rows.partitions(_ROWS_OF_ANSWER):
+            stored = [StoredRow(*row[:width]) for row in page]
+            _add_runs(connection, runs, {row.recording_id for row in stored})
+            for row, (*_, uuid, benchmark_id, path) in zip(stored, page, strict=True):
+                made = header(row, uuid, benchmark_id, path, runs[row.recording_id][row.run])
+                if matches is None or matches(made):
+                    yield made
 
 
 def _add_runs(

@@ -1,6 +1,6 @@
-"""PostgreSQL orders texts by code points and has numbers of 64 bits, too, as SQLite has by itself. Recordings have their
-environment and the sums of their episodes; of episodes it is known whether they succeeded, and whether SQL may look into
-their metadata.
+"""PostgreSQL orders texts by code points and has numbers of 64 bits, too, as SQLite has by itself. Recordings have
+their environment and the sums of their episodes; of an episode it is known whether it succeeded, and whether SQL may
+look into its metadata.
 """
 
 from __future__ import annotations
@@ -87,7 +87,11 @@ def _fill() -> None:
     ).all():
         last = page[-1].id
         told = [
-            {"of": row.id, "readable": not _UNREADABLE.search(row.metadata), "success": _success(row.metadata)}
+            {
+                "of": row.id,
+                "readable": not _UNREADABLE.search(row.metadata),
+                "success": _success(row.metadata),
+            }
             for row in page
         ]
         connection.execute(change, told)
