@@ -305,7 +305,8 @@ def test_the_id_of_sub_environments(how: str, tmp_path: Path, monkeypatch: pytes
 def test_sub_environments_that_nobody_knows(tmp_path: Path) -> None:
     envs = AsyncVectorEnv([Robot] * 2)
     with pytest.raises(
-        RecordingError, match="expected sub-environments in this process, found none in AsyncVectorEnv"
+        RecordingError,
+        match="found none in AsyncVectorEnv; make it with vectorization_mode",
     ):
         RecordVector(envs, tmp_path / "r.mcap", capture_env="pickle")
     with RecordVector(envs, tmp_path / "r.mcap") as recorder:

@@ -47,8 +47,9 @@ def build(
     if record.spec is None and record.pickle is None:
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt: expected a spec or a pickle, found only the "
-            f"names of its classes ({', '.join(record.classes)[:300]}); record with capture_env='pickle', or make the "
-            "environment yourself and pass it on as env=... where that is taken"
+            f"names of its classes ({', '.join(record.classes)[:300]}); record with capture_env='pickle' (a vector "
+            "environment whose class steps all at once has no single one: make it with vectorization_mode='sync'), or "
+            "make the environment yourself and pass it on as env=... where that is taken"
         )
     reasons = reasons_for_distrust(record)
     window = record.spec is not None and _may_open_a_window(record.spec)

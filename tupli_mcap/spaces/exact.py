@@ -54,7 +54,7 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
     if dtype != leaf.dtype:
         warnings.warn(
             f"{leaf.path} is declared {leaf.dtype.name}, but the values are {dtype.name}; "
-            f"they are recorded as {dtype.name}, exactly as given",
+            f"they are recorded as {dtype.name}, exactly as given; cast them where {leaf.dtype.name} is meant",
             UserWarning,
             stacklevel=2,
         )
@@ -107,7 +107,7 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
     if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
         raise StepError(
             f"{path}: expected values that {dtype.name} holds exactly, found {array.dtype.name} {shorten(value)}; "
-            "the recorded dtype is fixed by the first step, so cast in the environment or the policy"
+            f"the first step has fixed what is recorded: cast the values, or declare {array.dtype.name} in the space"
         )
     return cast
 

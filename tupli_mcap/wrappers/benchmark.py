@@ -78,5 +78,5 @@ def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym
         return first
     raise RecordingError(
         "capture_env='pickle': expected sub-environments in this process, found none in "
-        f"{type(env.unwrapped).__name__}; use capture_env='spec'"
+        f"{type(env.unwrapped).__name__}; make it with vectorization_mode='sync', or use capture_env='spec'"
     )
