@@ -47,7 +47,7 @@ READING = {
     ("GET", "/v1/roles"), ("POST", "/v1/benchmarks/list"), ("GET", "/v1/benchmarks/{uri}"),
     ("POST", "/v1/artifacts/list"), ("GET", "/v1/artifacts/{uri}"), ("GET", "/v1/artifacts/{uri}/users"),
     ("POST", "/v1/episodes/list"), ("POST", "/v1/episodes/count"), ("POST", "/v1/tickets"),
-    ("GET", "/v1/files/{name}"), ("HEAD", "/v1/files/{name}"), ("GET", "/v1/episodes/{uri}.rrd"),
+    ("POST", "/v1/query"), ("GET", "/v1/files/{name}"), ("HEAD", "/v1/files/{name}"), ("GET", "/v1/episodes/{uri}.rrd"),
     ("GET", "/access/users/list"), ("GET", "/access/groups/list"), ("GET", "/access/groups/read"),
     ("GET", "/access/roles/list"), ("GET", "/benchmarks/load"), ("POST", "/benchmarks/list"),
     ("GET", "/artifacts/download"), ("POST", "/artifacts/list"), ("POST", "/episodes/list"),

@@ -9,18 +9,22 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
     Recording,
-    merge_recordings,
     relabel_recording,
     rewrite_recording,
     say_made_of,
     trim_recording,
 )
+from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
@@ -106,12 +110,12 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) ->
         said = say_made_of([source], "filter", **_query_of(dataset))
         rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
-    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
-        parts = []
-        for i, (name, numbers) in enumerate(chosen.items()):
-            parts.append(Path(folder) / f"{i}.mcap")
-            rewrite_recording(dataset._recordings.get(name), parts[-1], episodes=sorted(numbers))
-        merge_recordings(parts, target, overwrite=overwrite)
+    excerpts = []
+    for name, numbers in chosen.items():
+        source = dataset._recordings.get(name)
+        excerpts.append(Excerpt(source, source.index[np.isin(source.index["episode"], numbers)]))
+    with replacing(target) as (fd, _):
+        merge_excerpts(excerpts, Container(fd, str(target), "zstd"))
     return target
 
 

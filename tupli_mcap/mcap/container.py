@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import stat
 import struct
 import threading
 import zlib
@@ -67,8 +68,10 @@ def _built(builder: RecordBuilder) -> bytes:
     return data
 
 
-def _write(fd: int, parts: Sequence[memoryview], position: int) -> int:
-    """Writes some bytes at a position, at least one; returns how many."""
+def _write(fd: int, parts: Sequence[memoryview], position: int | None) -> int:
+    """Writes some bytes at a position (None: to a pipe), at least one; returns how many."""
+    if position is None:
+        return os.writev(fd, parts)
     if hasattr(os, "pwritev"):
         return os.pwritev(fd, parts, position)
     return os.pwrite(fd, b"".join(parts), position)
@@ -105,7 +108,7 @@ Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and wha
 
 
 class Container:
-    """Writes records to a file descriptor and remembers what the summary needs.
+    """Writes records to the descriptor of a file or a pipe, and remembers what the summary needs.
 
     What `start_chunks` returns first may be called from another thread; nothing else.
     """
@@ -114,6 +117,7 @@ class Container:
         if compression not in COMPRESSIONS:
             raise RecordingError(f"compression: expected one of {COMPRESSIONS}, found {compression!r}")
         self._fd = fd
+        self._is_pipe = fd >= 0 and stat.S_ISFIFO(os.fstat(fd).st_mode)
         self._name = name
         self._compression = compression
         method = b"" if compression == "none" else compression.encode()
@@ -150,7 +154,7 @@ class Container:
         left = [memoryview(part) for part in parts]
         try:
             while left:
-                written = _write(self._fd, left[:_PIECES], position)
+                written = _write(self._fd, left[:_PIECES], None if self._is_pipe else position)
                 position += written
                 while left and written >= len(left[0]):
                     written -= len(left.pop(0))

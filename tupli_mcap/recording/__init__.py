@@ -29,10 +29,11 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
-    from tupli_mcap.recording.edit.merge import MergeReport, Part, merge_recordings, split_recording
+    from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
     from tupli_mcap.recording.edit.relabel import relabel_recording
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
+    from tupli_mcap.recording.edit.split import Part, split_recording
     from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "EpisodeData": "write.from_values",
     "MergeReport": "edit.merge",
-    "Part": "edit.merge",
+    "Part": "edit.split",
     "Problem": "check.verify",
     "RecoveryReport": "edit.repair.recover",
     "VerifyReport": "check.verify",
@@ -53,7 +54,7 @@ _HOMES = {
     "relabel_recording": "edit.relabel",
     "rewrite_recording": "edit.rewrite",
     "say_made_of": "edit.made_of",
-    "split_recording": "edit.merge",
+    "split_recording": "edit.split",
     "trim_recording": "edit.trim",
     "undo_annotation": "edit.annotate",
     "undo_edit": "edit.annotate",

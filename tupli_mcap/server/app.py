@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 import tupli_mcap
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.routes import accounts, episodes, items, pytupli, recordings, viewers
+from tupli_mcap.server.routes import accounts, episodes, items, pytupli, query, recordings, viewers
 from tupli_mcap.server.wire import Error, tell_errors
 
 __all__ = ["create_app"]
@@ -35,7 +35,7 @@ def create_app(library: Library) -> FastAPI:
         redoc_url=None,
     )
     app.state.library = library
-    for routes in (accounts, items, episodes, recordings, viewers, pytupli):
+    for routes in (accounts, items, episodes, query, recordings, viewers, pytupli):
         app.include_router(routes.router, responses=_REFUSALS)  # type: ignore[arg-type]
     tell_errors(app)
 

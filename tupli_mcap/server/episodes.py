@@ -28,7 +28,8 @@ from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = ["StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "new_name", "no_episode",
+__all__ = ["StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "names_of", "new_name",
+           "no_episode",
            "publish", "register", "stored_already", "unpublish"]  # fmt: skip
 
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
@@ -73,7 +74,7 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     Raises:
         NotFoundError: there is none, or none of its episodes may be read.
     """
-    for each in dict.fromkeys((name, _whole(name))):  # which has taken the place of its parts
+    for each in names_of(name):
         found = connection.execute(select(FILE).where(FILE.c.path == escape_text(each))).first()
         if found is not None:
             seen = count_episodes(connection, caller, FilterEQ(key="recording", value=each))
@@ -81,6 +82,11 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
                 place = unescape_text(found.place)
                 return StoredFile(each, place, found.digest, found.size, seen == found.episodes)
     raise NotFoundError(f"there is no recording {name[:200]!r}")
+
+
+def names_of(name: str) -> list[str]:
+    """The names under which a recording may be found now: its own, and that of the one it has become a part of."""
+    return list(dict.fromkeys((name, _whole(name))))
 
 
 def _seen(caller: Caller) -> ColumnElement[bool]:

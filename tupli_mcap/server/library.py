@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import os
 import secrets
-import shutil
 import tempfile
 import time
 import warnings
@@ -73,7 +72,6 @@ class Library:
             accounts.prepare(connection)
         self.uploads.forget_old()
         self.sweep(self._pending(seconds=_PENDING_SECONDS))
-        shutil.rmtree(settings.own / "cuts", ignore_errors=True)  # of a process that was killed
 
     def first_password(self) -> str | None:
         """Makes the user `admin` where there is none; returns the password if nobody has chosen it."""

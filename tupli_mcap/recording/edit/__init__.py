@@ -3,7 +3,8 @@
 assemble                          the new file: writes chunks, index and summary
 copy_episodes                     episodes of a recording into it
 copy_chunks                       chunks that can be copied as they are
-merge                             several recordings into one, with new numbers; one into several
+merge, split                      several recordings into one, with new numbers; one into several
+stream                            a recording of some episodes, handed on while it is made
 rewrite                           a recording with fewer episodes
 relabel, trim                     a recording with other values of steps; with fewer steps of episodes
 made_of                           what a recording was made of

@@ -1,4 +1,4 @@
-"""Several recordings as one, and one as several."""
+"""Several recordings as one."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ import contextlib
 import heapq
 import os
 import time
-import uuid
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO, Topics, parse
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
@@ -29,12 +28,11 @@ from tupli_mcap.recording.edit.carry_runs import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
 from tupli_mcap.recording.edit.made_of import MADE_OF_NAME, say_made_of
 from tupli_mcap.recording.edit.replacing import replacing, tidy
-from tupli_mcap.recording.edit.rewrite import camera_channels, define, write
+from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
-from tupli_mcap.recording.write.rotation import series
 
-__all__ = ["MergeReport", "Part", "merge_recordings", "split_recording"]
+__all__ = ["Excerpt", "MergeReport", "merge_excerpts", "merge_recordings"]
 
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 _MOST_TURNS = 100
@@ -58,16 +56,11 @@ class MergeReport(NamedTuple):
     size: int = 0
 
 
-class Part(NamedTuple):
-    """A file of a recording that was split, or would be: `first` to `last` are numbers of episodes."""
+class Excerpt(NamedTuple):
+    """Some episodes of a recording: rows of its index, in their order."""
 
-    path: Path
-    episodes: int
-    steps: int
-    first: int
-    last: int
-    copied: int = 0
-    size: int = 0
+    recording: Recording
+    rows: Array
 
 
 def merge_recordings(
@@ -98,50 +91,45 @@ def merge_recordings(
     with contextlib.ExitStack() as stack:
         opened = [stack.enter_context(Recording(source)) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
-        recordings = sorted((r for r in opened if len(r)), key=lambda r: int(r.index["start_time"].min()))
-        if not recordings:
+        excerpts = [Excerpt(recording, recording.index) for recording in opened]
+        parts = [(len(excerpt.rows), int(excerpt.rows["length"].sum())) for excerpt in excerpts]
+        if not any(episodes for episodes, _ in parts):
             raise RecordingError("expected recordings with episodes to merge, found none")
-        _check_alike(recordings)
-        attachments = _attachments(recordings)
-        report = MergeReport(
-            target,
-            len(recordings),
-            sum(map(len, recordings)),
-            sum(recording.num_steps for recording in recordings),
-        )
+        recordings = sum(episodes > 0 for episodes, _ in parts)
+        report = MergeReport(target, recordings, *(sum(counts) for counts in zip(*parts, strict=True)))
         if dry_run:
+            check_mergeable(excerpts)
             return report
         tidy(target.parent)
         with replacing(target) as (fd, _):
-            merged = _merge(recordings, Container(fd, str(target), compression), attachments)
-    if merged.held:
-        warnings.warn(
-            f"{merged.held:,} rows of {target} have the time of the row ahead of them, which was later than theirs",
-            UserWarning,
-            stacklevel=2,
-        )
+            merged = merge_excerpts(excerpts, Container(fd, str(target), compression))
     return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)
 
 
-def _merge(
-    sources: Sequence[Recording], container: Container, attachments: Mapping[str, tuple[str, bytes]]
-) -> Assembler:
-    now, first = time.time_ns(), sources[0]
+def merge_excerpts(excerpts: Sequence[Excerpt], container: Container) -> Assembler:
+    """Writes a recording of episodes of several, as `merge_recordings` does. There must be one.
+
+    Raises:
+        SpaceError: they have different spaces or dtypes.
+        RecordingError, FormatError: as `merge_recordings`.
+    """
+    sources, attachments = check_mergeable(excerpts)
+    now, first = time.time_ns(), sources[0].recording
     turns = _turns(sources)
     lanes = _lanes(sources, turns=len(turns))
     if lanes is not None:
-        turns = [(i, np.arange(len(recording))) for i, recording in enumerate(sources)]
+        turns = [(i, np.arange(len(source.rows))) for i, source in enumerate(sources)]
     numbered, next_episode = _numbered(sources, turns)
     target = Assembler(container)
-    said = {**carry_runs(numbered), **say_made_of(sources, "merge")}
-    target.begin(_metadata(first, next_episode=next_episode), {**attachments, **said}, now)
+    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), "merge")}
+    target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
     if lanes is None:
         define(first, target)
     envs = first.num_envs if first.is_vector else None
     if lanes is not None:
-        envs = max(lane + recording.num_envs for lane, recording in zip(lanes, sources, strict=True))
-    for recording in sources:
-        _define_missing(recording, container, envs)
+        envs = max(lane + source.recording.num_envs for lane, source in zip(lanes, sources, strict=True))
+    for source in sources:
+        _define_missing(source.recording, container, envs)
     container.define_channels()
     episodes, infos = [], []
     for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
@@ -160,10 +148,23 @@ def _merge(
             if channel.topic == INFO:
                 target.add_messages(channel.id, heapq.merge(*infos, key=itemgetter(0)))
     target.finish(now)
+    if target.held:
+        warnings.warn(
+            f"{target.held:,} merged rows have the time of the row ahead of them, which was later than theirs",
+            UserWarning,
+            stacklevel=3,
+        )
     return target
 
 
-def _lanes(sources: Sequence[Recording], turns: int) -> list[int] | None:
+def check_mergeable(excerpts: Sequence[Excerpt]) -> tuple[list[Excerpt], dict[str, tuple[str, bytes]]]:
+    """Those with episodes, in the order of their times, and their attachments. Raises as `merge_excerpts`."""
+    sources = sorted((e for e in excerpts if len(e.rows)), key=lambda e: int(e.rows["start_time"].min()))
+    _check_alike(sources)
+    return sources, _attachments([source.recording for source in sources])
+
+
+def _lanes(sources: Sequence[Excerpt], turns: int) -> list[int] | None:
     """The sub-environment that the first one of each source becomes; None where each stays what it is.
 
     A channel holds one episode after the other, in the order of their times. So episodes that were recorded at the same
@@ -171,25 +172,25 @@ def _lanes(sources: Sequence[Recording], turns: int) -> list[int] | None:
     when another one has ended takes its place. Recordings that take too many turns do so, too: every turn costs a look
     at all infos of its recording, and ends a chunk.
     """
-    alike = len({(recording.is_vector, recording.num_envs) for recording in sources}) == 1
+    alike = len({(recording.is_vector, recording.num_envs) for recording, _ in sources}) == 1
     if alike and turns < max(_MOST_TURNS, len(sources) + 1) and not _overlap(sources):
         return None
     free: list[int] = []  # by sub-environment, when its last episode ends
     lanes = []
-    for recording in sources:  # in the order in which they begin
-        begin, n = int(recording.index["start_time"].min()), recording.num_envs
+    for recording, rows in sources:  # in the order in which they begin
+        begin, n = int(rows["start_time"].min()), recording.num_envs
         at = 0
         while any(end > begin for end in free[at : at + n]):
             at += 1
-        free[at : at + n] = [int(recording.index["end_time"].max())] * n
+        free[at : at + n] = [int(rows["end_time"].max())] * n
         lanes.append(at)
     return lanes
 
 
-def _overlap(sources: Sequence[Recording]) -> bool:
+def _overlap(sources: Sequence[Excerpt]) -> bool:
     """Whether episodes of two recordings were recorded at the same time."""
-    which = np.repeat(np.arange(len(sources)), [len(recording) for recording in sources])
-    start, end = (np.concatenate([r.index[name] for r in sources]) for name in ("start_time", "end_time"))
+    which = np.repeat(np.arange(len(sources)), [len(source.rows) for source in sources])
+    start, end = (np.concatenate([s.rows[name] for s in sources]) for name in ("start_time", "end_time"))
     order = np.lexsort((end, start))
     which, start, latest = which[order], start[order], np.maximum.accumulate(end[order])
     group = np.concatenate([[0], np.cumsum(start[1:] >= latest[:-1])])
@@ -210,26 +211,25 @@ def _channels(source: Recording, container: Container, lane: int | None) -> dict
     return found
 
 
-def _turns(sources: Sequence[Recording]) -> list[tuple[int, np.ndarray]]:
-    """Which recording's turn it is, and which rows of its index it brings then, in the order of their times."""
-    which = np.repeat(np.arange(len(sources)), [len(recording) for recording in sources])
-    place = np.concatenate([np.arange(len(recording)) for recording in sources])
-    start = np.concatenate([recording.index["start_time"] for recording in sources])
+def _turns(sources: Sequence[Excerpt]) -> list[tuple[int, np.ndarray]]:
+    """Whose turn it is, and which of its rows it brings then, in the order of their times."""
+    which = np.repeat(np.arange(len(sources)), [len(source.rows) for source in sources])
+    place = np.concatenate([np.arange(len(source.rows)) for source in sources])
+    start = np.concatenate([source.rows["start_time"] for source in sources])
     order = np.lexsort((place, which, start))
     bounds = np.flatnonzero(np.diff(which[order])) + 1
     return [(int(which[part[0]]), np.sort(place[part])) for part in np.split(order, bounds)]
 
 
 def _numbered(
-    sources: Sequence[Recording], turns: Sequence[tuple[int, np.ndarray]]
+    sources: Sequence[Excerpt], turns: Sequence[tuple[int, np.ndarray]]
 ) -> tuple[list[tuple[Recording, np.ndarray, int]], int]:
     """(recording, rows of its index, what is added to its episodes' numbers) by turn, and the next free number."""
     last = {i: turn for turn, (i, _) in enumerate(turns)}
     numbered = []
     free, begun = 0, set()
     for turn, (i, places) in enumerate(turns):
-        recording = sources[i]
-        rows = recording.index[places]
+        recording, rows = sources[i].recording, sources[i].rows[places]
         shift = max(0, free - int(rows["episode"].min())) if i in begun else free
         free = shift + (
             recording.file.contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
@@ -237,17 +237,6 @@ def _numbered(
         begun.add(i)
         numbered.append((recording, rows, shift))
     return numbered, free
-
-
-def _metadata(source: Recording, *, next_episode: int) -> dict[str, str]:
-    return {
-        "uuid": uuid.uuid4().hex,
-        "format_version": source.metadata["format_version"],
-        "library": library(),
-        "created_ns": str(time.time_ns()),
-        "benchmark_id": source.benchmark_id,
-        "next_episode": str(next_episode),
-    }
 
 
 def _define_missing(source: Recording, container: Container, envs: int | None) -> None:
@@ -270,14 +259,14 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
             raise RecordingError(f"{target} exists; choose another path, or overwrite it")
 
 
-def _check_alike(sources: Sequence[Recording]) -> None:
-    first = sources[0]
+def _check_alike(sources: Sequence[Excerpt]) -> None:
+    first = sources[0].recording
     expected = first.layout.to_metadata()
-    seen = {(first.uuid, int(number)): first for number in first.index["episode"]}
-    rows = sum(recording.num_steps for recording in sources)
-    if rows > LAST_ROW:
-        raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {rows}; merge fewer")
-    for other in sources[1:]:
+    seen = {(first.uuid, int(number)): first for number in sources[0].rows["episode"]}
+    steps = sum(int(source.rows["length"].sum()) for source in sources)
+    if steps > LAST_ROW:
+        raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer")
+    for other, rows in sources[1:]:
         description = other.layout.to_metadata()
         for name in _SPACES:
             if description[name] != expected[name]:
@@ -296,7 +285,7 @@ def _check_alike(sources: Sequence[Recording]) -> None:
                 f"{other.name}: expected a recording of benchmark {first.benchmark_id or 'none'}, as {first.name} is, "
                 f"found {other.benchmark_id or 'none'}"
             )
-        for number in other.index["episode"].tolist():
+        for number in rows["episode"].tolist():
             before = seen.setdefault((other.uuid, number), other)
             if before is not other:
                 raise RecordingError(
@@ -334,72 +323,3 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
 def _digest(recording: Recording) -> Iterator[tuple[str, str]]:
     if _ENVIRONMENT[0] in recording.attachments:
         yield recording.name, recording.benchmark.record.digest
-
-
-def split_recording(
-    source: str | os.PathLike[str],
-    target: str | os.PathLike[str],
-    *,
-    episodes: int | None = None,
-    max_bytes: int | None = None,
-    compression: str = "zstd",
-    dry_run: bool = False,
-) -> list[Part]:
-    """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a UUID of its own.
-
-    Episodes keep their numbers, and everything comes along but signature and certificate, which would not hold.
-
-    Args:
-        episodes: in each file.
-        max_bytes: of each file, as far as steps take as many bytes as on average; one episode at least.
-
-    Raises:
-        RecordingError: neither limit is given, or both; the source cannot be read; a target exists or cannot be
-            written.
-        FormatError: the source is damaged.
-    """
-    limit = episodes if max_bytes is None else max_bytes
-    if (episodes is None) == (max_bytes is None) or not isinstance(limit, int | np.integer) or limit < 1:
-        raise RecordingError(
-            "expected how many episodes or how many bytes go into a file, at least 1 of either, found "
-            f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
-        )
-    target = Path(target)
-    with Recording(source) as recording:
-        groups = _groups(recording, episodes, max_bytes)
-        paths = [target.with_stem(f"{target.stem}_{i:04}") if i else target for i in range(len(groups))]
-        taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
-        if taken:
-            raise RecordingError(f"{taken[0]} exists; delete it, or choose another path")
-        parts = []
-        for path, numbers in zip(paths, groups, strict=True):
-            lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
-            part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
-            parts.append(part if dry_run else _write_part(recording, part, numbers.tolist(), compression))
-    return parts
-
-
-def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -> list[np.ndarray]:
-    """Numbers of episodes, by file."""
-    numbers, lengths = recording.index["episode"].astype(np.int64), recording.index["length"].astype(np.int64)
-    if not len(numbers):
-        raise RecordingError(f"{recording.name} has no episodes to split")
-    if episodes is not None:
-        return [numbers[at : at + episodes] for at in range(0, len(numbers), episodes)]
-    attached = sum(info.size for info in recording.attachments.values())
-    share = max(1, recording.size - attached) / int(lengths.sum())
-    room, groups, begin, filled = max(1, (max_bytes or 0) - attached), [], 0, 0.0
-    for i, size in enumerate((lengths * share).tolist()):
-        if filled and filled + size > room:
-            groups.append(numbers[begin:i])
-            begin, filled = i, 0.0
-        filled += size
-    return [*groups, numbers[begin:]]
-
-
-def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
-    metadata = _metadata(recording, next_episode=recording.file.contents.next_episode)
-    with replacing(part.path) as (fd, _):
-        container = Container(fd, str(part.path), compression)
-        copied = write(recording, container, metadata, numbers, {}, signed=False, left_out=STATEMENTS)
-    return part._replace(copied=copied, size=part.path.stat().st_size)

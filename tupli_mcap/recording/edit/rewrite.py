@@ -28,6 +28,7 @@ __all__ = [
     "NewFrames",
     "camera_channels",
     "define",
+    "kept_metadata",
     "new_metadata",
     "return_of",
     "rewrite_recording",
@@ -61,26 +62,33 @@ def rewrite_recording(
         FormatError: the source is damaged.
     """
     target = Path(target)
-    metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
+    metadata = kept_metadata(source)
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id
-    metadata["next_episode"] = str(source.file.contents.next_episode)
-    metadata["rewritten"] = uuid.uuid4().hex
     same = episodes is None and benchmark_id in (None, source.benchmark_id) and frames is None
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), compression)
         write(source, container, metadata, episodes, attachments or {}, frames, signed=same)
 
 
-def new_metadata(source: Recording) -> dict[str, str]:
-    """The metadata of a recording of its own that is made of `source`."""
+def kept_metadata(source: Recording) -> dict[str, str]:
+    """The metadata of a recording that is written anew."""
+    metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
+    metadata["next_episode"] = str(source.file.contents.next_episode)
+    metadata["rewritten"] = uuid.uuid4().hex
+    return metadata
+
+
+def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str, str]:
+    """The metadata of a recording of its own that is made of `source`; episodes are numbered on as there by default."""
+    free = source.file.contents.next_episode if next_episode is None else next_episode
     return {
         "uuid": uuid.uuid4().hex,
         "format_version": source.metadata["format_version"],
         "library": library(),
         "created_ns": str(time.time_ns()),
         "benchmark_id": source.benchmark_id,
-        "next_episode": str(source.file.contents.next_episode),
+        "next_episode": str(free),
     }
 
 

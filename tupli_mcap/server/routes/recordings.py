@@ -4,27 +4,22 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import os
 import re
-import tempfile
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
 
 from fastapi import APIRouter, Body, Header, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
-from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 
-from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.recording import Recording, rewrite_recording
-from tupli_mcap.schema import FilterEQ
+from tupli_mcap.errors import StorageError
 from tupli_mcap.server import episodes
-from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
+from tupli_mcap.server.routes.query import streamed
+from tupli_mcap.server.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Upload
 from tupli_mcap.storage.texts import is_hash
 
@@ -172,18 +167,12 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
     caller = holder.of(name)
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, name)
-        kept = [
-            header.episode
-            for header in episodes.find_episodes(
-                connection, caller, FilterEQ(key="recording", value=found.name)
-            )
-        ]
-    file_name = name.rpartition("/")[2]
+        if not found.whole:
+            query = EpisodeQuery(recordings=[found.name])
+            selected = select_episodes(connection, caller, library.items, query)
     if not found.whole:
-        path = _cut(library, found.place, kept)
-        return FileResponse(
-            path, media_type=_MEDIA, filename=file_name, background=BackgroundTask(os.unlink, path)
-        )
+        return Response() if request.method == "HEAD" else streamed(library, selected)
+    file_name = name.rpartition("/")[2]
     tag = f'"{found.digest}"'
     wanted = request.headers.get("If-Match")
     if wanted is not None and wanted.strip() != "*" and tag not in [t.strip() for t in wanted.split(",")]:
@@ -191,18 +180,3 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
     return FileResponse(
         library.path_of(found.place), media_type=_MEDIA, filename=file_name, headers={"ETag": tag}
     )
-
-
-def _cut(library: Library, place: str, kept: list[int]) -> Path:
-    """A temporary recording of some episodes of another one."""
-    directory = library.settings.own / "cuts"
-    directory.mkdir(parents=True, exist_ok=True)
-    handle, text = tempfile.mkstemp(suffix=".mcap", dir=directory)
-    os.close(handle)
-    path = Path(text)
-    path.unlink()
-    with Recording(library.blobs.place(place)) as recording:
-        if not set(kept) & {int(number) for number in recording.index["episode"]}:
-            raise NotFoundError("there is no such recording")
-        rewrite_recording(recording, path, episodes=kept)
-    return path

@@ -1,0 +1,154 @@
+"""Episodes that a server cuts out of recordings while it sends them."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from gymnasium import spaces
+from test_server import Things, Users, things, token_of, users
+
+from tupli_mcap import EpisodeData, Recording, verify_recording, write_recording
+from tupli_mcap.errors import FormatError
+from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.recording.edit.stream import stream_excerpts
+from tupli_mcap.schema import BaseFilter, F, FilterEQ
+from tupli_mcap.storage import TupliAPIClient
+
+__all__ = ["things", "users"]  # fixtures
+
+
+def short_episodes(path: Path, count: int, seed: int, space: Any = None) -> Path:
+    """Episodes of about 22 steps."""
+    random = np.random.default_rng(seed)
+    space = space or spaces.Box(-1, 1, (4,))
+    episodes = []
+    for i in range(count):
+        n = int(random.integers(10, 35))
+        states = random.uniform(-1, 1, (n, *space.shape)).astype(np.float32)
+        episodes.append(
+            EpisodeData(
+                states, random.integers(0, 2, n), np.ones(n), np.zeros(n, bool), np.arange(n) == n - 1, states[0],
+                metadata={"score": i, "best": i % 100 == 7},
+            )
+        )  # fmt: skip
+    write_recording(path, episodes, observation_space=space, action_space=spaces.Discrete(2))
+    return path
+
+
+def asked(user: TupliAPIClient, **told: Any) -> httpx.Response:
+    return httpx.post(f"{user.url}/v1/query", headers=token_of(user), json=told, timeout=60)
+
+
+def filtered(wanted: BaseFilter) -> Any:
+    return wanted.model_dump(mode="json")
+
+
+@pytest.fixture
+def names(users: Users, tmp_path: Path) -> list[str]:
+    """Two recordings of ann's, one after the other, and one of another space."""
+    other = spaces.Box(-1, 1, (3,))
+    paths = [short_episodes(tmp_path / f"{i}.mcap", 600 if i else 300, i) for i in range(2)]
+    return [users.ann.push(path) for path in (*paths, short_episodes(tmp_path / "other.mcap", 3, 2, other))]
+
+
+def kept(answer: httpx.Response, path: Path) -> Recording:
+    """The recording that an answer is."""
+    assert answer.status_code == 200, answer.text
+    path.write_bytes(answer.content)
+    assert verify_recording(path).problems == []
+    return Recording(path)
+
+
+def test_exactly_the_episodes_that_match(users: Users, names: list[str], tmp_path: Path) -> None:
+    wanted = filtered(F("metadata.best") == True)  # noqa: E712 - an expression
+    answer = asked(users.ann, filter=wanted, recordings=[names[1]])
+    assert (answer.headers["Recording-Count"], answer.headers["Episode-Count"]) == ("1", "6")
+    with kept(answer, tmp_path / "cut.mcap") as cut, Recording(tmp_path / "1.mcap") as whole:
+        assert len(answer.content) < 0.03 * whole.size
+        assert cut.uuid == whole.uuid
+        assert [episode.number for episode in cut.episodes] == [7, 107, 207, 307, 407, 507]
+        for episode in cut.episodes:
+            assert np.array_equal(episode.states, whole.episodes[episode.number].states)
+            assert np.array_equal(episode.final_state, whole.episodes[episode.number].final_state)
+        everything = kept(asked(users.ann, recordings=[names[1]]), tmp_path / "all.mcap")
+        tables = [recording.file.store.table_of(whole.file.steps[0]) for recording in (everything, whole)]
+        assert np.array_equal(*(table[["length", "crc"]] for table in tables))  # copied as they are
+
+
+def test_episodes_of_several_recordings_are_merged(users: Users, names: list[str], tmp_path: Path) -> None:
+    wanted = filtered(F("metadata.best") == True)  # noqa: E712
+    answer = asked(users.ann, filter=wanted)
+    assert (answer.headers["Recording-Count"], answer.headers["Episode-Count"]) == ("2", "9")
+    with kept(answer, tmp_path / "merged.mcap") as merged:
+        scores = [episode.metadata["score"] for episode in merged.episodes]
+        assert scores == [7, 107, 207, 7, 107, 207, 307, 407, 507]
+        sources = [Recording(tmp_path / f"{i}.mcap") for i in (0, 1)]
+        for episode, source in zip(merged.episodes, [0] * 3 + [1] * 6, strict=True):
+            expected = sources[source].episodes[episode.metadata["score"]]
+            assert np.array_equal(episode.states, expected.states)
+    refused = asked(users.ann)
+    assert (refused.status_code, refused.json()["error"]) == (400, "SpaceError")
+    assert names[2] in refused.json()["detail"] and str(tmp_path) not in refused.text
+
+
+def test_benchmarks_and_rights(users: Users, things: Things, names: list[str], tmp_path: Path) -> None:
+    of_benchmark = {"benchmark_filter": filtered(FilterEQ(key="id", value=things.benchmark))}
+    assert len(kept(asked(users.ann, **of_benchmark), tmp_path / "of.mcap")) == 2
+    for told in ({}, of_benchmark, {"recordings": [names[1]]}):
+        assert asked(users.bob, **told).status_code == 404
+    users.ann.publish_episodes(F("metadata.score") < 5)
+    seen = kept(asked(users.bob, recordings=[names[1]]), tmp_path / "seen.mcap")
+    assert [episode.number for episode in seen.episodes] == [0, 1, 2, 3, 4]
+    assert asked(users.bob, filter=filtered(F("metadata.score") == 5)).status_code == 404
+    assert asked(users.ann, filter={"type": "EQ", "key": "nonsense", "value": 1}).status_code == 400
+    users.ann.delete_episodes(F("metadata.score") == 3)
+    left = kept(asked(users.bob, recordings=[names[1]]), tmp_path / "left.mcap")
+    assert [episode.number for episode in left.episodes] == [0, 1, 2, 4]
+
+
+def test_who_goes_away_is_not_sent_to(users: Users, tmp_path: Path) -> None:
+    random, n = np.random.default_rng(0), 100_000
+    noise = random.normal(size=(n, 40)).astype(np.float32)
+    data = [EpisodeData(noise, np.zeros(n, int), np.ones(n), np.zeros(n, bool), np.arange(n) == n - 1)]
+    write_recording(
+        tmp_path / "large.mcap",
+        data,
+        observation_space=spaces.Box(-np.inf, np.inf, (40,)),
+        action_space=spaces.Discrete(2),
+    )
+    name = users.ann.push(tmp_path / "large.mcap")
+    url, headers = f"{users.url}/v1/query", token_of(users.ann)
+    with httpx.stream("POST", url, json={"recordings": [name]}, headers=headers) as answer:
+        assert len(next(answer.iter_raw(1 << 16))) == 1 << 16
+        assert any(thread.name == "tupli-stream" for thread in threading.enumerate())
+    end = time.monotonic() + 60
+    while any(thread.name == "tupli-stream" for thread in threading.enumerate()):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_a_stream_tells_what_goes_wrong(tmp_path: Path) -> None:
+    path = short_episodes(tmp_path / "a.mcap", 200, 0)
+    data = bytearray(path.read_bytes())
+    with Recording(path) as recording:
+        row = recording.file.contents.table[-1]
+        data[int(row["offset"]) + 80] ^= 1
+        path.write_bytes(data)
+    opening = contextlib.ExitStack()
+    recording = opening.enter_context(Recording(path))
+
+    @contextlib.contextmanager
+    def opened() -> Iterator[list[Excerpt]]:
+        with opening:
+            yield [Excerpt(recording, recording.index)]
+
+    with pytest.raises(FormatError, match="CRC|decompress"):
+        list(stream_excerpts(opened()))

@@ -1,0 +1,101 @@
+"""One recording as several."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.mcap.container import Container
+from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.rewrite import new_metadata, write
+from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.rotation import series
+
+__all__ = ["Part", "split_recording"]
+
+
+class Part(NamedTuple):
+    """A file of a recording that was split, or would be: `first` to `last` are numbers of episodes."""
+
+    path: Path
+    episodes: int
+    steps: int
+    first: int
+    last: int
+    copied: int = 0
+    size: int = 0
+
+
+def split_recording(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    episodes: int | None = None,
+    max_bytes: int | None = None,
+    compression: str = "zstd",
+    dry_run: bool = False,
+) -> list[Part]:
+    """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a UUID of its own.
+
+    Episodes keep their numbers, and everything comes along but signature and certificate, which would not hold.
+
+    Args:
+        episodes: in each file.
+        max_bytes: of each file, as far as steps take as many bytes as on average; one episode at least.
+
+    Raises:
+        RecordingError: neither limit is given, or both; the source cannot be read; a target exists or cannot be
+            written.
+        FormatError: the source is damaged.
+    """
+    limit = episodes if max_bytes is None else max_bytes
+    if (episodes is None) == (max_bytes is None) or not isinstance(limit, int | np.integer) or limit < 1:
+        raise RecordingError(
+            "expected how many episodes or how many bytes go into a file, at least 1 of either, found "
+            f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
+        )
+    target = Path(target)
+    with Recording(source) as recording:
+        groups = _groups(recording, episodes, max_bytes)
+        paths = [target.with_stem(f"{target.stem}_{i:04}") if i else target for i in range(len(groups))]
+        taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
+        if taken:
+            raise RecordingError(f"{taken[0]} exists; delete it, or choose another path")
+        parts = []
+        for path, numbers in zip(paths, groups, strict=True):
+            lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
+            part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
+            parts.append(part if dry_run else _write_part(recording, part, numbers.tolist(), compression))
+    return parts
+
+
+def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -> list[np.ndarray]:
+    """Numbers of episodes, by file."""
+    numbers, lengths = recording.index["episode"].astype(np.int64), recording.index["length"].astype(np.int64)
+    if not len(numbers):
+        raise RecordingError(f"{recording.name} has no episodes to split")
+    if episodes is not None:
+        return [numbers[at : at + episodes] for at in range(0, len(numbers), episodes)]
+    attached = sum(info.size for info in recording.attachments.values())
+    share = max(1, recording.size - attached) / int(lengths.sum())
+    room, groups, begin, filled = max(1, (max_bytes or 0) - attached), [], 0, 0.0
+    for i, size in enumerate((lengths * share).tolist()):
+        if filled and filled + size > room:
+            groups.append(numbers[begin:i])
+            begin, filled = i, 0.0
+        filled += size
+    return [*groups, numbers[begin:]]
+
+
+def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
+    with replacing(part.path) as (fd, _):
+        container = Container(fd, str(part.path), compression)
+        copied = write(
+            recording, container, new_metadata(recording), numbers, {}, signed=False, left_out=STATEMENTS
+        )
+    return part._replace(copied=copied, size=part.path.stat().st_size)

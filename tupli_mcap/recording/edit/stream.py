@@ -1,0 +1,72 @@
+"""Episodes of recordings as a recording that is handed on while it is made."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager
+
+from tupli_mcap.mcap.container import COMPRESSIONS, Container
+from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit.rewrite import kept_metadata, write
+
+__all__ = ["stream_excerpts"]
+
+_PIECE = 1 << 16  # what a pipe holds
+
+
+def stream_excerpts(opening: AbstractContextManager[Sequence[Excerpt]]) -> Generator[bytes]:
+    """The bytes of a recording of these episodes, no faster than they are taken; each excerpt has some.
+
+    Of one recording they keep their numbers, and the recording its UUID; several are merged, as `merge_recordings`
+    does. A thread of its own opens the recordings, writes, and closes them; it gives up once the iterator is closed.
+
+    Raises:
+        SpaceError, RecordingError: they cannot be merged.
+        FormatError: one is damaged.
+    """
+
+    def write(fd: int) -> None:
+        with opening as excerpts:
+            _write(excerpts, fd)
+
+    return _through_a_pipe(write)
+
+
+def _write(excerpts: Sequence[Excerpt], fd: int) -> None:
+    source, rows = excerpts[0]
+    table = source.file.store.table
+    compression = COMPRESSIONS[int(table["compression"][0])]  # so that chunks can be copied as they are
+    container = Container(fd, source.name, compression)
+    if len(excerpts) > 1:
+        merge_excerpts(excerpts, container)
+        return
+    whole = len(rows) == len(source)
+    numbers = None if whole else rows["episode"].tolist()
+    write(source, container, kept_metadata(source), numbers, {}, signed=whole)
+
+
+def _through_a_pipe(write: Callable[[int], None]) -> Generator[bytes]:
+    """What `write` writes to a descriptor, by a thread of its own; its errors are raised here."""
+    reading, writing = os.pipe()
+    failed: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            write(writing)
+        except BaseException as err:  # noqa: BLE001 - raised where the pieces are taken
+            failed.append(err)
+        finally:
+            os.close(writing)
+
+    thread = threading.Thread(target=work, name="tupli-stream", daemon=True)
+    try:
+        thread.start()
+        while piece := os.read(reading, _PIECE):
+            yield piece
+    finally:
+        os.close(reading)  # whoever still writes is told so
+    thread.join()
+    if failed:
+        raise failed[0]

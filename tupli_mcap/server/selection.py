@@ -1,0 +1,105 @@
+"""Episodes that a query means, as a recording that is made while it is sent."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from operator import and_
+from typing import Final, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, Field
+from sqlalchemy import Connection, select
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.schema import BaseFilter, FilterIN
+from tupli_mcap.server import episodes
+from tupli_mcap.server.blobs import Blobs
+from tupli_mcap.server.items import Items
+from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.tables import FILE
+from tupli_mcap.storage.texts import escape_text, unescape_text
+
+__all__ = ["EpisodeQuery", "Selected", "opened", "select_episodes"]
+
+_MOST: Final = 256  # recordings in one answer: all of them are open
+_CACHE_BYTES: Final = 32 << 20  # of all recordings of an answer
+
+
+class EpisodeQuery(BaseModel):
+    """Which episodes: those of which all that is given is true.
+
+    recordings: names of recordings, as headers of episodes give them.
+    """
+
+    filter: BaseFilter | None = None
+    benchmark_filter: BaseFilter | None = None
+    recordings: list[str] | None = Field(default=None, max_length=10_000)
+
+
+class Selected(NamedTuple):
+    """Episodes of a recording, by number, and the place of its file among the blobs."""
+
+    name: str
+    place: str
+    numbers: Sequence[int]
+
+
+def select_episodes(
+    connection: Connection, caller: Caller, items: Items, query: EpisodeQuery
+) -> list[Selected]:
+    """The episodes that a query means, of those that the caller may read.
+
+    Raises:
+        NotFoundError: there are none.
+        StorageError: they are of more recordings than one answer can hold.
+        FilterError: a filter names what there is not.
+    """
+    wanted: list[BaseFilter] = [] if query.filter is None else [query.filter]
+    if query.benchmark_filter is not None:
+        ids = [header.id for header in items.list_benchmarks(connection, caller, query.benchmark_filter)]
+        wanted.append(FilterIN(key="benchmark_id", value=ids))
+    if query.recordings is not None:
+        names = [each for name in query.recordings for each in episodes.names_of(name)]
+        wanted.append(FilterIN(key="recording", value=names))
+    meant = reduce(and_, wanted) if wanted else None
+    numbers: dict[str, list[int]] = {}
+    for header in episodes.find_episodes(connection, caller, meant):
+        numbers.setdefault(header.recording, []).append(header.episode)
+    if not numbers:
+        raise NotFoundError("there is no such episode")
+    if len(numbers) > _MOST:
+        raise StorageError(
+            f"expected episodes of at most {_MOST} recordings, found {len(numbers)}; name some (`recordings`)"
+        )
+    return [Selected(name, _place(connection, name), found) for name, found in numbers.items()]
+
+
+def _place(connection: Connection, name: str) -> str:
+    query = select(FILE.c.place).where(FILE.c.path == escape_text(name))
+    return unescape_text(connection.execute(query).scalar_one())
+
+
+@contextlib.contextmanager
+def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]]:
+    """The episodes of recordings that are open in the block.
+
+    Raises:
+        NotFoundError: they have been deleted meanwhile.
+        RecordingError, FormatError: a file is gone, or damaged.
+    """
+    with contextlib.ExitStack() as stack:
+        excerpts = []
+        for name, place, numbers in selected:
+            source = Recording(blobs.place(place), cache_bytes=_CACHE_BYTES // len(selected))
+            recording = stack.enter_context(source)
+            recording.name = name  # what errors say: where files lie is nobody else's business
+            rows = recording.index[np.isin(recording.index["episode"], list(numbers))]
+            if len(rows):
+                excerpts.append(Excerpt(recording, rows))
+        if not excerpts:
+            raise NotFoundError("there is no such episode any more")
+        yield excerpts
