@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import gymnasium as gym
 import httpx
@@ -34,7 +35,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def web(lab: Path) -> Iterator[httpx.Client]:
-    with browsing(lab) as address, httpx.Client(base_url=address) as client:
+    with browsing(lab) as address, httpx.Client(base_url=address, timeout=120) as client:
         yield client
 
 
@@ -49,7 +50,7 @@ def addresses(client: httpx.Client) -> list[str]:
     """A page of each kind."""
     episodes = told(client, "/episodes")["episodes"]
     keys = [dataset["key"] for dataset in told(client, "/")["datasets"]]
-    ids = {episode["recording"]: episode["id"] for episode in episodes}.values()
+    ids = list({episode["recording"]: episode["id"] for episode in episodes}.values())
     return [
         "/",
         "/?q=cart",
@@ -59,6 +60,7 @@ def addresses(client: httpx.Client) -> list[str]:
         *(f"/dataset/{key}" for key in keys),
         *(f"/episode/{uri}?step=3" for uri in ids),
         "/episode/nope",
+        f"/compare?{'&'.join(f'episode={uri}' for uri in ids[:2])}",
         "/nowhere",
     ]
 
@@ -66,13 +68,13 @@ def addresses(client: httpx.Client) -> list[str]:
 class TestDatasets:
     def test_they_are_put_together_by_environment(self, web: httpx.Client, lab: Path) -> None:
         found = {dataset["name"]: dataset for dataset in told(web, "/")["datasets"]}
-        assert set(found) == {"CartPole-v1", "recordings"}
+        assert set(found) == {"CartPole-v1", "open the drawer"}
         carts = tupli_mcap.open(str(lab / "ppo*.mcap"))
         told_of = found["CartPole-v1"]
         assert (told_of["recordings"], told_of["episodes"], told_of["steps"]) == (2, 24, carts.n_steps)
         assert told_of["return"]["mean"] == pytest.approx(carts.returns.mean())
         assert told_of["return"]["max"] == carts.returns.max()
-        assert found["recordings"]["success"] == 0.5
+        assert found["open the drawer"]["success"] == 0.5
 
     def test_search(self, web: httpx.Client) -> None:
         assert [d["name"] for d in told(web, "/", q="CART baseline")["datasets"]] == ["CartPole-v1"]
@@ -230,6 +232,91 @@ class TestEpisodes:
         drawn = web.get("/cover/CartPole-v1")
         assert drawn.headers["content-type"] == "image/svg+xml"
         assert "default-src 'none'" in drawn.headers["content-security-policy"]
+
+
+class TestChosen:
+    @pytest.fixture(scope="class")
+    def best(self, web: httpx.Client) -> list[dict[str, Any]]:
+        listed: list[dict[str, Any]] = told(web, "/episodes", dataset="CartPole-v1", sort="-return")[
+            "episodes"
+        ]
+        return listed[:3]
+
+    def test_they_are_compared(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
+        ids = [episode["id"] for episode in best]
+        assert {e["id"] for e in told(web, "/compare", episode=ids)["episodes"]} == set(ids)
+        text = web.get("/compare", params={"episode": ids}).text
+        assert text.count('class="line s2"') == len(["reward", "so far", "action", "4 states"]) + 3
+        assert web.get("/compare", params={"episode": ids[:1]}).status_code == 400
+        assert web.get("/compare", params={"episode": [*ids, "0" * 32 + "-1"]}).status_code == 404
+
+    def test_they_are_downloaded(self, web: httpx.Client, best: list[dict[str, Any]], tmp_path: Path) -> None:
+        path = tmp_path / "got.mcap"
+        for chosen in (
+            {"episode": [e["id"] for e in best]},
+            {"dataset": "CartPole-v1", "filter": "steps > 100"},
+        ):
+            answer = web.get("/download", params=chosen)  # type: ignore[arg-type]
+            assert "attachment" in answer.headers["content-disposition"]
+            path.write_bytes(answer.content)
+            wanted = best if "episode" in chosen else told(web, "/episodes", **chosen)["episodes"]
+            with tupli_mcap.Recording(path) as recording:
+                assert sorted(e.return_ for e in recording) == sorted(e["episode_return"] for e in wanted)
+        one = web.get("/download", params={"episode": best[0]["id"]})
+        path.write_bytes(one.content)
+        with tupli_mcap.Recording(path) as recording:
+            assert [episode.id for episode in recording] == [best[0]["id"]]
+        assert web.get("/download", params={"filter": "steps > 100000"}).status_code == 404
+        assert web.get("/download", params={"filter": "steps >"}).status_code == 400
+
+    def test_python_loads_them(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
+        for address in (
+            f"/episode/{best[0]['id']}",
+            "/episodes?dataset=CartPole-v1&filter=steps+%3E+30+or+steps+%3C+20&sort=-return",
+            "/dataset/CartPole-v1",
+        ):
+            line = html.unescape(re.findall(r'data-copy="(tupli_mcap[^"]*)"', web.get(address).text)[-1])
+            found = eval(line, {"tupli_mcap": tupli_mcap})
+            if "/episode/" in address:
+                assert found.id == best[0]["id"]
+            else:
+                listed = "/episodes?dataset=CartPole-v1" if "/dataset/" in address else address
+                expected = web.get(f"{listed}&format=json").json()["episodes"]
+                assert [e.id for e in found] == [e["id"] for e in expected]
+
+    def test_lines_beside_rows(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
+        sparks = web.get("/sparks", params={"episode": [e["id"] for e in best]}).json()
+        assert sparks["name"] == "Cart Position"  # the rewards are always the same
+        assert set(sparks["lines"]) == {e["id"] for e in best}
+        assert all(re.fullmatch(r"[ML0-9. -]+", line) for line in sparks["lines"].values())
+
+    def test_a_film(self, web: httpx.Client) -> None:
+        uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
+        assert b"ftyp" in web.get(f"/episode/{uri}/film.mp4").content[:16]
+
+    def test_rerun(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
+        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+        ids = [episode["id"] for episode in best]
+        for chosen in (ids[:1], ids):
+            assert web.get("/replay.rrd", params={"episode": chosen}).content.startswith(b"RRF")
+        page = web.get("/viewer", params={"episode": ids})
+        assert "'wasm-unsafe-eval'" in page.headers["content-security-policy"]
+        assert "frame-ancestors 'self'" in page.headers["content-security-policy"]
+        script = re.search(r'src="(/viewer/[^"]*re_viewer.js)"', page.text)
+        assert script and "wasm_bindgen" in web.get(script[1]).text
+        assert web.get("/viewer/0.0.1/re_viewer.js").status_code == 404
+
+    def test_foxglove_is_given_an_address_that_others_do_not_know(
+        self, web: httpx.Client, best: list[dict[str, Any]], lab: Path
+    ) -> None:
+        text = html.unescape(web.get(f"/episode/{best[0]['id']}").text)
+        link = re.search(r'href="(https://app.foxglove.dev/[^"]*)"', text)
+        assert link
+        url = parse_qs(urlsplit(link[1]).query)["ds.url"][0]
+        answer = httpx.get(url, headers={"Range": "bytes=0-7"})
+        assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (206, "*")
+        assert answer.content == (lab / best[0]["recording"]).read_bytes()[:8]
+        assert httpx.get(re.sub("/file/[^/]*/", "/file/guessed/", url)).status_code == 404
 
 
 class TestOneFile:

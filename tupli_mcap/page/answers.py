@@ -20,14 +20,14 @@ from tupli_mcap.page import texts
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
-__all__ = ["PageRoute", "Shown", "address", "error_page", "page"]
+__all__ = ["POLICY", "PageRoute", "Shown", "address", "error_page", "page"]
 
-_POLICY: Final = (
+POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
 )
 _HEADERS: Final = {
-    "Content-Security-Policy": _POLICY,
+    "Content-Security-Policy": POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",

@@ -2,33 +2,49 @@
 
 from __future__ import annotations
 
+import secrets
 import socket
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 
 import uvicorn
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
+from fastapi.responses import FileResponse
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.page.answers import error_page
-from tupli_mcap.page.directory import shelf_of
+from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
-from tupli_mcap.page.shelf import Shelf
 
 __all__ = ["browse", "create_app"]
 
 _HOST = "127.0.0.1"
+_FOR_VIEWERS = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
+    "X-Content-Type-Options": "nosniff",
+}
 
 
-def create_app(shelf: Shelf) -> FastAPI:
+def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
+    """A recording for a viewer of another host, which has its address from a page of ours."""
+    shelf: DirectoryShelf | FileShelf = request.app.state.shelf
+    if not secrets.compare_digest(ticket.encode(), shelf.ticket.encode()):
+        raise HTTPException(404, "there is no such file")
+    return FileResponse(shelf.path_of(name), media_type="application/octet-stream", headers=_FOR_VIEWERS)
+
+
+def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
     """The application that shows a shelf, to programs of this machine only."""
     app = FastAPI(title="tupli-mcap", docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.shelf = shelf
     app.state.shelf_of = lambda request: shelf
     for router in PAGES:
         app.include_router(router)
+    app.get("/file/{ticket}/{name:path}")(read_recording)
     app.add_exception_handler(HTTPException, error_page)  # an address that there is not
     # A page of somebody else, whose name is made to mean this machine, must not read what is shown.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])

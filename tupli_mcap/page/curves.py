@@ -82,8 +82,7 @@ def curves_of(episode: Episode) -> Curves:
         ("reward", layout.reward, columns.rewards),
     ):
         for leaf in leaves:
-            if leaf.kind == "variable" or leaf.apart:  # a picture of its own, or no number
-                notes += [] if leaf.apart else LeafValues(leaf, recording.labels, None).notes()
+            if leaf.kind == "variable" or leaf.apart:  # shown as a text, or as a picture
                 continue
             column = np.asarray(leaf.get(values)).reshape(read, leaf.size)
             tracks += _tracks(field, leaf, recording.labels, column, notes)

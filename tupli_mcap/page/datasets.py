@@ -14,17 +14,26 @@ from sqlalchemy import ColumnElement, Connection, and_, select
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.shelf import Shelf
-from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader
+from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterEQ, format_filter
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.listing import LIVE
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = ["Dataset", "all_datasets", "dataset_of", "find_dataset", "of_dataset", "of_recording"]
+__all__ = [
+    "Dataset",
+    "all_datasets",
+    "dataset_filter",
+    "dataset_of",
+    "find_dataset",
+    "of_dataset",
+    "of_recording",
+]
 
 _PLAIN: Final = re.compile(r"\w[\w.@:+ -]{0,100}(/\w[\w.@:+ -]{0,100}){0,3}", re.ASCII)
 _NAMELESS: Final = "-"
+_UNNAMED: Final = "Recordings without an environment"
 
 
 @dataclass(frozen=True)
@@ -43,9 +52,11 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """The benchmark's name, else the environment's."""
+        """The benchmark's name, else the environment's, else that of the only run."""
         named = self.benchmark.metadata.name if self.benchmark else ""
-        unnamed = f"benchmark {self.benchmark_id[:8]}" if self.benchmark_id else "recordings"
+        runs = {str(run.get("name", "")) for run in self.runs}
+        only = next(iter(runs)) if len(runs) == 1 else ""
+        unnamed = f"benchmark {self.benchmark_id[:8]}" if self.benchmark_id else only or _UNNAMED
         return named or self.environment or unnamed
 
     @property
@@ -160,6 +171,14 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
     if not found:
         raise NotFoundError(f"there is no dataset {key[:80]!r} here")
     return found[0]
+
+
+def dataset_filter(key: str) -> str:
+    """The text of a filter that is true of the episodes of a dataset; empty for none, or an odd name."""
+    if not key or key.startswith(("~", _NAMELESS)):
+        return ""
+    name = "benchmark_id" if is_hash(key) else "run.environment"
+    return format_filter(FilterEQ(key=name, value=key))
 
 
 def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:

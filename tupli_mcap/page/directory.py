@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
+from urllib.parse import quote
 
 from sqlalchemy import ColumnElement, Connection, true
 
@@ -66,9 +68,18 @@ class OpenedRecordings:
 
 
 class _OpenToAll:
-    """What lies on this machine is read as a whole, by who runs the program."""
+    """What lies on this machine is read as a whole, by who runs the program.
+
+    A page of another host may read a recording only where it was given its address, which nobody can guess.
+    """
 
     user = ""
+
+    def __init__(self) -> None:
+        self.ticket = secrets.token_urlsafe(16)
+
+    def address_of(self, recording: str) -> str:
+        return f"/file/{self.ticket}/{quote(recording, errors='surrogatepass')}"
 
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
         return true()
@@ -78,6 +89,7 @@ class DirectoryShelf(_OpenToAll):
     """The recordings below a directory, and the benchmarks if it is a storage."""
 
     def __init__(self, root: Path) -> None:
+        super().__init__()
         self._storage = FileStorage(root)
         self._opened = OpenedRecordings()
         self.title = self._storage.root.name or str(self._storage.root)
@@ -91,8 +103,10 @@ class DirectoryShelf(_OpenToAll):
         return self._storage.ask(question)
 
     def open(self, recording: str) -> Recording:
-        path = self._storage.recording_path(recording)
-        return self._opened.get(path, _stamp(self._storage.root, recording))
+        return self._opened.get(self.path_of(recording), _stamp(self._storage.root, recording))
+
+    def path_of(self, recording: str) -> Path:
+        return self._storage.recording_path(recording)
 
     def benchmarks(self) -> Sequence[BenchmarkHeader]:
         return self._storage.list_benchmarks()
@@ -102,6 +116,7 @@ class FileShelf(_OpenToAll):
     """One recording."""
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self._path = path.absolute()
         self._catalog = Catalog(None)
         self._known: RecordingStamp | None = None
@@ -137,9 +152,12 @@ class FileShelf(_OpenToAll):
         self._known = None if entry.live else entry.stamp
 
     def open(self, recording: str) -> Recording:
+        return self._opened.get(self.path_of(recording), _stamp(self._path.parent, recording))
+
+    def path_of(self, recording: str) -> Path:
         if recording != self._path.name:
             raise NotFoundError(f"there is no recording {recording[:200]!r} here")
-        return self._opened.get(self._path, _stamp(self._path.parent, recording))
+        return self._path
 
     def benchmarks(self) -> Sequence[BenchmarkHeader]:
         return []

@@ -19,6 +19,9 @@ from tupli_mcap.spaces.leaves import Leaf
 __all__ = ["Camera", "cameras_of", "picture_at"]
 
 
+_COARSE = 200  # pixels
+
+
 class Camera(NamedTuple):
     """What there are pictures of: a camera, or an image of the states (`leaf`).
 
@@ -28,6 +31,11 @@ class Camera(NamedTuple):
     name: str
     steps: Array
     leaf: Leaf | None = None
+
+    @property
+    def coarse(self) -> bool:
+        """Whether its pixels are to be seen as such: it has few."""
+        return self.leaf is not None and max(self.leaf.shape) < _COARSE
 
     def place(self, step: int) -> int:
         """Which picture shows a step: the last one up to it."""

@@ -9,11 +9,11 @@ from sqlalchemy import ColumnElement, Connection, and_
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterEQ
+from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.catalog.tables import EPISODE
 
-__all__ = ["Shelf", "find_episode", "seen_episodes"]
+__all__ = ["Shelf", "find_episode", "find_some", "seen_episodes"]
 
 T = TypeVar("T")
 
@@ -51,6 +51,10 @@ class Shelf(Protocol):
         """
         ...
 
+    def address_of(self, recording: str) -> str | None:
+        """Where a viewer of another host may read a recording for a while: a path of this server; None for nowhere."""
+        ...
+
     def benchmarks(self) -> Sequence[BenchmarkHeader]:
         """The benchmarks that may be read."""
         ...
@@ -61,15 +65,24 @@ def seen_episodes(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnEleme
     return and_(shelf.seen(EPISODE.c.created_by, EPISODE.c.published_in), *conditions)
 
 
-def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
-    """An episode by its id; of one that several people have stored, the reader's own.
+def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:
+    """Episodes by their ids, each once, in the order of their recordings; of those that several people have stored,
+    the reader's own.
 
     Raises:
-        NotFoundError: there is none that may be read.
+        NotFoundError: one of them is not there, or may not be read.
     """
-    found = list(
-        find_episodes(connection, FilterEQ(key="id", value=uri), only=seen_episodes(shelf), limit=100)
-    )
-    if not found:
-        raise NotFoundError(f"there is no episode {uri[:80]!r} here")
-    return min(found, key=lambda header: header.created_by != shelf.user)
+    wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
+    found: dict[str, EpisodeHeader] = {}
+    for header in find_episodes(connection, wanted, only=seen_episodes(shelf)):
+        if header.id not in found or header.created_by == shelf.user:
+            found[header.id] = header
+    missing = [uri for uri in uris if uri not in found]
+    if missing:
+        raise NotFoundError(f"there is no episode {missing[0][:80]!r} here")
+    return list(found.values())
+
+
+def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
+    """An episode by its id. Raises NotFoundError, as `find_some` does."""
+    return find_some(shelf, connection, [uri])[0]

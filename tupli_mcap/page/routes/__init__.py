@@ -3,11 +3,13 @@
 lists      `/`: datasets; `/episodes`: tables of episodes
 dataset    `/dataset/KEY`: one of them
 episode    `/episode/ID`: one episode
+chosen     `/compare`, `/download`
+replay     `/viewer`: episodes in Rerun
 files      pictures, and the style and the script of the pages
 """
 
-from tupli_mcap.page.routes import dataset, episode, files, lists
+from tupli_mcap.page.routes import chosen, dataset, episode, files, lists, replay
 
 __all__ = ["PAGES"]
 
-PAGES = (lists.router, dataset.router, episode.router, files.router)
+PAGES = (lists.router, dataset.router, episode.router, chosen.router, replay.router, files.router)

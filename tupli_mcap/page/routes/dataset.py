@@ -15,7 +15,8 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page import charts, texts
 from tupli_mcap.page.answers import PageRoute, Shown, page
-from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset, of_recording
+from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_dataset, of_recording
+from tupli_mcap.page.python import python_line
 from tupli_mcap.page.routes.episode import Seen, look
 from tupli_mcap.page.samples import (
     SampledEpisodes,
@@ -80,6 +81,7 @@ def dataset(
     }
     drawn: dict[str, Any] = {
         "over_time": list(_over_time(episodes, _lines_apart(episodes, of))),
+        "python": python_line(shelf, dataset_filter(key)),
         "seeds": _ends(episodes.seeds),
         "histograms": _histograms(values),
         "files": sorted(of.recordings, key=lambda item: -item.last)[:_RECORDINGS],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Request, Response
 from markupsafe import Markup
@@ -16,9 +17,11 @@ from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
 from tupli_mcap.page.datasets import Dataset, dataset_of, of_dataset, of_recording
 from tupli_mcap.page.pictures import Camera, cameras_of
+from tupli_mcap.page.python import python_line
 from tupli_mcap.page.shelf import Shelf, find_episode, seen_episodes
+from tupli_mcap.page.texts import iso
 from tupli_mcap.recording import Episode
-from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_bound
 from tupli_mcap.storage.catalog.queries import After, Sort, find_episodes
 
 __all__ = ["Seen", "look", "opened", "router"]
@@ -66,7 +69,8 @@ def episode(
     context = {"dataset": dataset, "filter": filter, "sort": sort}
     return page(
         request, "episode.html", facts, shelf=shelf, header=header, seen=seen, dataset=of, around=neighbours,
-        context=context,
+        context=context, python=python_line(shelf, format_filter(FilterEQ(key="id", value=uri))) + "[0]",
+        foxglove=_foxglove(request, shelf, header, seen.episode),
     )  # fmt: skip
 
 
@@ -90,6 +94,16 @@ def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
     if found == len(recording.index) or recording.index["episode"][found] != header.episode:
         raise NotFoundError(f"episode {header.id} is gone")
     return recording.episodes[int(found)]
+
+
+def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Episode) -> str:
+    """A link that opens the recording in Foxglove, where the episode begins."""
+    place = shelf.address_of(header.recording)
+    if place is None:
+        return ""
+    url = str(request.base_url).rstrip("/") + place
+    told = {"ds": "remote-file", "ds.url": url, "time": iso(shown.start_time)}
+    return f"https://app.foxglove.dev/~/view?{urlencode(told)}"
 
 
 class Seen(NamedTuple):

@@ -16,7 +16,9 @@ from sqlalchemy import Connection
 from tupli_mcap.errors import FilterError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
-from tupli_mcap.page.datasets import Dataset, all_datasets, find_dataset, of_dataset
+from tupli_mcap.page.copies import MOST_COMPARED
+from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
+from tupli_mcap.page.python import both, python_line
 from tupli_mcap.page.shelf import Shelf, find_episode, seen_episodes
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
@@ -107,7 +109,7 @@ def episodes(
     link = functools.partial(_link, dataset=dataset, filter=filter, sort=sort)
     return page(
         request, "episodes.html", facts, status=status, shelf=shelf, dataset=of, table=table, filter=filter, sort=sort,
-        link=link,
+        link=link, most_compared=MOST_COMPARED, python=python_line(shelf, both(dataset_filter(dataset), filter), sort),
     )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
-// What the page does beyond links and forms: times as the reader's clock has them, copying, and the player.
+// What the page does beyond links and forms: times as the reader's clock has them, copying, choosing, the player.
 
 import { player } from "./player.js";
+import { table } from "./table.js";
 
 for (const time of document.querySelectorAll("time[datetime]")) {
   const moment = new Date(time.dateTime);
@@ -10,13 +11,41 @@ for (const time of document.querySelectorAll("time[datetime]")) {
   }
 }
 
-document.addEventListener("click", async (event) => {
+for (const section of document.querySelectorAll(".player")) player(section);
+for (const form of document.querySelectorAll("form.chosen")) table(form);
+
+document.addEventListener("click", (event) => {
   const button = event.target.closest("[data-copy]");
-  if (!button) return;
-  await navigator.clipboard.writeText(button.dataset.copy);
-  const label = button.textContent;
-  button.textContent = "Copied";
-  setTimeout(() => (button.textContent = label), 1500);
+  if (button) copy(button);
+  const opener = event.target.closest("[data-embed]");
+  if (opener && !event.ctrlKey && !event.metaKey && !event.shiftKey) {
+    event.preventDefault();
+    embed(document.getElementById(opener.dataset.embed), opener);
+  }
 });
 
-for (const section of document.querySelectorAll(".player")) player(section);
+async function copy(button) {
+  const label = (button.dataset.label ??= button.textContent);
+  try {
+    await navigator.clipboard.writeText(button.dataset.copy);
+    button.textContent = "Copied";
+  } catch {
+    prompt("Copy this:", button.dataset.copy); // a browser allows more only where the page is served by HTTPS or from here
+  }
+  setTimeout(() => (button.textContent = label), 1500);
+}
+
+// Shows a page within this one; shown already, it goes again.
+function embed(place, opener) {
+  const gone = place.hidden;
+  place.hidden = !gone;
+  place.replaceChildren();
+  opener.setAttribute("aria-expanded", String(gone));
+  if (gone) {
+    const frame = document.createElement("iframe");
+    frame.src = opener.href;
+    frame.title = "Replay in the Rerun viewer";
+    place.append(frame);
+    place.scrollIntoView({ block: "nearest" });
+  }
+}

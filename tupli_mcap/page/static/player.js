@@ -126,6 +126,7 @@ function seekByTracks(section, slider, steps, show) {
 // The values of the last step that was asked for; those of steps passed by meanwhile are not fetched.
 const asked = new WeakMap();
 async function values(section, step) {
+  if (!section.dataset.episode) return;
   const busy = asked.has(section);
   asked.set(section, step);
   if (busy) return;

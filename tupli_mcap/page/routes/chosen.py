@@ -1,0 +1,119 @@
+"""Chosen episodes: compared, drawn small beside each other, taken home."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import numpy as np
+from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi.responses import FileResponse
+from markupsafe import Markup
+from sqlalchemy import Connection
+from starlette.background import BackgroundTask
+
+from tupli_mcap import files, jsonvalue
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.page import charts
+from tupli_mcap.page.answers import PageRoute, Shown, page
+from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_file
+from tupli_mcap.page.curves import Track
+from tupli_mcap.page.datasets import of_dataset
+from tupli_mcap.page.routes.episode import Seen, look
+from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes
+from tupli_mcap.page.sparks import sparks_of
+from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.storage.catalog.queries import find_episodes
+
+__all__ = ["router", "sent"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
+_MEDIA: Final = "application/octet-stream"
+
+
+class Compared(NamedTuple):
+    """The same number in several episodes. lines: as SVG. ends: the smallest and the largest value of all."""
+
+    name: str
+    lines: Markup
+    ends: tuple[float, float]
+
+
+@router.get("/compare")
+def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
+    """Up to eight episodes, in the same plots."""
+    if not 2 <= len(set(uris)) <= MOST_COMPARED:
+        raise HTTPException(400, f"expected 2 to {MOST_COMPARED} episodes to compare, found {len(set(uris))}")
+    headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
+    seen = [look(shelf, header, 0) for header in headers]
+    steps = max(len(one.episode) for one in seen)
+    groups = [(title, _compared(seen, field, steps)) for field, title in _FIELDS.items()]
+    keys = list(dict.fromkeys(chain.from_iterable(header.metadata for header in headers)))
+    facts = {"episodes": [dict(header) for header in headers]}
+    return page(
+        request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
+        groups=[(title, tracks) for title, tracks in groups if tracks],
+    )  # fmt: skip
+
+
+_FIELDS: Final = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
+
+
+def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
+    """The tracks that all episodes have."""
+    each = [{track.name: track for track in one.curves.of(field)} for one in seen]
+    names = [name for name in each[0] if all(name in tracks for tracks in each)]
+    return [_overlaid(name, [tracks[name] for tracks in each], steps) for name in names]
+
+
+def _overlaid(name: str, tracks: Sequence[Track], steps: int) -> Compared:
+    ends = np.array([track.ends for track in tracks])
+    known = ends[np.isfinite(ends).all(axis=1)]
+    low, high = (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
+    room = 0.04 * (high - low)
+    lines = [(track.at, track.values) for track in tracks]
+    drawn = charts.lines(lines, (0.0, max(1.0, steps - 1.0)), (low - room, high + room))
+    return Compared(name, drawn, (low, high))
+
+
+@router.get("/sparks")
+def sparks(shelf: Shown, uris: Ids) -> Response:
+    """Lines beside the rows of a table, as JSON: what they are of, and by id the path of each."""
+    headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
+    return Response(jsonvalue.dumps(sparks_of(shelf, headers)._asdict()), media_type="application/json")
+
+
+@router.get("/download")
+def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> FileResponse:
+    """One recording of exactly the chosen episodes, or else of all that a filter is true of."""
+
+    def ask(connection: Connection) -> list[EpisodeHeader]:
+        if uris:
+            return find_some(shelf, connection, uris)
+        wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
+        only = seen_episodes(shelf, *([of_dataset(dataset)] if dataset else []))
+        return list(find_episodes(connection, wanted, only=only))
+
+    headers = shelf.ask(ask)
+    if not headers:
+        raise NotFoundError("there is no such episode; choose others")
+    name = str(headers[0].run.get("name", "")) or Path(headers[0].recording).stem
+    what = f"episode-{headers[0].episode}" if len(headers) == 1 else f"{len(headers)}-episodes"
+    return sent(recording_file(shelf, headers), f"{files.as_file_name(name)}-{what}.mcap")
+
+
+@router.get("/episode/{uri}/film.mp4")
+def film(shelf: Shown, uri: str) -> FileResponse:
+    """The pictures of an episode."""
+    header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
+    return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")
+
+
+def sent(path: Path, name: str, media: str = _MEDIA) -> FileResponse:
+    """A file in a temporary directory of its own, which is removed when it was sent."""
+    gone = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
+    return FileResponse(path, media_type=media, filename=name, background=gone)

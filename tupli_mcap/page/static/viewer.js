@@ -1,0 +1,23 @@
+// Starts the Rerun viewer, whose own script defines `wasm_bindgen`, with the replay that the page names.
+
+(async () => {
+  const canvas = document.getElementById("viewer");
+  const status = document.querySelector(".coming");
+  try {
+    await wasm_bindgen({ module_or_path: `${canvas.dataset.files}/re_viewer_bg.wasm` });
+    const handle = new wasm_bindgen.WebHandle({
+      url: [new URL(canvas.dataset.replay, location.href).href],
+      hide_welcome_screen: true,
+      enable_history: false,
+      notebook: false,
+      persist: false,
+      theme: "system",
+      panel_state_overrides: { top: "Hidden", blueprint: "Collapsed", selection: "Hidden", time: "Collapsed" },
+    });
+    await handle.start(canvas);
+    status.remove();
+  } catch (error) {
+    status.textContent = `The viewer does not run in this browser: ${error}`;
+    canvas.remove();
+  }
+})();

@@ -1,0 +1,79 @@
+"""The Rerun web viewer that comes with rerun-sdk, as files that the page serves itself: it asks no other host.
+
+The program `rerun` holds them and serves them; they are taken from it once, and kept compressed in this user's cache
+directory, where nobody else can write. Their version is that of the data, as viewers read no other one.
+"""
+
+from __future__ import annotations
+
+import gzip
+import threading
+import urllib.request
+from pathlib import Path
+from typing import Final
+
+from tupli_mcap import files
+from tupli_mcap.errors import StorageError, os_reason
+from tupli_mcap.storage.catalog.place import cache_dir, is_private, make_private
+
+__all__ = ["NAMES", "viewer_file", "viewer_version"]
+
+NAMES: Final = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "application/wasm"}
+_turn = threading.Lock()
+
+
+def viewer_version() -> str:
+    """The version of rerun-sdk.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    from tupli_mcap.viewer.sdk import rerun_sdk
+
+    return str(rerun_sdk().__version__)
+
+
+def viewer_file(name: str) -> Path:
+    """One of NAMES, compressed by gzip.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+        ViewerError: its program cannot be run.
+        StorageError: there is no place for the files.
+    """
+    folder = cache_dir() / "viewer" / viewer_version()
+    with _turn:
+        if not (folder / f"{name}.gz").is_file():
+            _take(folder)
+        if not is_private(folder) or not is_private(folder / f"{name}.gz"):
+            raise StorageError(f"others may write to {folder}; remove it, or set TUPLI_MCAP_CACHE_DIR")
+    return folder / f"{name}.gz"
+
+
+def _take(folder: Path) -> None:
+    from tupli_mcap.viewer.process import (
+        LOCAL,
+        end,
+        free_port,
+        scratch,
+        start,
+        viewer_program,
+        wait_for_ports,
+    )
+
+    try:
+        make_private(folder)
+        with scratch() as place, (place / "log").open("wb") as log:
+            ports = [free_port(), free_port()]
+            words = ["--serve-web", "--port", str(ports[0]), "--web-viewer-port", str(ports[1])]
+            process = start(viewer_program(), *words, log=log)
+            try:
+                wait_for_ports(process, ports[1:], place / "log")
+                for name in NAMES:
+                    with urllib.request.urlopen(f"http://{LOCAL}:{ports[1]}/{name}", timeout=60) as answer:
+                        data = gzip.compress(answer.read(), 6, mtime=0)
+                    files.write_bytes(folder / f"{name}.gz", data, permissions=0o600)
+            finally:
+                end(process)
+    except OSError as err:
+        raise StorageError(f"the viewer's files cannot be kept in {folder}: {os_reason(err)}") from err
