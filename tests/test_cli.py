@@ -1133,6 +1133,7 @@ class TestSharing:
 # --- the program as a whole ---
 
 
+LISTED = ("users", "groups", "roles", "tokens", "benchmarks", "artifacts", "episodes")
 COMMANDS = [name for name, command in get_command(app).commands.items() if not command.hidden]  # type: ignore[attr-defined]
 
 
@@ -1163,7 +1164,18 @@ class TestProgram:
     def test_the_commands_are_in_groups(self, here: Path) -> None:
         lines = ok("--help").splitlines()
         titles = [line[:-1] for line in lines if re.fullmatch(r"[A-Z]\w+:", line)]
-        assert titles == ["Options", "Record", "Look", "Check", "Edit", "Share", "Server", "Storage", "Help"]
+        assert titles == [
+            "Options",
+            "Record",
+            "Look",
+            "Check",
+            "Edit",
+            "Share",
+            "Server",
+            "People",
+            "Storage",
+            "Help",
+        ]
         assert lines[lines.index("Record:") + 1].startswith("  record ")
 
     @pytest.mark.parametrize("command", COMMANDS)
@@ -1223,7 +1235,7 @@ class TestProgram:
         found = tool(
             cwd=here, _TUPLI_MCAP_COMPLETE="complete_bash", COMP_WORDS="tupli-mcap list-", COMP_CWORD="1"
         )
-        assert found.out.split() == ["list-benchmarks", "list-artifacts", "list-episodes"]
+        assert found.out.split() == [f"list-{each}" for each in LISTED]
 
     def test_help_imports_nothing_heavy(self, here: Path) -> None:
         code = (

@@ -154,6 +154,22 @@ pull: pull {pole} --storage pulled
 publish: publish {pole}
 unpublish: unpublish {pole}
 password: password ann
+list-users: list-users
+create-group: create-group lab --description us
+list-groups: list-groups
+add-members: add-members lab ann
+read-group: read-group lab
+remove-members: remove-members lab ann
+delete-group: delete-group lab
+create-role: create-role looker episode_read
+list-roles: list-roles
+delete-role: delete-role looker
+create-token: create-token ci --forever
+create-token: create-token robot --write
+list-tokens: list-tokens
+delete-token: delete-token {token}
+delete-user: delete-user ann
+push: push --dry-run
 logout: logout
 """
 EMPTY = {
@@ -181,6 +197,8 @@ def test_every_command_prints_what_the_page_says(url: str) -> None:
         call, _, code = line.partition(" | ")
         words = call.format(**ids).split()
         found = document(*words, code=int(code or 0))
+        if section == "create-token":
+            ids["token"] = found["result"]["id"]
         assert (list(found), found["command"]) == (["version", "command", "result"], words[0])
         are_several, fields = TABLES[section]
         assert isinstance(found["result"], list) == are_several

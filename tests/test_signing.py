@@ -21,6 +21,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message, Metadata, Statistics, SummaryOffset
+from serving import PASSWORD, serving
 from test_cli import fails, ok, run
 from test_environment import Counter
 
@@ -51,6 +52,9 @@ from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.schema import ArtifactMetadata, Episode, FilterEQ
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage import TupliAPIClient
+from tupli_mcap.storage.exchange import copy_episodes, push_recording
 
 
 def write_key(path: Path, *, format: str = "ssh", passphrase: str | None = None) -> signing.SigningKey:
@@ -664,6 +668,33 @@ def test_importing_takes_the_key_s_word(bundle: Path, tmp_path: Path, alice: sig
         trust.trust_key(alice.public_key, "alice")  # what was vouched for before is forgotten
         with pytest.raises(UntrustedError):
             TupliEnvWrapper.load(storage, benchmark)
+
+
+def test_fetching_from_a_server_takes_the_key_s_word(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey
+) -> None:
+    with serving(Settings(tmp_path / "served")) as url, TupliAPIClient(url) as client:
+        client.login("admin", PASSWORD)
+        push_recording(client, bundle)
+        (benchmark,) = client.list_benchmarks()
+        with FileStorage(tmp_path / "lab") as lab:
+
+            def refused() -> None:
+                for storage in (client, lab):
+                    with pytest.raises(UntrustedError, match="pickled Python code"):
+                        TupliEnvWrapper.load(storage, benchmark.id)
+
+            copy_episodes(client, lab, benchmark_id=benchmark.id)
+            refused()
+            trust.trust_key(write_key(tmp_path / "bob").public_key, "bob")
+            copy_episodes(client, lab, benchmark_id=benchmark.id)
+            refused()
+            trust.trust_key(alice.public_key, "alice")
+            copy_episodes(client, lab, benchmark_id=benchmark.id)
+            for storage in (client, lab):
+                TupliEnvWrapper.load(storage, benchmark.id).close()
+            trust.untrust_key(alice.public_key)
+            refused()
 
 
 def test_importing_without_asking_works_as_before(

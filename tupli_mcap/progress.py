@@ -15,11 +15,12 @@ _PATIENCE = 1.0  # seconds without a bar
 
 
 class Progress:
-    """Counts steps; shows a bar once it is worth it, where somebody can see it."""
+    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it."""
 
-    def __init__(self, total: int, what: str) -> None:
+    def __init__(self, total: int, what: str, *, in_bytes: bool) -> None:
         self._total = total
         self._what = what
+        self._in_bytes = in_bytes
         self._done = 0
         self._started = time.monotonic()
         self._bar: Any = None
@@ -32,9 +33,12 @@ class Progress:
             if time.monotonic() - self._started < _PATIENCE or not _visible():
                 return
             from rich.console import Console
-            from rich.progress import Progress as Bar
+            from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
 
-            self._bar = Bar(console=Console(stderr=True), transient=True, auto_refresh=False)
+            columns = [*Bar.get_default_columns()]
+            if self._in_bytes:
+                columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
+            self._bar = Bar(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
             self._task = self._bar.add_task(self._what, total=self._total)
             self._bar.start()
         self._bar.update(self._task, completed=self._done, refresh=True)
@@ -45,9 +49,9 @@ class Progress:
 
 
 @contextmanager
-def progress(total: int, what: str) -> Iterator[Progress]:
+def progress(total: int, what: str, *, in_bytes: bool = False) -> Iterator[Progress]:
     """A `Progress` that is gone when the block ends."""
-    shown = Progress(total, what)
+    shown = Progress(total, what, in_bytes=in_bytes)
     try:
         yield shown
     finally:

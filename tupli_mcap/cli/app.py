@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
-from tupli_mcap.cli.share import account, browse, bundle, exchange, serve, trust
+from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -264,6 +264,22 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "publish": exchange.publish,
         "unpublish": exchange.unpublish,
     },
+    "People": {
+        "list-users": people.list_users,
+        "delete-user": people.delete_user,
+        "list-groups": people.list_groups,
+        "read-group": people.read_group,
+        "create-group": people.create_group,
+        "delete-group": people.delete_group,
+        "add-members": people.add_group_members,
+        "remove-members": people.remove_group_members,
+        "list-roles": people.list_roles,
+        "create-role": people.create_role,
+        "delete-role": people.delete_role,
+        "list-tokens": people.list_tokens,
+        "create-token": people.create_token,
+        "delete-token": people.delete_token,
+    },
     "Storage": {
         "list-benchmarks": storage.list_benchmarks,
         "list-artifacts": storage.list_artifacts,
@@ -331,10 +347,27 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "logout": ("logout",),
     "whoami": ("whoami", "whoami --url http://192.0.2.7:8080"),
     "password": ("password", "password ann"),
-    "push": ("push lab/", "push run.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'"),
-    "pull": ("pull 3f2a --storage lab",),
+    "push": ("push lab/", "push run.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'", "push"),
+    "pull": ("pull 3f2a --storage lab", "pull --filter 'return > 100' --storage lab --dry-run"),
     "publish": ("publish 3f2a", "publish 3f2a --group robots"),
     "unpublish": ("unpublish 3f2a --group robots",),
+    "list-users": ("list-users",),
+    "delete-user": ("delete-user ann",),
+    "list-groups": ("list-groups",),
+    "read-group": ("read-group robots",),
+    "create-group": ("create-group robots --description 'those with arms'",),
+    "delete-group": ("delete-group robots",),
+    "add-members": (
+        "add-members robots ann bob",
+        "add-members robots ann --role contributor",
+    ),
+    "remove-members": ("remove-members robots bob",),
+    "list-roles": ("list-roles",),
+    "create-role": ("create-role looker episode_read benchmark_read",),
+    "delete-role": ("delete-role looker",),
+    "list-tokens": ("list-tokens",),
+    "create-token": ("create-token robot --write --days 30", "create-token ci --forever"),
+    "delete-token": ("delete-token 0f3c9a1b2d4e5f60",),
     "list-benchmarks": ("list-benchmarks --storage lab", "list-benchmarks --storage http://127.0.0.1:8080"),
     "list-artifacts": ("list-artifacts --storage lab",),
     "list-episodes": ("list-episodes --storage lab --filter 'metadata.score > 30'",),

@@ -65,6 +65,7 @@ AnyStorage = Annotated[
     str,
     typer.Option(
         "--storage",
+        "--url",
         envvar="TUPLI_MCAP_STORAGE",
         metavar="PATH|URL",
         help="The storage's directory, or a server.",

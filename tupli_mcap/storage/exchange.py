@@ -3,82 +3,191 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from tupli_mcap import trust
 from tupli_mcap.errors import FormatError
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
-from tupli_mcap.schema import ArtifactMetadata, BaseFilter, BenchmarkQuery, FilterEQ, FilterIN
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.remote import shown
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    BaseFilter,
+    BenchmarkQuery,
+    EpisodeHeader,
+    FilterEQ,
+    FilterIN,
+)
 from tupli_mcap.storage import bundles
 from tupli_mcap.storage.api import TupliAPIClient
-from tupli_mcap.storage.base import TupliStorage
+from tupli_mcap.storage.api.outbox import Waiting
+from tupli_mcap.storage.atomic import fill, os_errors
+from tupli_mcap.storage.base import TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
+from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["Copied", "copy_benchmark", "publish_benchmark", "push_recording", "unpublish_benchmark"]
+__all__ = [
+    "Copied",
+    "copy_episodes",
+    "publish_benchmark",
+    "push_recording",
+    "send_waiting",
+    "unpublish_benchmark",
+]
 
 
 class Copied(NamedTuple):
-    """How much was new to the storage it was copied to."""
+    """How much was new to the storage it was copied to, or would be."""
 
     artifacts: int
     episodes: int
 
 
-def copy_benchmark(
-    source: TupliStorage, target: TupliStorage, uri: str, filter: BaseFilter | None = None
-) -> Copied:
-    """Copies a benchmark, its artifacts and its episodes (those a filter is true of) to another storage.
+def copy_episodes(
+    source: TupliStorage,
+    target: TupliStorage,
+    filter: BaseFilter | None = None,
+    *,
+    benchmark_id: str | None = None,
+    dry_run: bool = False,
+) -> dict[str, Copied]:
+    """Copies the episodes that a filter is true of to another storage, with their benchmarks and what these need; only
+    those of one benchmark if it is named. Without a filter, benchmarks without episodes are copied, too.
 
-    What that has already stays as it is there; episodes keep their ids. Nothing of it is executed.
+    What the target has already stays as it is there; episodes keep their ids. Nothing of it is executed. In a
+    directory, an environment is trusted if it was before, or for as long as a key is trusted that has signed one of its
+    recordings, which must have come whole for that.
+
+    Returns:
+        By benchmark, how much was copied.
 
     Raises:
         NotFoundError: the source has no such benchmark, or an artifact of it is gone.
         StorageError: the target refuses it.
     """
+    return anew(lambda: _copy(source, target, filter, benchmark_id, dry_run=dry_run))
+
+
+def _copy(
+    source: TupliStorage,
+    target: TupliStorage,
+    filter: BaseFilter | None,
+    benchmark_id: str | None,
+    *,
+    dry_run: bool,
+) -> dict[str, Copied]:
+    wanted: dict[str, list[EpisodeHeader]] = {}
+    chosen = filter
+    if benchmark_id is not None:
+        wanted[benchmark_id] = []
+        of_it = FilterEQ(key="benchmark_id", value=benchmark_id)
+        chosen = of_it if filter is None else of_it & filter
+    elif filter is None:
+        wanted = {header.id: [] for header in source.list_benchmarks()}
+    for header in source.list_episodes(chosen):
+        wanted.setdefault(header.benchmark_id, []).append(header)
+    copied = {}
+    for uri, headers in wanted.items():
+        artifacts = _copy_benchmark(source, target, uri, dry_run=dry_run) if uri else 0
+        held = {header.id for header in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
+        new = [header for header in headers if header.id not in held]
+        groups = [
+            (name, list(of)) for name, of in itertools.groupby(new, key=lambda header: header.recording)
+        ]
+        for i, (name, of) in enumerate(groups, start=1):
+            if not dry_run:
+                numbers = [header.episode for header in of]
+                _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
+        if uri and isinstance(target, FileStorage) and not dry_run:
+            _vouch(target, uri)
+        copied[uri] = Copied(artifacts, len(new))
+    return copied
+
+
+def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
+    """Copies a benchmark and the artifacts that it needs; returns how many of these were new."""
     benchmark = source.load_benchmark(uri)
-    artifacts = _copy_artifacts(source, target, benchmark.serialized)
-    target.store_benchmark(
-        BenchmarkQuery(
-            hash=benchmark.hash, serialized=benchmark.serialized, metadata=benchmark.stored_metadata
-        )
-    )
-    of_benchmark = FilterEQ(key="benchmark_id", value=uri)
-    headers = source.list_episodes(of_benchmark if filter is None else of_benchmark & filter)
-    held = {header.id for header in target.list_episodes(of_benchmark)}
-    by_recording: dict[str, list[int]] = {}
-    for header in headers:
-        if header.id not in held:
-            by_recording.setdefault(header.recording, []).append(header.episode)
-    for name, numbers in by_recording.items():
-        if isinstance(target, TupliAPIClient):  # which lets a recording that has grown take its place
-            kept = [h.episode for h in headers if h.recording == name]
-        else:
-            kept = numbers
-        path = target.new_recording_path(uri)
-        with source.open_recording(name) as recording:
-            whole = len(kept) == len(recording)
-            rewrite_recording(recording, path, episodes=None if whole else kept)
-        target.ingest(path)
-    if isinstance(target, TupliAPIClient):
-        target.flush()
-    return Copied(artifacts, sum(map(len, by_recording.values())))
-
-
-def _copy_artifacts(source: TupliStorage, target: TupliStorage, serialized: str) -> int:
-    try:
-        wanted = unpack(serialized).artifacts
-    except FormatError:  # a benchmark of somebody else's making names none
-        return 0
-    held = {item.id for item in target.list_artifacts(FilterIN(key="id", value=wanted))}
-    missing = [uri for uri in wanted if uri not in held]
-    for uri in missing:
-        data = source.load_artifact(uri)
-        (item,) = source.list_artifacts(FilterEQ(key="id", value=uri))
+    wanted: Sequence[str] = ()
+    with contextlib.suppress(FormatError):  # a benchmark of somebody else's making names none
+        wanted = unpack(benchmark.serialized).artifacts
+    held = {item.id for item in target.list_artifacts(FilterIN(key="id", value=list(wanted)))}
+    missing = [artifact for artifact in wanted if artifact not in held]
+    if dry_run:
+        return len(missing)
+    for artifact in missing:
+        data = source.load_artifact(artifact)
+        (item,) = source.list_artifacts(FilterEQ(key="id", value=artifact))
         target.store_artifact(data, ArtifactMetadata.model_validate(item.model_dump()))
+    target.store_benchmark(
+        BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=benchmark.metadata)
+    )
     return len(missing)
 
 
-def push_recording(client: TupliAPIClient, path: Path) -> str:
+def _copy_recording(
+    source: TupliStorage, target: TupliStorage, uri: str, name: str, numbers: Sequence[int], place: str
+) -> None:
+    """Copies episodes of a recording, of the benchmark `uri` if that is not empty."""
+    with _file_with(source, name, numbers, place) as path:
+        if isinstance(target, TupliAPIClient):
+            with progress(path.stat().st_size, f"sending {place}", in_bytes=True) as bar:
+                target.push(path, bar.advance)
+            return
+        if uri or not isinstance(target, FileStorage):
+            goal = target.new_recording_path(uri)
+        else:
+            goal = target.root / "recordings" / name.rpartition("/")[2]
+        with os_errors("cannot write", goal), fill(goal) as new:
+            shutil.copyfile(path, new)
+        target.ingest(goal)
+
+
+@contextlib.contextmanager
+def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: str) -> Iterator[Path]:
+    """A file with these episodes of a recording and no others: its own, where it is that."""
+    if isinstance(source, TupliAPIClient):
+        of_it = FilterEQ(key="recording", value=name)
+        whole = len(numbers) == source.count_episodes(of_it)
+        with source.downloaded(name, place) if whole else contextlib.nullcontext() as path:
+            if path is not None:
+                yield path
+                return
+    with source.open_recording(name) as recording:
+        path = recording.file.source.path
+        if path is not None and recording.complete and len(numbers) == len(recording):
+            yield path
+            return
+        with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+            path = Path(folder) / "episodes.mcap"
+            rewrite_recording(recording, path, episodes=numbers)
+            yield path
+
+
+def _vouch(target: FileStorage, uri: str) -> None:
+    """Trusts the environment of a benchmark for as long as a key is trusted that has signed one of its recordings."""
+    if not trust.trusted_keys():
+        return
+    for name in {
+        header.recording for header in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))
+    }:
+        with target.open_recording(name) as recording:
+            if SIGNATURE_NAME in recording.attachments and DOCUMENT_NAME in recording.attachments:
+                digest = bundles.incoming(recording, target.root / name)[0].digest
+                if trust.is_trusted(digest):
+                    return
+                signature = bundles.checked_signature(recording, required=False)
+                if signature is not None and signature.trusted:
+                    trust.vouch(digest, signature.public_key)
+                    return
+
+
+def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> str | None:
     """Sends a recording to a server, before it the benchmark and the artifacts that it carries; returns its name there.
 
     Raises:
@@ -90,24 +199,50 @@ def push_recording(client: TupliAPIClient, path: Path) -> str:
         if carries and not client.list_benchmarks(FilterEQ(key="id", value=recording.benchmark_id)):
             record, _, query = bundles.incoming(recording, path)
             for data, metadata in bundles.carried_artifacts(recording, record, path):
-                client.store_artifact(data, metadata)
-            client.store_benchmark(query)
-    return client.push(path)
+                if not dry_run:
+                    client.store_artifact(data, metadata)
+            if not dry_run:
+                client.store_benchmark(query)
+    if dry_run:
+        return None
+    with progress(path.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
+        return client.push(path, bar.advance)
 
 
-def publish_benchmark(client: TupliAPIClient, uri: str, group: str) -> int:
+def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:
+    """Sends what was recorded to a server and waits here; returns what did.
+
+    Raises:
+        StorageError: the server does not answer, or refuses some of it.
+    """
+    waiting = client.waiting()
+    if not dry_run:
+        with progress(sum(each.size for each in waiting), "sending", in_bytes=True) as bar:
+            client.flush(everything=True, tell=bar.advance)
+    return waiting
+
+
+def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
     """Lets a group see a benchmark, its artifacts, and the caller's episodes of it; returns how many these are."""
+    own = _own_episodes(client, uri)
+    if dry_run:
+        client.load_benchmark(uri)
+        return client.count_episodes(own)
     client.publish_benchmark(uri, group)
     with contextlib.suppress(FormatError):  # a benchmark of somebody else's making names no artifacts
         for artifact in unpack(client.load_benchmark(uri).serialized).artifacts:
             client.publish_artifact(artifact, group)
-    return client.publish_episodes(_own_episodes(client, uri), group)
+    return client.publish_episodes(own, group)
 
 
-def unpublish_benchmark(client: TupliAPIClient, uri: str, group: str) -> int:
+def unpublish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
     """Takes a benchmark and the caller's episodes of it away from a group; returns how many these are. Its artifacts
     stay: other benchmarks may need them."""
-    episodes = client.unpublish_episodes(_own_episodes(client, uri), group)
+    own = _own_episodes(client, uri)
+    if dry_run:
+        client.load_benchmark(uri)
+        return client.count_episodes(own & FilterEQ(key="published_in", value=group))
+    episodes = client.unpublish_episodes(own, group)
     client.unpublish_benchmark(uri, group)
     return episodes
 

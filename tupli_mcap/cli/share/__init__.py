@@ -2,7 +2,8 @@
 
 bundle     one file with all that a benchmark needs, and back
 exchange   push, pull, publish: between a directory and a server
-account    login, logout, whoami
+account    login, logout, whoami, signup, password
+people     users, groups, roles, tokens for machines
 browse     a page of recordings on this machine
 serve      the server
 trust      whose code may run

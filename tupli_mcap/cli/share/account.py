@@ -54,7 +54,7 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
 
     with TupliAPIClient(url) as client:
         me = client.whoami()
-        memberships = {held.group: held.roles for held in me.memberships}
+        memberships = {membership.group: membership.roles for membership in me.memberships}
         found: dict[str, Any] = {"url": client.url, "username": me.username, "memberships": memberships}
     if as_json:
         print_json(found)

@@ -19,7 +19,7 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json
 from tupli_mcap.cli.terminal import ask_secret, say
-from tupli_mcap.remote import copied, is_url
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -75,8 +75,12 @@ def bundle(
 
 
 def _local(file: str) -> AbstractContextManager[Path]:
-    """A file, or a temporary copy of what is at a URL."""
-    return copied(file) if is_url(file) else nullcontext(Path(file))
+    """A file, or what is at a URL, fetched unless it is kept."""
+    if not is_url(file):
+        return nullcontext(Path(file))
+    from tupli_mcap.storage.downloads import fetched_url
+
+    return fetched_url(file)
 
 
 def export(

@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tupli_mcap.cli.options import DEFAULT_STORAGE, FilterText, Json, filter_of, full_id, local_path
-from tupli_mcap.cli.output import counted, print_json
+from tupli_mcap.cli.output import bytes_of, counted, print_json
 from tupli_mcap.cli.share.account import Url
 from tupli_mcap.cli.terminal import say
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import BaseFilter
+    from tupli_mcap.storage import TupliAPIClient
 
 __all__ = ["publish", "pull", "push", "unpublish"]
 
 Benchmark = Annotated[str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark (4 digits may do).")]
 Group = Annotated[str, typer.Option(metavar="GROUP", help="Who sees it: 'global' is everybody.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
+_EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
 def push(
     source: Annotated[
-        Path, typer.Argument(metavar="DIR|FILE", parser=local_path, help="A storage or a recording.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="[DIR|FILE]", parser=local_path, help="A storage or a recording.", readable=False
+        ),
+    ] = None,
     benchmark: Annotated[
         str | None, typer.Option("--benchmark", metavar="BENCHMARK_ID", help="Only this one of the storage.")
     ] = None,
     filter_text: FilterText = None,
+    dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
@@ -33,36 +45,72 @@ def push(
 
     All benchmarks of a storage are sent, with their artifacts and episodes.
     What the server has already is not sent again. Nobody else sees it before it is published.
+    Without DIR or FILE, what was recorded to the server and waits here is sent.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
-    from tupli_mcap.storage.exchange import copy_benchmark, push_recording
+    from tupli_mcap.storage.exchange import copy_episodes, push_recording
 
+    if (source is None or source.is_file()) and (filter_text is not None or benchmark is not None):
+        raise typer.BadParameter("a filter and a benchmark go with a storage")
+    verb = "would send" if dry_run else "sent"
     with TupliAPIClient(url) as client:
-        if source.is_file():
-            if filter_text is not None or benchmark is not None:
-                raise typer.BadParameter("a filter and a benchmark go with a storage, not with a file")
-            name = push_recording(client, source)
-            if as_json:
-                print_json({"url": client.url, "benchmarks": [], "recordings": [name], "episodes": None})
-            else:
-                say(f"sent {source} to {client.url}")
-            return
-        with FileStorage(source) as storage:
-            ids = [header.id for header in storage.list_benchmarks()]
-            if benchmark is not None:
-                ids = [full_id(storage, benchmark)]
-            copied = {uri: copy_benchmark(storage, client, uri, filter_of(filter_text)) for uri in ids}
-        episodes = sum(each.episodes for each in copied.values())
-        if as_json:
-            print_json(
-                {"url": client.url, "benchmarks": list(copied), "recordings": [], "episodes": episodes}
-            )
+        to = client.url
+        if source is None:
+            _push_waiting(client, verb, dry_run=dry_run, as_json=as_json)
+        elif source.is_file():
+            name = push_recording(client, source, dry_run=dry_run)
+            _tell_sent(to, f"{verb} {source}", dry_run, recordings=[name or str(source)], as_json=as_json)
         else:
-            say(f"sent {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')} to {client.url}")
+            with FileStorage(source) as storage:
+                uri = None if benchmark is None else full_id(storage, benchmark)
+                copied = copy_episodes(
+                    storage, client, filter_of(filter_text), benchmark_id=uri, dry_run=dry_run
+                )
+            ids, episodes = list(filter(None, copied)), sum(each.episodes for each in copied.values())
+            line = f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
+            _tell_sent(to, line, dry_run, benchmarks=ids, episodes=episodes, as_json=as_json)
+
+
+def _push_waiting(client: TupliAPIClient, verb: str, *, dry_run: bool, as_json: bool) -> None:
+    from tupli_mcap.storage.exchange import send_waiting
+
+    waiting = send_waiting(client, dry_run=dry_run)
+    size = bytes_of(sum(each.size for each in waiting))
+    line = f"{verb} {counted(len(waiting), 'recording')}, {size}," if waiting else "nothing waits to be sent"
+    _tell_sent(client.url, line, dry_run, recordings=[str(each.path) for each in waiting], as_json=as_json)
+    if not as_json:
+        say(
+            *(f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
+              for (url, name), n in client.waiting_elsewhere().items())
+        )  # fmt: skip
+
+
+def _tell_sent(
+    url: str,
+    line: str,
+    dry_run: bool,
+    *,
+    benchmarks: Sequence[str] = (),
+    recordings: Sequence[str] = (),
+    episodes: int | None = None,
+    as_json: bool,
+) -> None:
+    if as_json:
+        named = {"benchmarks": list(benchmarks), "recordings": list(recordings)}
+        print_json({"dry_run": dry_run, "url": url, **named, "episodes": episodes})
+    else:
+        say(f"{line} to {url}")
 
 
 def pull(
-    benchmark: Benchmark,
+    item: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[BENCHMARK_ID|EPISODE_ID]",
+            help="A benchmark with its episodes (4 digits may do), or one episode.",
+            readable=False,
+        ),
+    ] = None,
     storage_path: Annotated[
         Path,
         typer.Option(
@@ -70,26 +118,57 @@ def pull(
         ),
     ] = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Fetch a benchmark with its episodes from a server.
+    """Fetch benchmarks and episodes from a server.
 
-    Its environment is as untrusted as a file from a stranger. Fetched again, only what is new comes.
+    Of a benchmark, all of its episodes, or those of the filter; with a filter alone, those of all
+    benchmarks. Their environments are as untrusted as a file from a stranger, unless a key that you trust
+    has signed them. Fetched again, only what is new comes.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
-    from tupli_mcap.storage.exchange import copy_benchmark
+    from tupli_mcap.storage.exchange import copy_episodes
 
+    if item is None and filter_text is None:
+        raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter")
+    chosen = filter_of(filter_text)
     with TupliAPIClient(url) as client, FileStorage(storage_path) as storage:
-        uri = full_id(client, benchmark)
-        copied = copy_benchmark(client, storage, uri, filter_of(filter_text))
+        uri = None
+        if item is not None and _EPISODE.fullmatch(item):
+            chosen = _only(client, item, chosen)
+        elif item is not None:
+            uri = full_id(client, item)
+        copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run)
+    ids = list(filter(None, copied))
+    artifacts, episodes = (sum(counts) for counts in zip(*copied.values(), strict=True)) if copied else (0, 0)
     if as_json:
-        print_json({"benchmark": uri, "storage": str(storage_path), **copied._asdict()})
+        told = {"dry_run": dry_run, "benchmarks": ids, "storage": str(storage_path)}
+        print_json({**told, "artifacts": artifacts, "episodes": episodes})
     else:
-        say(f"fetched {counted(copied.episodes, 'episode')} of {uri[:8]} into {storage_path}")
+        verb = "would fetch" if dry_run else "fetched"
+        say(f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')} into {storage_path}")
 
 
-def publish(benchmark: Benchmark, group: Group = "global", url: Url = None, as_json: Json = False) -> None:
+def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> BaseFilter:
+    """A filter for one episode. NotFoundError if it is not there."""
+    from tupli_mcap.errors import NotFoundError
+    from tupli_mcap.schema import FilterEQ
+
+    it = FilterEQ(key="id", value=episode)
+    if not client.count_episodes(it):
+        raise NotFoundError(f"there is no episode with id {episode!r} at {client.url}")
+    return it if chosen is None else it & chosen
+
+
+def publish(
+    benchmark: Benchmark,
+    group: Group = "global",
+    dry_run: DryRun = False,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
     """Let others see a benchmark on a server.
 
     They see its artifacts, and your episodes of it, too.
@@ -99,14 +178,16 @@ def publish(benchmark: Benchmark, group: Group = "global", url: Url = None, as_j
 
     with TupliAPIClient(url) as client:
         uri = full_id(client, benchmark)
-        episodes = publish_benchmark(client, uri, group)
-        line = f"published {uri[:8]} with {counted(episodes, 'episode')} in {group}"
-        _tell(uri, group, episodes, line, as_json=as_json)
+        episodes = publish_benchmark(client, uri, group, dry_run=dry_run)
+        verb = "would publish" if dry_run else "published"
+        line = f"{verb} {uri[:8]} with {counted(episodes, 'episode')} in {group}"
+        _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
 
 def unpublish(
     benchmark: Benchmark,
     group: Group = "global",
+    dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
@@ -119,12 +200,14 @@ def unpublish(
 
     with TupliAPIClient(url) as client:
         uri = full_id(client, benchmark)
-        episodes = unpublish_benchmark(client, uri, group)
-        _tell(uri, group, episodes, f"{group} does not see {uri[:8]} any more", as_json=as_json)
+        episodes = unpublish_benchmark(client, uri, group, dry_run=dry_run)
+        rest = f"{uri[:8]} and {counted(episodes, 'episode')} of yours"
+        line = f"{group} would not see {rest}" if dry_run else f"{group} does not see {rest} any more"
+        _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
 
-def _tell(uri: str, group: str, episodes: int, line: str, *, as_json: bool) -> None:
+def _tell_published(uri: str, group: str, episodes: int, line: str, *, dry_run: bool, as_json: bool) -> None:
     if as_json:
-        print_json({"benchmark": uri, "group": group, "episodes": episodes})
+        print_json({"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes})
     else:
         say(line)

@@ -103,12 +103,15 @@ def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Bod
 
 
 @router.get("/artifacts/{uri}")
-def load_artifact(library: Served, caller: Reader, uri: str) -> FileResponse:
-    """The bytes of an artifact; their SHA-256 is the `ETag`."""
+def load_artifact(library: Served, caller: Reader, uri: str, request: Request) -> Response:
+    """The bytes of an artifact; their SHA-256 is the `ETag`, and 304 the answer to an `If-None-Match` with it."""
     with library.database.reading() as connection:
         item = library.items.load_artifact(connection, caller, uri)
+    headers = {"ETag": f'"{item.id}"'}
+    if request.headers.get("If-None-Match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
     path = library.path_of(artifact_key(item.id))
-    return FileResponse(path, media_type="application/octet-stream", headers={"ETag": f'"{item.id}"'})
+    return FileResponse(path, media_type="application/octet-stream", headers=headers)
 
 
 @router.get("/artifacts/{uri}/users")

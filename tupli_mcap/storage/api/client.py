@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import re
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, write_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -29,12 +31,13 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.api.outbox import Outbox, outbox_of
+from tupli_mcap.storage.api.outbox import Outbox, Waiting, outbox_of
 from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.session import Session, as_told, pages
 from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.base import TupliStorage, anew, published_in
 from tupli_mcap.storage.benchmark_json import declared_spaces, plain, recording_attachments
+from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import episode_data, episode_spaces
 from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import is_hash
@@ -86,13 +89,23 @@ class TupliAPIClient(People, TupliStorage):
         self.close()
         self.__init__(url)  # type: ignore[misc]
 
-    def flush(self) -> None:
-        """Wait until the server has all that was recorded; of what goes on, the episodes that have ended.
+    def waiting(self) -> list[Waiting]:
+        """What was recorded to the server on this machine, by this process or others, and is not there yet."""
+        return self._outbox.waiting()
+
+    def waiting_elsewhere(self) -> dict[tuple[str, str], int]:
+        """How many recordings wait for other servers and users, by these (address, name)."""
+        return self._outbox.waiting_elsewhere()
+
+    def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
+        """Wait until the server has all that this process has recorded; of what goes on, the episodes that have ended.
+
+        everything: also what other processes have left. tell: is told how many more bytes were sent.
 
         Raises:
             StorageError: the server does not answer, or refuses some of it; that stays on this machine.
         """
-        self._outbox.flush()
+        self._outbox.flush(everything=everything, tell=tell)
 
     def close(self) -> None:
         """Close the connections."""
@@ -152,9 +165,13 @@ class TupliAPIClient(People, TupliStorage):
         return as_told(ArtifactMetadataItem, response)
 
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
-        data = self._session.send("GET", f"/v1/artifacts/{_hash(uri, 'artifact')}").content
+        path, unless_here = f"/v1/artifacts/{_hash(uri, 'artifact')}", {"If-None-Match": f'"{uri}"'}
+        self._session.send("GET", path, headers=unless_here)  # whether it is there, and may be read
+        with fetched(uri, lambda start: self._session.stream(path, start), digest=uri) as kept:
+            data = kept.read_bytes()
         if sha256(data) != uri:
-            raise FormatError(f"expected artifact {uri}, found bytes with SHA-256 {sha256(data)}")
+            kept.unlink(missing_ok=True)
+            raise FormatError(f"{kept} was damaged, and is deleted; try again")
         return data
 
     def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
@@ -285,13 +302,40 @@ class TupliAPIClient(People, TupliStorage):
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
             )
-        ticket = self._session.ask("POST", "/v1/tickets", {"recording": recording}, repeat=True)
-        if ticket["whole"]:
-            return Recording(self.url + ticket["path"])
+        ticket = self._ticket(recording)
+        if ticket.whole:
+            return Recording(self.url + ticket.path)
         with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
             path = Path(folder) / recording.rpartition("/")[2]
-            path.write_bytes(self._session.send("GET", ticket["path"]).content)
+            path.write_bytes(self._session.send("GET", ticket.path).content)
             return Recording(path)  # which stays readable when its name is gone
+
+    @contextlib.contextmanager
+    def downloaded(self, recording: str, what: str = "") -> Iterator[Path | None]:
+        """The file of a recording, valid in the block; None where not all of it may be read. `what` is part of a
+        progress bar's text.
+
+        Raises:
+            NotFoundError: there is no such recording, or another file has taken its place meanwhile.
+            FormatError: its bytes are not those that the server has named.
+        """
+        ticket = self._ticket(recording)
+        if not ticket.whole:
+            yield None
+            return
+
+        def pieces(start: int) -> Iterator[bytes]:
+            return self._session.stream(ticket.path, start, headers={"If-Match": f'"{ticket.digest}"'})
+
+        with contextlib.ExitStack() as stack:
+            with progress(ticket.size, f"fetching {what}", in_bytes=True) as bar:
+                kept = fetched(ticket.digest, pieces, digest=ticket.digest, tell=bar.advance)
+                path = stack.enter_context(kept)
+            yield path
+
+    def _ticket(self, recording: str) -> _Ticket:
+        asked = {"recording": recording}
+        return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
 
     def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
         """Store a recording that lies here; returns the name that `open_recording` takes. `tell` is told of bytes sent.
@@ -340,6 +384,13 @@ class TupliAPIClient(People, TupliStorage):
 
     def _unpublish(self, kind: str, uri: str, group: str) -> None:
         self._session.ask("DELETE", f"/v1/{kind}/{uri}/published", group=group)
+
+
+class _Ticket(BaseModel):
+    path: str = Field(pattern="^/v1/files/")
+    whole: bool
+    digest: str = Field(pattern="^[0-9a-f]{64}$")
+    size: int
 
 
 def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:

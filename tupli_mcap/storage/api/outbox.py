@@ -42,6 +42,7 @@ from tupli_mcap.storage.sidecar import Sidecar
 __all__ = ["Outbox", "Waiting", "outbox_of"]
 
 _DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
+_WHOSE: Final = "whose.json"
 _MOST_PAUSE: Final = 60.0  # seconds between two attempts
 _POLL: Final = 0.05  # seconds until it is looked again whether another process has sent a file
 
@@ -95,6 +96,8 @@ class Outbox:
         directory = self.directory / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            whose = {"url": self._identity[0], "username": self._identity[1]}
+            files.write_bytes(self.directory / _WHOSE, json.dumps(whose).encode())
         now = datetime.datetime.now(datetime.UTC)
         named = f"{files.as_file_name(name)}-" if name else ""
         path = directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
@@ -110,6 +113,17 @@ class Outbox:
         for path in self._paths():
             with contextlib.suppress(FileNotFoundError):
                 found.append(Waiting(path, path.stat().st_size, state_of(path)))
+        return found
+
+    def waiting_elsewhere(self) -> dict[tuple[str, str], int]:
+        """How many recordings wait for other servers and users, by these."""
+        found = {}
+        for path in self.directory.parent.glob(f"*/{_WHOSE}"):
+            waiting = len(list(path.parent.glob("*/*.mcap")))
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                whose = json.loads(path.read_bytes())
+                if waiting and path.parent != self.directory:
+                    found[str(whose["url"]), str(whose["username"])] = waiting
         return found
 
     def _paths(self) -> list[Path]:

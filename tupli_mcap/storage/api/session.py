@@ -3,6 +3,7 @@ where asking twice is as asking once."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -40,6 +41,7 @@ TIMEOUT: Final = 60.0  # seconds without a byte
 _CONNECT_TIMEOUT: Final = 10.0
 _ATTEMPTS: Final = 4  # of a request that changes nothing when it is sent twice
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
+_NOTHING_LEFT: Final = 416  # there is nothing from that offset on
 _LATER: Final = (423, 429, 500, 502, 503, 504)
 _URL_VARIABLE: Final = "TUPLI_MCAP_URL"
 _TOKEN_VARIABLE: Final = "TUPLI_MCAP_TOKEN"
@@ -197,20 +199,36 @@ class Session:
         *,
         anonymous: bool = False,
         repeat: bool | None = None,
+        stream: bool = False,
         headers: dict[str, str] | None = None,
         **options: Any,
     ) -> httpx.Response:
-        """A request, again if it fails on the way and may be repeated; refusals are raised as errors."""
+        """A request, again if it fails on the way and may be repeated; refusals are raised as errors.
+
+        stream: the body is read, and the answer closed, by the caller; redirections are followed.
+        """
         token = "" if anonymous else self._token()
-        response = self._sent(method, path, token, repeat, headers or {}, options)
+        options |= {"headers": headers or {}, "stream": stream}
+        response = self._sent(method, path, token, repeat, **options)
         if response.status_code == 401 and not anonymous and self._renew(token):
-            response = self._sent(method, path, self._token(), repeat, headers or {}, options)
-        if response.status_code >= 400:
-            raise self._error(response, anonymous)
+            response.close()
+            response = self._sent(method, path, self._token(), repeat, **options)
+        if response.status_code >= 400 and not (stream and response.status_code == _NOTHING_LEFT):
+            with contextlib.closing(response):
+                response.read()
+                raise self._error(response, anonymous)
         return response
 
     def _sent(
-        self, method: str, path: str, token: str, repeat: bool | None, headers: dict[str, str], options: Any
+        self,
+        method: str,
+        path: str,
+        token: str,
+        repeat: bool | None,
+        *,
+        headers: dict[str, str],
+        stream: bool,
+        **options: Any,
     ) -> httpx.Response:
         import httpx
 
@@ -219,18 +237,52 @@ class Session:
         last = (_ATTEMPTS if (method in _SAFE if repeat is None else repeat) else 1) - 1
         for attempt in range(last + 1):
             try:
-                response = self.client.request(method, path, headers=headers, **options)
+                client = self.client
+                request = client.build_request(method, path, headers=headers, **options)
+                response = client.send(request, stream=stream, follow_redirects=stream)
                 if attempt and method == "DELETE" and response.status_code == 404:
                     return httpx.Response(204)  # it was deleted, and the answer was lost
                 if attempt == last or response.status_code not in _LATER:
                     return response
+                response.close()
             except httpx.TransportError as err:
                 if attempt == last:
-                    raise UnreachableError(
-                        f"{shown(self.url)} does not answer: {err}; is the server running, and the address right?"
-                    ) from None
+                    raise self._unreachable(err) from None
             time.sleep(0.2 * 2**attempt)
         raise UnreachableError(f"{shown(self.url)} does not answer")
+
+    def _unreachable(self, err: Exception) -> UnreachableError:
+        why = str(err) or type(err).__name__
+        return UnreachableError(
+            f"{shown(self.url)} does not answer: {why}; is the server running, and the address right?"
+        )
+
+    def stream(self, path: str, start: int = 0, **options: Any) -> Iterator[bytes]:
+        """The bytes of an answer from an offset on. Where the connection breaks off, it goes on with what is left."""
+        import httpx
+
+        fruitless = 0
+        while True:
+            try:
+                for piece in self._pieces(path, start, **options):
+                    fruitless, start = 0, start + len(piece)
+                    yield piece
+                return
+            except httpx.TransportError as err:
+                fruitless += 1
+                if fruitless == _ATTEMPTS:
+                    raise self._unreachable(err) from None
+            time.sleep(0.2 * 2**fruitless)
+
+    def _pieces(self, path: str, start: int, **options: Any) -> Iterator[bytes]:
+        headers = {"Accept-Encoding": "identity", "Range": f"bytes={start}-", **options.pop("headers", {})}
+        with contextlib.closing(self.send("GET", path, headers=headers, stream=True, **options)) as response:
+            if response.status_code == _NOTHING_LEFT:
+                return
+            skipped = 0 if response.status_code == 206 else start  # all of it comes
+            for piece in response.iter_raw():
+                yield piece[skipped:]
+                skipped = max(0, skipped - len(piece))
 
     def _token(self) -> str:
         return os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
@@ -253,7 +305,7 @@ class Session:
             return ConflictError(message)
         kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
         if not issubclass(kind, TupliError) or kind is TupliError:
-            kind = NotFoundError if status == 404 else StorageError
+            kind = NotFoundError if status in (404, 412) else StorageError
         return kind(message)
 
 

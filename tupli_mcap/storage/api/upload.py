@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
+from urllib.parse import urlsplit
 
 from tupli_mcap.storage.api.session import TIMEOUT, Session, UnreachableError
 from tupli_mcap.storage.atomic import os_errors
@@ -61,7 +62,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
         try:
             done = session.send(
                 "PATCH",
-                begun["Location"],
+                _path(begun.get("Location", "")),
                 content=pieces(offset),
                 headers={
                     **_TUS,
@@ -77,3 +78,8 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
             if fruitless == _FRUITLESS:
                 raise
         time.sleep(0.2 * 2**fruitless)
+
+
+def _path(location: str) -> str:
+    """The path of an upload on the same server, whatever that calls itself."""
+    return urlsplit(location).path or "/"

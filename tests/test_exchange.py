@@ -1,0 +1,259 @@
+"""Between a directory and a server: push, pull, publish; downloads that are kept; what may run of it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import web_server
+from between import Between, Fault, between
+from malicious import MODULE, _store as store, pickles, specs
+from serving import PASSWORD, serving
+from typer.testing import CliRunner
+
+from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
+from tupli_mcap.cli import app
+from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.errors import FormatError, StorageError, UntrustedError
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, F
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.downloads import fetched
+from tupli_mcap.storage.exchange import copy_episodes
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[Between]:
+    with serving(Settings(tmp_path / "served")) as url, between(url) as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def admin(proxy: Between) -> Iterator[TupliAPIClient]:
+    with TupliAPIClient(proxy.url) as client:
+        client.login("admin", PASSWORD)
+        yield client
+
+
+def fill(lab: Path, episodes: int = 12) -> str:
+    env = TupliEnvWrapper(gym.make("Pendulum-v1"), lab)
+    uri = env.store(name="cart")
+    for seed in range(episodes):
+        env.reset(seed=seed)
+        while not env.step(env.action_space.sample())[3]:
+            pass
+    env.close()
+    return uri
+
+
+def pushed(admin: TupliAPIClient, lab: Path) -> str:
+    uri = fill(lab)
+    with FileStorage(lab) as storage:
+        copy_episodes(storage, admin, benchmark_id=uri)
+    return uri
+
+
+def run(*words: object) -> str:
+    done = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done.stdout
+
+
+def test_a_whole_recording_comes_and_goes_as_the_file_that_it_is(
+    proxy: Between, admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    uri = pushed(admin, tmp_path / "lab")
+    with FileStorage(tmp_path / "lab") as lab, FileStorage(tmp_path / "pulled") as pulled:
+        assert copy_episodes(admin, pulled, benchmark_id=uri)[uri].episodes == 12
+        one, other = (storage.root / storage.list_episodes()[0].recording for storage in (lab, pulled))
+        assert one.read_bytes() == other.read_bytes()
+        before = proxy.up + proxy.down
+        assert copy_episodes(admin, pulled, benchmark_id=uri)[uri].episodes == 0
+        assert copy_episodes(lab, admin, benchmark_id=uri)[uri].episodes == 0
+        assert proxy.up + proxy.down - before < one.stat().st_size  # nothing came again
+    with FileStorage(tmp_path / "again") as again:  # what was fetched is kept
+        before = proxy.down
+        assert copy_episodes(admin, again, benchmark_id=uri)[uri].episodes == 12
+        assert proxy.down - before < one.stat().st_size
+
+
+def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "lab" / "run.mcap"
+    path.parent.mkdir()
+    for seed, new in ((0, 1), (1, 1), (2, 1)):
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+            env.reset(seed=seed)
+            while not env.step(env.action_space.sample())[2]:
+                pass
+        with FileStorage(path.parent) as lab, FileStorage(tmp_path / "pulled") as pulled:
+            for source, target in ((lab, admin), (admin, pulled)):
+                assert sum(each.episodes for each in copy_episodes(source, target).values()) == new
+    assert [header.episode for header in admin.list_episodes()] == [0, 1, 2]
+    assert sorted(header.episode for header in pulled.list_episodes()) == [0, 1, 2]
+
+
+def test_pulling_a_filter_and_an_episode(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = pushed(admin, tmp_path / "lab")
+    chosen = [header.id for header in admin.list_episodes(F("seed") >= 9)]
+    target = tmp_path / "some"
+    dry = run("pull", "--filter", "seed >= 9", "--storage", target, "--dry-run")
+    assert dry == f"would fetch 3 episodes of 1 benchmark into {target}\n"
+    assert not target.exists()
+    run("pull", "--filter", "seed >= 9", "--storage", target)
+    run("pull", admin.list_episodes(F("seed") == 0)[0].id, "--storage", target)
+    with FileStorage(target) as storage:
+        assert sorted(storage.list_episodes(), key=lambda h: h.episode)[0].seed == 0
+        assert {header.id for header in storage.list_episodes(F("seed") > 0)} == set(chosen)
+        assert storage.load_benchmark(uri).metadata.name == "cart"
+    gone = CliRunner().invoke(app, ["pull", "0" * 32 + "-0", "--storage", str(target)])
+    assert (gone.exit_code, "there is no episode with id" in gone.stderr) == (1, True)
+
+
+def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = fill(tmp_path / "lab")
+    assert run("push", tmp_path / "lab", "--dry-run") == (
+        f"would send 12 episodes of 1 benchmark to {admin.url}\n"
+    )
+    assert admin.list_benchmarks() == []
+    run("push", tmp_path / "lab")
+    assert "would publish" in run("publish", uri, "--dry-run")
+    assert admin.list_benchmarks(F("published_in") == "global") == []
+    run("publish", uri)
+    assert "would not see" in run("unpublish", uri, "--dry-run")
+    assert len(admin.list_episodes(F("published_in") == "global")) == 12
+
+
+@pytest.mark.parametrize("kind", ["pickle", "spec"])
+def test_nothing_from_a_server_runs(admin: TupliAPIClient, tmp_path: Path, kind: str) -> None:
+    """Listing, reading and fetching run nothing, and rebuilding is refused, from the server and from the directory."""
+    marker = tmp_path / "marker"
+    cases = pickles(marker) if kind == "pickle" else specs()
+    with FileStorage(tmp_path / "evil") as evil, FileStorage(tmp_path / "pulled") as pulled:
+        for name, value in cases:
+            record = EnvironmentRecord(f"{MODULE}:Env", **{kind: value})
+            uri = store(evil, record, BenchmarkMetadata(name=name))
+            copy_episodes(evil, admin, benchmark_id=uri)
+            copy_episodes(admin, pulled, benchmark_id=uri)
+            assert len(admin.list_episodes(F("benchmark_id") == uri, include_tuples=True)) == 2
+            for storage in (admin, pulled):
+                with pytest.raises(UntrustedError):
+                    TupliEnvWrapper.load(storage, uri)
+                (header, *_) = storage.list_episodes(F("benchmark_id") == uri)
+                with storage.open_recording(header.recording) as recording, pytest.raises(UntrustedError):
+                    recording.benchmark.make_env()
+    assert not marker.exists()
+    assert MODULE not in sys.modules
+
+
+# --- downloads ---
+
+
+def test_a_download_that_breaks_off_goes_on(
+    proxy: Between, admin: TupliAPIClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = np.random.default_rng(0).bytes(3 << 20)
+    uri = admin.store_artifact(data, ArtifactMetadata(name="noise")).id
+    before = proxy.down
+    admin._session._client.close()
+    monkeypatch.setattr(admin._session, "_process", 0)  # connections anew
+    proxy.faults += [Fault("reset", 1 << 20), Fault("5xx"), Fault("refuse"), Fault("reset", 1 << 20)]
+    assert admin.load_artifact(uri) == data
+    assert proxy.down - before < len(data) + (1 << 19)  # nothing of it came twice
+    before = proxy.down
+    assert admin.load_artifact(uri) == data
+    assert proxy.down - before < 10_000
+
+
+def test_a_killed_download_goes_on_in_the_next_process(tmp_path: Path) -> None:
+    data = bytes(range(256)) * 1000
+    digest = hashlib.sha256(data).hexdigest()
+    asked = []
+
+    def pieces(start: int, stop: int = len(data)) -> Iterator[bytes]:
+        asked.append(start)
+        yield data[start:stop]
+
+    def broken(start: int) -> Iterator[bytes]:
+        yield from pieces(start, 1000)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), fetched(digest, broken, digest=digest):
+        pass
+    with fetched(digest, pieces, digest=digest) as path:
+        assert path.read_bytes() == data
+    with fetched(digest, pieces, digest=digest) as path:
+        assert path.read_bytes() == data
+    assert asked == [0, 1000]
+
+
+def test_wrong_bytes_are_an_error_and_not_kept(proxy: Between, admin: TupliAPIClient) -> None:
+    data = bytes(200_000)
+    uri = admin.store_artifact(data, ArtifactMetadata(name="zeros")).id
+    admin._session._process = 0
+    proxy.faults += [Fault("flip", 100_000)]
+    with pytest.raises(FormatError, match=f"expected bytes with the SHA-256 {uri}.*not kept"):
+        admin.load_artifact(uri)
+    assert admin.load_artifact(uri) == data
+
+
+def test_what_is_kept_stays_within_a_budget_and_what_is_used_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_BYTES", "2500")
+    kept = Path(os.environ["TUPLI_MCAP_CACHE_DIR"]) / "downloads"
+    with fetched("0", lambda _: [bytes(1000)]) as used:
+        for name in "1234":
+            with fetched(name, lambda _: [bytes(1000)]):
+                pass
+        assert used.exists()
+        assert sorted(path.name for path in kept.iterdir()) == ["0", "4"]
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_BYTES", "0")
+    with fetched("5", lambda _: [bytes(1000)]):
+        pass
+    assert list(kept.iterdir()) == []
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_BYTES", "much")
+    with (
+        pytest.raises(StorageError, match="TUPLI_MCAP_CACHE_BYTES to be a number"),
+        fetched("6", lambda _: []),
+    ):
+        pass
+
+
+def test_a_bundle_at_a_url_is_fetched_once(tmp_path: Path) -> None:
+    uri = fill(tmp_path / "lab", 2)
+    with FileStorage(tmp_path / "lab") as lab, web_server.serving() as server:
+        lab.bundle(uri, tmp_path / "b.mcap")
+        server.files["/r.mcap"] = (tmp_path / "b.mcap").read_bytes()
+        size = len(server.files["/r.mcap"])
+        for name in ("one", "two"):
+            assert "imported 2 of 2 episodes" in run("import", server.url(), "--storage", tmp_path / name)
+            assert server.sent < 1.1 * size
+        server.tags["/r.mcap"] = '"second"'
+        run("import", server.url(), "--storage", tmp_path / "three")
+        assert 2 * size <= server.sent < 2.1 * size
+
+
+def test_threads_fetch_a_file_once() -> None:
+    asked: list[int] = []
+    gate = threading.Barrier(4)
+
+    def pieces(start: int) -> Iterator[bytes]:
+        asked.append(start)
+        yield bytes(100_000)
+
+    def use() -> None:
+        gate.wait()
+        with fetched("one", pieces) as path:
+            assert path.stat().st_size == 100_000
+
+    threads = [threading.Thread(target=use) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert asked == [0]

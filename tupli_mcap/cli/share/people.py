@@ -1,0 +1,257 @@
+"""Commands on the people of a server: its users, groups and roles, and tokens for machines.
+
+Each calls the method of `TupliAPIClient` of its name.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.output import Column, print_facts, print_json, print_table, when
+from tupli_mcap.cli.share.account import Url
+from tupli_mcap.cli.terminal import say
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import GroupMembershipQuery, GroupWithMembers
+
+__all__ = [
+    "add_group_members", "create_group", "create_role", "create_token", "delete_group", "delete_role", "delete_token",
+    "delete_user", "list_groups", "list_roles", "list_tokens", "list_users", "read_group", "remove_group_members",
+]  # fmt: skip
+
+Group = Annotated[str, typer.Argument(metavar="GROUP")]
+Users = Annotated[list[str], typer.Argument(metavar="USER")]
+Description = Annotated[str | None, typer.Option(help="What it is for.")]
+
+
+def list_users(url: Url = None, as_json: Json = False) -> None:
+    """List the users of a server, and their groups."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        users = client.list_users()
+    if as_json:
+        held = [{membership.group: membership.roles for membership in user.memberships} for user in users]
+        print_json([{"username": u.username, "memberships": m} for u, m in zip(users, held, strict=True)])
+        return
+    groups = {u.username: ", ".join(m.group for m in u.memberships if m.group != u.username) for u in users}
+    print_table((Column("USER"), Column("GROUPS", shrink="end")), list(groups.items()), empty="no users")
+
+
+def delete_user(
+    username: Annotated[str, typer.Argument(metavar="USER")], url: Url = None, as_json: Json = False
+) -> None:
+    """Delete a user; what they made stays.
+
+    Their name stays taken. You may delete yourself.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.delete_user(username)
+        _deleted(client.url, "user", username, as_json=as_json)
+
+
+def list_groups(url: Url = None, as_json: Json = False) -> None:
+    """List the groups of a server that you may know of."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        groups = client.list_groups()
+    if as_json:
+        print_json([group.model_dump() for group in groups])
+        return
+    rows = [(group.name, group.description or "") for group in groups]
+    print_table((Column("GROUP"), Column("DESCRIPTION", shrink="end")), rows, empty="no groups")
+
+
+def read_group(group: Group, url: Url = None, as_json: Json = False) -> None:
+    """Show a group and its members."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        _print_group(client.read_group(group), as_json=as_json)
+
+
+def create_group(
+    group: Group, description: Description = None, url: Url = None, as_json: Json = False
+) -> None:
+    """Make a group of users, which you lead.
+
+    `publish --group` lets its members see a benchmark.
+    """
+    from tupli_mcap.schema import Group
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        made = client.create_group(Group(name=group, description=description))
+        if as_json:
+            print_json(made.model_dump())
+        else:
+            say(f"made the group {group} at {client.url}")
+
+
+def delete_group(group: Group, url: Url = None, as_json: Json = False) -> None:
+    """Delete a group of users.
+
+    What is published in it is seen by its owners only; its name stays taken.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.delete_group(group)
+        _deleted(client.url, "group", group, as_json=as_json)
+
+
+def add_group_members(
+    group: Group,
+    users: Users,
+    roles: Annotated[
+        list[str] | None,
+        typer.Option("--role", metavar="ROLE", help="What they may do, member by default. Repeatable."),
+    ] = None,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Put users into a group, or give them roles there.
+
+    `list-roles` shows what roles there are. Nobody can give a right that they lack.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        _print_group(client.add_group_members(_query(group, users, roles)), as_json=as_json)
+
+
+def remove_group_members(group: Group, users: Users, url: Url = None, as_json: Json = False) -> None:
+    """Take users out of a group."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        _print_group(client.remove_group_members(_query(group, users, None)), as_json=as_json)
+
+
+def list_roles(url: Url = None, as_json: Json = False) -> None:
+    """List the roles that a server knows, and their rights."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        roles = client.list_roles()
+    if as_json:
+        print_json([role.model_dump(mode="json") for role in roles])
+        return
+    rows = [(role.role, ", ".join(role.rights), role.description or "") for role in roles]
+    columns = (Column("ROLE"), Column("RIGHTS", shrink="end"), Column("DESCRIPTION", shrink="end"))
+    print_table(columns, rows, empty="no roles")
+
+
+def create_role(
+    role: Annotated[str, typer.Argument(metavar="ROLE")],
+    rights: Annotated[list[str], typer.Argument(metavar="RIGHT", help="Such as episode_read.")],
+    description: Description = None,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Make a role out of rights, for admins."""
+    from tupli_mcap.schema import Right, UserRole
+    from tupli_mcap.storage import TupliAPIClient
+
+    unknown = [right for right in rights if right not in set(Right)]
+    if unknown:
+        raise typer.BadParameter(f"expected rights among {', '.join(Right)}, found {', '.join(unknown)}")
+    with TupliAPIClient(url) as client:
+        wanted = UserRole(role=role, rights=[Right(right) for right in rights], description=description)
+        made = client.create_role(wanted)
+        if as_json:
+            print_json(made.model_dump(mode="json"))
+        else:
+            say(f"made the role {role} at {client.url}")
+
+
+def delete_role(
+    role: Annotated[str, typer.Argument(metavar="ROLE")], url: Url = None, as_json: Json = False
+) -> None:
+    """Delete a role, wherever it was given."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.delete_role(role)
+        _deleted(client.url, "role", role, as_json=as_json)
+
+
+def list_tokens(url: Url = None, as_json: Json = False) -> None:
+    """List your tokens for machines."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        tokens = client.list_tokens()
+    if as_json:
+        print_json([token.model_dump(exclude={"token"}) for token in tokens])
+        return
+    columns = (Column("ID"), Column("NAME", shrink="end"), Column("MAY"), Column("MADE"), Column("EXPIRES"))
+    rows = [
+        (t.id, t.name, t.scope, when(t.created_at), "never" if t.expires is None else when(t.expires))
+        for t in tokens
+    ]
+    print_table(columns, rows, empty="no tokens")
+
+
+def create_token(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="What it is called.")],
+    write: Annotated[bool, typer.Option("--write", help="It may write, too; else it may read.")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="For how long it is valid.")] = 90,
+    forever: Annotated[bool, typer.Option("--forever", help="It is valid until it is deleted.")] = False,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Make a token with which a machine may do what you may.
+
+    It is shown this once. On the machine, put it into TUPLI_MCAP_TOKEN.
+    """
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        token = client.create_token(name, "write" if write else "read", None if forever else days)
+    if as_json:
+        print_json(token.model_dump())
+    else:
+        say(token.token)
+
+
+def delete_token(
+    token: Annotated[str, typer.Argument(metavar="ID", help="As list-tokens shows it.")],
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Revoke one of your tokens for machines."""
+    from tupli_mcap.storage import TupliAPIClient
+
+    with TupliAPIClient(url) as client:
+        client.delete_token(token)
+        _deleted(client.url, "token", token, as_json=as_json)
+
+
+def _query(group: str, users: list[str], roles: list[str] | None) -> GroupMembershipQuery:
+    from tupli_mcap.schema import GroupMembership, GroupMembershipQuery
+
+    members = [GroupMembership(user=user, roles=roles or None) for user in users]
+    return GroupMembershipQuery(group_name=group, members=members)
+
+
+def _print_group(group: GroupWithMembers, *, as_json: bool) -> None:
+    if as_json:
+        print_json(group.model_dump())
+        return
+    held = [(user, ", ".join(group.roles[user])) for user in group.members]
+    told = [("description", group.description)] if group.description else []
+    print_facts([("group", group.name), *told, *held])
+
+
+def _deleted(url: str, kind: str, name: str, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"url": url, "deleted": name})
+    else:
+        say(f"deleted the {kind} {name} at {url}")

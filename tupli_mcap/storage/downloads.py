@@ -1,0 +1,192 @@
+"""Files that were fetched from elsewhere, kept for a while: `<cache>/downloads/<name>`, where the name says what is in
+it, such as a SHA-256. All of it may be deleted at any time.
+
+1. What has come so far is in `<name>.part`, locked by who fetches it. Whoever wants the same file waits; whoever comes
+   after one that broke off or was killed goes on where that ended.
+2. A file that is whole is checked against its SHA-256, then renamed. Wrong bytes are an error, and deleted.
+3. Who uses a file holds a shared lock on it. What was not used for longest is deleted while nobody does, until all of
+   it is within the budget.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from tupli_mcap import files
+from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.mcap.lock import drop_private, open_private
+from tupli_mcap.progress import progress
+from tupli_mcap.remote import copied, shown
+from tupli_mcap.remote.objects import NoRangesError, find
+from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.catalog.place import cache_dir, make_private
+
+__all__ = ["fetched", "fetched_url"]
+
+_BUDGET_VARIABLE: Final = "TUPLI_MCAP_CACHE_BYTES"
+_BUDGET: Final = 4 << 30
+_PART: Final = ".part"
+_PIECE: Final = 8 << 20
+
+
+@contextlib.contextmanager
+def fetched(
+    name: str,
+    pieces: Callable[[int], Iterable[bytes | memoryview]],
+    *,
+    digest: str | None = None,
+    tell: Callable[[int], None] = lambda _: None,
+) -> Iterator[Path]:
+    """The path of a file, valid in the block; it is fetched if it is not kept.
+
+    Args:
+        name: what it is kept as: files with different contents have different names.
+        pieces: gives its bytes from an offset on.
+        digest: their SHA-256.
+        tell: is told how many bytes more are here.
+
+    Raises:
+        FormatError: they are others.
+        StorageError: there is no room for it, or TUPLI_MCAP_CACHE_BYTES is no number.
+    """
+    budget, path = _budget(), cache_dir() / "downloads" / name
+    with os_errors("cannot keep what is downloaded in", path.parent):
+        make_private(path.parent)
+        while (fd := _held(path)) is None:
+            _fetch(path, pieces, digest, tell)
+    try:
+        yield path
+    finally:
+        drop_private(fd)
+        with contextlib.suppress(OSError):
+            _tidy(path.parent, budget)
+
+
+@contextlib.contextmanager
+def fetched_url(url: str) -> Iterator[Path]:
+    """The path of a file at a URL, valid in the block; it is fetched unless this version of it is kept.
+
+    Raises:
+        RecordingError: it cannot be read, or changes meanwhile.
+        StorageError: there is no room for it.
+        MissingExtraError: what reads such URLs is not installed.
+    """
+    remote = find(url)
+    try:
+        end = remote.tail(1)
+    except NoRangesError:
+        with copied(url) as path:
+            yield path
+        return
+
+    def pieces(start: int) -> Iterator[memoryview]:
+        for at in range(start, end.size, _PIECE):
+            yield remote.get(at, min(at + _PIECE, end.size), end.version)
+
+    which = hashlib.sha256(f"{url}\n{end.version}\n{end.size}".encode()).hexdigest()
+    name = f"{which[:32]}-{files.as_file_name(Path(urlsplit(url).path).name)}"
+    with contextlib.ExitStack() as stack:
+        with progress(end.size, f"downloading {shown(url)}", in_bytes=True) as bar:
+            path = stack.enter_context(fetched(name, pieces, tell=bar.advance))
+        yield path
+
+
+def _held(path: Path) -> int | None:
+    """A descriptor with which nobody deletes the file; None if it is not there."""
+    try:
+        fd = open_private(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH)
+        if _is_at(fd, path):
+            os.utime(fd)
+            return fd
+    except BaseException:
+        drop_private(fd)
+        raise
+    drop_private(fd)
+    return None
+
+
+def _fetch(
+    path: Path,
+    pieces: Callable[[int], Iterable[bytes | memoryview]],
+    digest: str | None,
+    tell: Callable[[int], None],
+) -> None:
+    part = path.with_name(path.name + _PART)
+    fd = open_private(part, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        if not _is_at(fd, part):  # another one has finished it, or it was deleted
+            return
+        with os.fdopen(os.dup(fd), "r+b") as file:
+            tell(file.seek(0, os.SEEK_END))
+            for piece in pieces(file.tell()):
+                file.write(piece)
+                tell(len(piece))
+            file.flush()
+            file.seek(0)
+            found = digest and hashlib.file_digest(file, "sha256").hexdigest()
+        if found != digest:
+            part.unlink()
+            raise FormatError(
+                f"expected bytes with the SHA-256 {digest}, found {found}: they are not kept; try again"
+            )
+        part.replace(path)
+    finally:
+        drop_private(fd)
+
+
+def _tidy(directory: Path, budget: int) -> None:
+    """Deletes what was not used for longest."""
+    found = []
+    for path in directory.iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            status = path.stat()
+            found.append((status.st_mtime_ns, status.st_size, path))
+    over = sum(size for _, size, _ in found) - budget
+    for _, size, path in sorted(found):
+        if over <= 0:
+            return
+        if _delete(path):
+            over -= size
+
+
+def _delete(path: Path) -> bool:
+    """Deletes a file unless somebody uses it."""
+    try:
+        fd = open_private(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return True
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if _is_at(fd, path):
+            path.unlink()
+    except BlockingIOError:
+        return False
+    finally:
+        drop_private(fd)
+    return True
+
+
+def _is_at(fd: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(fd), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def _budget() -> int:
+    text = os.environ.get(_BUDGET_VARIABLE, str(_BUDGET))
+    if not text.isdecimal():
+        raise StorageError(f"expected {_BUDGET_VARIABLE} to be a number of bytes, found {text!r:.80}")
+    return int(text)
