@@ -55,7 +55,7 @@ from tupli_mcap.storage.bundles import from_recording
 from tupli_mcap.storage.catalog import database
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
-from tupli_mcap.storage.exchange import copy_benchmark
+from tupli_mcap.storage.exchange import copy_episodes
 from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.verify import verify_storage
@@ -860,7 +860,8 @@ class TestFileStorage(StorageContract):
         other = FileStorage(tmp_path / "other")
         assert other.import_bundle(tmp_path / "b.mcap") == header.id
         assert other.load_benchmark(header.id).metadata == edited.metadata
-        assert copy_benchmark(storage, FileStorage(tmp_path / "third"), header.id).episodes == 1
+        copied = copy_episodes(storage, FileStorage(tmp_path / "third"), benchmark_id=header.id)
+        assert copied[header.id].episodes == 1
         assert verify_storage(other.root).ok
         document = json.loads((storage.root / "benchmarks" / f"{header.id}.json").read_text())
         validator("benchmark.schema.json").validate(document)
