@@ -479,10 +479,11 @@ class TestLook:
             shutil.copy(name, f"b{name[1:]}")
         (told,) = run("ls", "b.mcap", "--json").json
         assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
-        assert "did not finish it, what its chunks and its journal hold is here" in ok("info", "b.mcap")
+        assert "did not finish it; what its chunks and its journal hold is here" in ok("info", "b.mcap")
         Path("b.mcap.journal").unlink()
         told = run("info", "b.mcap").out  # with a warning
-        assert "did not finish it, its journal is missing; what its chunks hold is here" in told
+        assert "did not finish it, and its journal is missing; its chunks are here" in told
+        assert json.loads(run("ls", "b.mcap", "--json").out)["result"][0]["state"] == "incomplete"
         env.close()
 
     def test_info(self, cartpole: Path, here: Path) -> None:
@@ -796,7 +797,7 @@ def test_a_file_cut_off_later_is_read_up_to_there(here: Path, cartpole: Path) ->
     )
     assert result.err.count("\n") == 1
     (told,) = json.loads(result.out)["result"]
-    assert (told["state"], told["error"]) == ("recovered", None)
+    assert (told["state"], told["error"]) == ("incomplete", None)
 
 
 def test_episodes_of_what_is_missing(here: Path) -> None:
@@ -990,11 +991,12 @@ class TestSharing:
         ok("bundle", cartpole, "-o", "b.mcap")
         with Recording("b.mcap") as copy, Recording(cartpole) as original:
             np.testing.assert_array_equal(copy.read().states, original.read().states)
-            assert copy.benchmark.record == original.benchmark.record
+            assert copy.benchmark.record.spec == original.benchmark.record.spec
+        assert run("import", "b.mcap", "--storage", "lab", "--json").json["name"] == "CartPole-v1"
         with RecordEpisodes(gym.make("CartPole-v1"), "bare.mcap", attachments={}) as env:
             env.reset()
             env.step(0)
-        assert fails("bundle", "bare.mcap", "-o", "c.mcap").startswith("'bare.mcap' carries no benchmark")
+        assert fails("bundle", "bare.mcap", "-o", "c.mcap").startswith("'bare.mcap' carries no environment")
         assert not Path("c.mcap").exists()
 
     def test_artifacts_come_along(self, here: Path) -> None:
@@ -1054,7 +1056,7 @@ class TestSharing:
 
     def test_a_plain_recording_is_no_bundle(self, here: Path, cartpole: Path) -> None:
         line = fails("import", cartpole, "--storage", "lab")
-        assert re.search("recorded outside a storage; copy the file into the storage's directory", line)
+        assert "recorded outside a storage; make a bundle of it (tupli-mcap bundle), or copy it into" in line
 
     def test_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
         (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")

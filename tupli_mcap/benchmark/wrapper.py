@@ -313,7 +313,9 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             self._finish()
             self._path = None
         self.id = stored.id
-        self._benchmark = Benchmark(**{**dict(stored), "serialized": serialized})
+        self._benchmark = self.storage.load_benchmark(
+            stored.id
+        )  # whose text names the id, as recordings carry it
         return stored.id
 
     @classmethod

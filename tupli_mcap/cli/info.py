@@ -24,7 +24,7 @@ from tupli_mcap.cli.output import (
     time_of,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def info(
             positions = np.array(sorted(named_positions(recording, positions, episodes or "all", wanted)))
         description = describe(recording, positions)
         if not as_json:
-            print_facts(_facts(description, has_journal=_has_journal(recording)))
+            print_facts(_facts(description))
             _print_series(recording, positions, description.steps)
     if as_json:
         print_json(_json_of(description))
@@ -164,26 +164,12 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
     return facts
 
 
-def _has_journal(recording: Recording) -> bool:
-    """Whether the journal of an unfinished recording is there."""
-    from tupli_mcap.journal.file import recorded_journal
-
-    try:
-        return recording.path is not None and recorded_journal(recording.path, recording.metadata).exists()
-    except FormatError:
-        return False
-
-
-def _facts(d: RecordingDescription, *, has_journal: bool) -> list[tuple[str, str]]:
-    held = (
-        "what its chunks and its journal hold"
-        if has_journal
-        else "its journal is missing; what its chunks hold"
-    )
+def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     states = {
         "complete": "complete",
         "recording": "a writer is at work on it",
-        "recovered": f"recovered: its writer did not finish it, {held} is here",
+        "recovered": "recovered: its writer did not finish it; what its chunks and its journal hold is here",
+        "incomplete": "incomplete: its writer did not finish it, and its journal is missing; its chunks are here",
     }
     environment = d.environment or "none attached"
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)

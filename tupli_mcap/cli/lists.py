@@ -109,8 +109,8 @@ def ls(
     """List recordings in files and directories: their runs.
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size, state.
-    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; or recovered:
-    its writer was killed or failed, and all steps that were finished are there, if its journal is.
+    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; recovered: its writer
+    was killed or failed, and all steps that were finished are there; or incomplete: its journal is missing, too.
     Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
     """
     from tupli_mcap.storage.listing import list_recordings

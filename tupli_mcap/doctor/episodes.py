@@ -38,6 +38,9 @@ def unfinished(measured: Measurements) -> Iterator[Finding]:
     elif state == "recovered":
         message = "its writer did not finish it; what its chunks and its journal hold is there"
         advice = "finish it with 'tupli-mcap recover'"
+    elif state == "incomplete":
+        message = "its writer did not finish it, and its journal is missing; what its chunks hold is there"
+        advice = "copy the journal beside it, if there is one; or finish it with 'tupli-mcap recover'"
     else:
         return
     yield measured.finding("unfinished", Severity.INFO, message, advice)

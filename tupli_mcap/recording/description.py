@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,6 +12,8 @@ import numpy as np
 
 from tupli_mcap import jsonvalue, signing
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
+from tupli_mcap.journal.file import recorded_journal
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.about.success import success_of
@@ -69,7 +72,7 @@ class ChannelFacts(NamedTuple):
 class RecordingDescription:
     """Facts about a recording; spaces and spreads are None where there is no step or no episode.
 
-    state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
+    state: as `state_of` says.
     size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without
         an episode.
     compression: bytes of messages for one byte of chunks in the file; None without a chunk.
@@ -164,10 +167,17 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
 
 
 def state_of(recording: Recording) -> str:
-    """ "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish)."""
+    """ "complete"; "recording", while a writer is at work; "recovered": its writer did not finish it, what chunks and
+    journal hold is there; or "incomplete": the journal is missing, too."""
     if recording.complete:
         return "complete"
-    return "recording" if recording.path is not None and is_locked(recording.path) else "recovered"
+    path = recording.path
+    if path is not None and is_locked(path):
+        return "recording"
+    with contextlib.suppress(FormatError):
+        if path is not None and recorded_journal(path, recording.metadata).exists():
+            return "recovered"
+    return "incomplete"
 
 
 def _runs(recording: Recording, positions: Array) -> list[dict[str, Any]]:

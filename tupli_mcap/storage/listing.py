@@ -75,7 +75,7 @@ class ListedRecording(NamedTuple):
 
     return_mean: over the episodes that are left, None if there are none; without the `return_nan` whose return is
         NaN, and NaN itself where that is so of all. size: bytes of the file.
-    state: "complete", "recording" (a writer is at work) or "recovered" (a writer did not finish).
+    state: as `tupli_mcap.recording.description.state_of` says.
     name, environment, started (ISO 8601 in UTC): of its run. success: the share of the episodes that succeeded, among
         the `success_known` whose metadata say it; None if none do.
     """
