@@ -25,7 +25,8 @@ from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.edit.attach import add_attachments
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, sign_recording
+from tupli_mcap.recording.sign.sign import sign_recording
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.replay import render
 from tupli_mcap.replay.movie import Indexed
 from tupli_mcap.signing import SigningKey

@@ -46,7 +46,8 @@ from tupli_mcap.recording.recover.damaged import gather
 from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
 from tupli_mcap.recording.recover.evidence import RecordedChannels
 from tupli_mcap.recording.recover.file_end import Tail, read_tail
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, sign_recording
+from tupli_mcap.recording.sign.sign import sign_recording
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 Steps = dict[tuple[int, int], str]

@@ -31,8 +31,6 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["MAX_DEPTH", "dumps", "dumps_any", "dumps_plain", "loads", "shown"]
-
 MAX_DEPTH = 64
 """Deepest nesting of values: each container is a level, and each dimension of an array."""
 

@@ -20,8 +20,6 @@ from tupli_mcap.errors import NotFoundError, SignatureError, missing_extra, os_r
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-__all__ = ["PassphraseNeededError", "SigningKey", "find_key", "fingerprint", "is_signed", "read_public_key"]
-
 _MAX_KEY_FILE = 1 << 16
 _SSH_HEAD = b"\0\0\0\x0bssh-ed25519\0\0\0\x20"  # the name of the algorithm and the length of a key
 _SSH_LINE = re.compile(r"ssh-ed25519\s+([A-Za-z0-9+/]+=*)(?:\s+(.*))?\s*\Z")

@@ -28,20 +28,6 @@ import platformdirs
 from tupli_mcap import files
 from tupli_mcap.errors import TupliError, os_reason
 
-__all__ = [
-    "TrustedKey",
-    "config_dir",
-    "is_trusted",
-    "sign",
-    "trust",
-    "trust_key",
-    "trusted_digests",
-    "trusted_keys",
-    "untrust",
-    "untrust_key",
-    "vouch",
-]
-
 _KEY_BYTES = 32
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 # Names what is signed, so that the key can never be made to sign something else that looks like a digest.

@@ -11,8 +11,6 @@ from tupli_mcap.doctor import duplicates, episodes, steps, values
 from tupli_mcap.doctor.findings import Finding
 from tupli_mcap.doctor.measurements import Statistic
 
-__all__ = ["CHECKS", "Check"]
-
 
 @dataclass(frozen=True)
 class Check:

@@ -16,8 +16,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.columns.statistics import element_bounds
 
-__all__ = ["Digests", "duplicate_episodes"]
-
 _SIZE = 16
 
 

@@ -17,16 +17,6 @@ from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.description import state_of
 from tupli_mcap.recording.index import HAS_SEED
 
-__all__ = [
-    "FinalStates",
-    "final_state_is_reset",
-    "missing_reset",
-    "missing_terminals",
-    "one_step_episodes",
-    "repeated_seed",
-    "unfinished",
-]
-
 _STARTS = 4096  # episode starts that are decoded at a time
 
 

@@ -12,8 +12,6 @@ from tupli_mcap.doctor.measurements import Measurements, Statistic
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys
 
-__all__ = ["UNREADABLE", "examine"]
-
 UNREADABLE = "unreadable"
 
 

@@ -6,8 +6,6 @@ import enum
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-__all__ = ["MAX_PLACES", "Diagnosis", "Finding", "Place", "Severity"]
-
 MAX_PLACES = 5  # examples that a finding names
 JSON_VERSION = 1
 

@@ -15,8 +15,6 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Block, blocks
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Measurements", "Statistic", "StepPlace", "value_bytes"]
-
 StepPlace = tuple[int, int]
 """The number of an episode, and a step in it; its length stands for its final state."""
 

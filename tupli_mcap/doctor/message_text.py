@@ -9,8 +9,6 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["dimension_text", "dimensions", "duration", "plural", "share", "unravel"]
-
 _NAMED = 4  # dimensions that a message names
 _LISTED = 100  # dimensions that a finding lists
 

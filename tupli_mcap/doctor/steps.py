@@ -13,17 +13,6 @@ from tupli_mcap.doctor.message_text import duration, plural, share
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = [
-    "Clock",
-    "Frames",
-    "Largest",
-    "Rewards",
-    "Sample",
-    "clock_jump",
-    "frozen_frames",
-    "reward_outliers",
-]
-
 _SECOND = 10**9
 _SAMPLE_SIZE = 1 << 16
 _FEWEST_REWARDS = 20

@@ -18,8 +18,6 @@ from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.columns.statistics import ElementStatistics, columns_of
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["LeafValues", "constant_dimension", "infinity", "nan", "outside_space", "unused_action"]
-
 Locate = Callable[[int], StepPlace]
 Role = Literal["state", "action", "reward"]
 _KINDS = ("nan", "infinite", "outside")

@@ -9,8 +9,6 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
-__all__ = ["foreign_arguments", "more_than_data"]
-
 # Such a text can name no file, URL, module or attribute.
 _PLAIN_WORD = re.compile(r"[A-Za-z0-9_ +=,;()\[\]<>#-]{0,256}\Z")
 _LARGEST: Final = 1 << 20

@@ -18,8 +18,6 @@ from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
 from tupli_mcap.errors import TupliError, UntrustedError
 
-__all__ = ["build", "entry_point_name", "foreign_code", "make_from_spec", "reasons_for_distrust"]
-
 # What these render opens no window.
 _PICTURES = frozenset(
     {"rgb_array", "rgb_array_list", "depth_array", "depth_array_list", "rgbd_tuple", "ansi", "ansi_list"}

@@ -24,8 +24,6 @@ from tupli_mcap.environment._pickling import InProcessCopy, dump
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
 from tupli_mcap.errors import TupliError
 
-__all__ = ["Snapshot", "capture", "fingerprint", "note"]
-
 # Python 3.11 and 3.12 keep attributes outside a dict until somebody asks for one, and reach them slower from then on.
 _HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
 _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  # among a spec's arguments

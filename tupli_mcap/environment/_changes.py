@@ -14,8 +14,6 @@ from collections.abc import Callable, Iterator, Mapping
 from types import CodeType
 from typing import Any, NamedTuple
 
-__all__ = ["is_changed"]
-
 _ATOMS = (type(None), bool, int, float, complex, str, bytes)
 _SET_BY_MAKE = frozenset(("spec",))  # by gymnasium.make
 

@@ -13,8 +13,6 @@ from gymnasium.envs.registration import load_env_creator
 
 from tupli_mcap.spaces.labels import Labels
 
-__all__ = ["documented_labels"]
-
 _HEADING = re.compile(r"^\s*#+\s*(.*?)\s*$", re.MULTILINE)
 _ROW = re.compile(r"^\s*\|\s*(\d+)\s*\|([^|\n]*)\|", re.MULTILINE)
 _ITEM = re.compile(r"^\s*[-*]\s*(\d+)\s*:\s*(.+?)\s*$", re.MULTILINE)

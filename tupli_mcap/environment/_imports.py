@@ -9,8 +9,6 @@ from __future__ import annotations
 import pickletools
 from typing import Final, NamedTuple
 
-__all__ = ["WHAT_LOADING_DOES", "PickleImports", "named_imports"]
-
 WHAT_LOADING_DOES: Final = (
     "Loading this pickle can run any code; the names below are what it says it imports; they prove nothing."
 )

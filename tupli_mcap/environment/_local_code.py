@@ -18,8 +18,6 @@ from types import ModuleType
 
 import cloudpickle
 
-__all__ = ["by_value", "is_local"]
-
 # cloudpickle's registry of modules belongs to the process.
 _LOCK = threading.RLock()
 

@@ -15,8 +15,6 @@ from gymnasium.utils import EzPickle
 
 from tupli_mcap.environment._local_code import by_value
 
-__all__ = ["InProcessCopy", "dump", "load", "rebuild_ezpickled"]
-
 _PROTOCOL = 5
 _PLAIN_ATOMS = (type(None), bool, int, float, complex, str, bytes)
 _MAX_PLAIN_DEPTH = 20

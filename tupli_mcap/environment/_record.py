@@ -13,8 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from tupli_mcap.errors import FormatError, TupliError
 
-__all__ = ["EnvironmentRecord", "canonical_json", "sha256"]
-
 _MAX_JSON_BYTES = 64 << 20
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
 # Fields of an EnvSpec at these values say nothing, so that a field which a later gymnasium adds changes no

@@ -19,19 +19,6 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 
-__all__ = [
-    "Committed",
-    "CommittedRecords",
-    "CommittedRows",
-    "FinalHole",
-    "committed_records",
-    "rows_among",
-    "rows_of",
-    "running_record",
-    "size_behind",
-    "torn_rows",
-]
-
 Taken = TypeVar("Taken")
 Taken_co = TypeVar("Taken_co", covariant=True)
 SEQUENCE_END = 15  # of `sequence` in a Message record

@@ -17,8 +17,6 @@ from tupli_mcap.journal.seals import STATE
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 
-__all__ = ["EpisodeBatch", "EpisodeDeriver", "StartedEpisode"]
-
 _START = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
 _END = np.dtype(
     [

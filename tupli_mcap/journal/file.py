@@ -32,22 +32,6 @@ from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
 
-__all__ = [
-    "EVENT_AREAS",
-    "FRAMES_AREA",
-    "Journal",
-    "LogArea",
-    "RowArea",
-    "journal_aside",
-    "journal_in",
-    "journal_info",
-    "journal_name",
-    "journal_path",
-    "owner_among",
-    "read_journal",
-    "recorded_journal",
-]
-
 MAGIC = b"TMCAPJ1\0"
 EVENT_AREAS = "events", "info"
 FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name

@@ -18,16 +18,6 @@ from tupli_mcap.journal.file import LOG_HEADER, Journal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
-__all__ = [
-    "FRONT",
-    "LOG_HEADER",
-    "EvenRecords",
-    "EventLog",
-    "Sink",
-    "as_rows",
-    "group_records",
-]
-
 Sink = Callable[[Rows], None]
 FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
 _LOG_TIME = FRONT.size - 8

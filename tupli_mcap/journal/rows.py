@@ -9,13 +9,6 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Rows
 
-__all__ = [
-    "LAST_ROW",
-    "RowDeriver",
-    "even_rows",
-    "rows_per_half",
-]
-
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
 

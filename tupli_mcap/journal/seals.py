@@ -18,19 +18,6 @@ from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.records import BODY
 
-__all__ = [
-    "SECTOR",
-    "STATE",
-    "Durability",
-    "boot_id",
-    "check_durability",
-    "checksum",
-    "seal",
-    "seal_of",
-    "sync_directory",
-    "sync_file",
-]
-
 Durability = Literal["os", "chunk", "step"]
 SECTOR = 512  # bytes a disk writes as one
 _SEAL = struct.Struct("<II")

@@ -17,8 +17,6 @@ from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
 from tupli_mcap.mcap.walk import Chunk
 
-__all__ = ["HEADERS", "ChunkRecords", "chunk_records", "message_headers", "message_places", "messages"]
-
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _BLOCK = 1 << 16  # records whose headers are looked at together
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])

@@ -10,8 +10,6 @@ import zstandard
 
 from tupli_mcap.errors import FormatError
 
-__all__ = ["MAX_RATIO", "decompress"]
-
 MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
 """How many bytes a compressed one may stand for at most: LZ4 counts a match in bytes of 255, and a block of zstd takes
 4 bytes at least and holds 128 KiB at most. Zeros come close to both."""

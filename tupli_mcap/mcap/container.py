@@ -40,8 +40,6 @@ from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, with_crc
 
-__all__ = ["CHUNK_ROWS", "MAGIC", "REPEATED", "Compression", "Container"]
-
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "tupli_mcap"
 REPEATED = ".repeated"

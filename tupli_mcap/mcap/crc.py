@@ -16,8 +16,6 @@ try:
 except ImportError:
     from zlib import crc32 as _crc32
 
-__all__ = ["crc32", "crc32_each"]
-
 _ZEROS = np.zeros(256)
 
 

@@ -22,8 +22,6 @@ from pathlib import Path
 from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, os_reason
 
-__all__ = ["FileLock", "drop_private", "is_locked", "open_private", "writers_kept_out"]
-
 _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
 _guard = threading.RLock()  # no fork between opening a descriptor and noting it

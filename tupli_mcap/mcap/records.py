@@ -27,29 +27,6 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.source import Source
 
-__all__ = [
-    "ATTACHMENT_HEAD",
-    "BODY",
-    "CDR_HEADER",
-    "CHUNK_HEAD",
-    "HEADER_FIELDS",
-    "MAX_CHUNK",
-    "MAX_ROWS_A_BYTE",
-    "MESSAGE_INDEX",
-    "RECORD",
-    "RECORD_HEADER",
-    "attachment_index",
-    "check_crc",
-    "checked_attachment",
-    "iter_records",
-    "message_index",
-    "parse_record",
-    "read_attachment",
-    "read_metadata",
-    "records",
-    "with_crc",
-]
-
 RECORD = struct.Struct("<BQ")  # what every record begins with: opcode, and the length of what follows
 # RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
 # name, and the length of the compressed bytes (u64)

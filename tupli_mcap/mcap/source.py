@@ -17,8 +17,6 @@ from urllib.parse import unquote, urlsplit
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
-__all__ = ["Source", "open_regular", "open_source"]
-
 _T = TypeVar("_T")
 _LARGEST_LENT = 4 << 20
 _lent = threading.local()

@@ -19,13 +19,6 @@ from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
 
-__all__ = [
-    "OTHER_TOOLS",
-    "Summary",
-    "has_summary",
-    "read_summary",
-]
-
 FOOTER_SIZE = 9 + 20
 OTHER_TOOLS = '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them'
 _FOOTER = struct.Struct("<BQQQI")

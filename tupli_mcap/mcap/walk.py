@@ -30,8 +30,6 @@ from tupli_mcap.mcap.records import (
 )
 from tupli_mcap.mcap.source import Source
 
-__all__ = ["Chunk", "ChunkClaim", "Damage", "Found", "Walk", "attachment_name"]
-
 _PIECE = 1 << 20
 _FIRST_PIECE = 1 << 12
 _PARSING = 16  # times as long as a checksum of as many bytes takes

@@ -5,8 +5,6 @@ from __future__ import annotations
 import functools
 from importlib.metadata import version
 
-__all__ = ["library"]
-
 
 @functools.cache  # it is read from the disk
 def library() -> str:

@@ -16,8 +16,6 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["LOG_TIME", "BatchDecoder", "Decode"]
-
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
 LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
 _LOG_TIME_AT = 15  # in a record

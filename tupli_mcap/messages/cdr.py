@@ -19,16 +19,6 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError
 
-__all__ = [
-    "decode_string",
-    "read_array",
-    "read_length",
-    "read_string",
-    "write_array",
-    "write_length",
-    "write_string",
-]
-
 _LENGTH = Struct("<I")
 _PADDING = tuple(bytes(n) for n in range(8))
 _TO_ESCAPE = re.compile("[\x00\x1a\ud800-\udfff]")

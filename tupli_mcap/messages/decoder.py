@@ -10,8 +10,6 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["MessageDecoder"]
-
 
 class MessageDecoder:
     """Decodes the CDR bodies of `/step` and `/final_state`. Every defect is a FormatError."""

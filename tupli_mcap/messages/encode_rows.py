@@ -31,8 +31,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["COMMIT", "EPISODE_AND_STEP", "HOLE", "SEQUENCE_OFFSET", "RowEncoder", "make_row_encoder"]
-
 SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
 COMMIT = Struct("<IQ")
 EPISODE_AND_STEP = Struct("<II")

@@ -9,25 +9,6 @@ from typing import NamedTuple
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
 
-__all__ = [
-    "END_FIELDS",
-    "END_NAME",
-    "END_NAMES",
-    "END_SCHEMA",
-    "INTERRUPTED",
-    "START_FIELDS",
-    "START_NAME",
-    "START_SCHEMA",
-    "TERMINAL",
-    "TIMEOUT",
-    "EpisodeEnd",
-    "EpisodeStart",
-    "end_texts",
-    "read_strings",
-    "record",
-    "start_texts",
-]
-
 END_NAMES = ("terminal", "timeout", "interrupted")
 TERMINAL, TIMEOUT, INTERRUPTED = range(3)
 

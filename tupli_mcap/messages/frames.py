@@ -14,20 +14,6 @@ from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
 from tupli_mcap.messages.topics import Topics, parse
 
-__all__ = [
-    "CAMERA_NAME",
-    "CAMERA_SCHEMA",
-    "FRAME_LAYOUT",
-    "FRAME_NAME",
-    "FRAME_SCHEMA",
-    "CameraTopics",
-    "EncodedFrame",
-    "camera_names",
-    "decode_frame",
-    "encode_frame",
-    "encode_pair",
-]
-
 CAMERA_NAME = "sensor_msgs/msg/CompressedImage"
 CAMERA_SCHEMA = (
     "std_msgs/Header header\nstring format\nuint8[] data\n" + IMAGE_SCHEMA[IMAGE_SCHEMA.index("=") :]

@@ -16,8 +16,6 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.spaces.leaves import NameRegistry
 
-__all__ = ["InfoCodec"]
-
 _HEAD = struct.Struct("<II")
 _FIELD = struct.Struct("<d?7x")
 

@@ -19,16 +19,6 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
 from tupli_mcap.spaces.leaves import Leaf, ros_type
 
-__all__ = [
-    "IMAGE_NAME",
-    "IMAGE_SCHEMA",
-    "Field",
-    "MessageLayout",
-    "image_layout",
-    "record_dtype",
-]
-
-
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 _SEPARATOR = "=" * 80 + "\n"
 IMAGE_NAME = "sensor_msgs/msg/Image"

@@ -11,8 +11,6 @@ from tupli_mcap.errors import SpaceError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["check_layouts", "common_dtype", "field_leaves"]
-
 
 def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
     """The leaves of a field; None where it is a plain column (flags, infos)."""

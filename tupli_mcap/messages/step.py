@@ -23,8 +23,6 @@ from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
-__all__ = ["FINAL_STATE_SCHEMA", "STEP_SCHEMA", "Stack", "StepLayout", "can_stack", "stack_of"]
-
 STEP_SCHEMA = "tupli_mcap/msg/Step"
 FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
 MAX_FRAMES = 256  # of a stack: what a row takes in memory is at most so many times what it takes in the file

@@ -9,8 +9,6 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-__all__ = ["EPISODE_END", "EPISODE_START", "FINAL_STATE", "INFO", "Topic", "Topics", "parse"]
-
 EPISODE_START = "/episode_start"
 EPISODE_END = "/episode_end"
 FINAL_STATE = "/final_state"

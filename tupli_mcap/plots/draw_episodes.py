@@ -17,8 +17,6 @@ from tupli_mcap.plots.measure import INFO, SUCCESS
 from tupli_mcap.plots.statistics import bands, bin_edges, mean_interval, running_mean
 from tupli_mcap.plots.style import Cell, Page, cut
 
-__all__ = ["add_episodes"]
-
 _MOST_DOTS, _VECTOR_DOTS = 3000, 500  # of more there are bands; they are one picture inside an SVG
 _MOST_WINDOW, _GROUPS = 100, 250  # episodes of a mean, groups of a band
 _POINTS, _MOST_LINES = 200, 12  # of a mean over runs; runs of a group that have lines of their own

@@ -15,8 +15,6 @@ from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
 from tupli_mcap.spaces.element_names import short_path
 
-__all__ = ["add_trace", "by_scale"]
-
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel
 _SAME_SCALE = 8  # lines of one panel differ by this factor at most
 _MOST_INFOS = 4

@@ -16,8 +16,6 @@ from tupli_mcap.plots.statistics import LARGEST, LeafValues, bin_edges, drawable
 from tupli_mcap.plots.style import COLUMNS, LEFT, SMALL, Cell, Page, cut, number_text
 from tupli_mcap.spaces.element_names import short_path
 
-__all__ = ["LEVELS", "add_coverage", "add_values", "most_varying", "quantiles"]
-
 Leaves = Sequence[LeafValues]  # the same leaf of each group of recordings
 Dimension = tuple[Leaves, int]  # one of its elements
 

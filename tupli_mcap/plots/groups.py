@@ -13,8 +13,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 
-__all__ = ["Group", "PlottedRun", "X", "groups_of", "shown_numbers"]
-
 X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
 _LONGEST = 200  # characters of a run's name that are looked at

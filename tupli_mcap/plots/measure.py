@@ -21,8 +21,6 @@ from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["INFO", "METADATA", "SUCCESS", "Measured", "Trace", "measure", "numbers_in", "thinned", "trace"]
-
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON

@@ -23,8 +23,6 @@ from tupli_mcap.plots.style import Page, styled
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.atomic import write_bytes
 
-__all__ = ["FORMATS", "Report", "check_goal", "report"]
-
 FORMATS = (".png", ".svg", ".pdf", ".html")
 _LONGEST_NAME = 200  # characters of a run's name that are shown
 _MOST_TRACES = 4

@@ -15,8 +15,6 @@ from tupli_mcap.spaces.element_names import element_names, short_path
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["LARGEST", "LeafValues", "bands", "bin_edges", "drawable_numbers", "mean_interval", "running_mean"]
-
 LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float
 MAX_ELEMENTS = 256  # of a leaf that are looked at one by one; of larger leaves, so many evenly chosen ones
 _SMALLEST_PICTURE = 16  # pixels

@@ -10,11 +10,6 @@ from typing import Any, NamedTuple
 
 from tupli_mcap.errors import missing_extra
 
-__all__ = [
-    "BLUE", "COLUMNS", "ENDS", "GREY", "INK", "LEFT", "SERIES", "SMALL", "VERMILION", "Cell", "Page", "colour_bar",
-    "colours", "cut", "draw_histograms", "heat_map", "legend_above", "number_text", "seed_text", "styled",
-]  # fmt: skip
-
 # Okabe and Ito's palette; https://jfly.uni-koeln.de/color/
 BLUE, VERMILION, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, INK, GREY, PALE = "#E69F00", "#56B4E9", "#222222", "#8A8A8A", "#E6E6E6"

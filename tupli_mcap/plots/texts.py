@@ -19,8 +19,6 @@ from tupli_mcap.plots.measure import SUCCESS, Measured
 from tupli_mcap.plots.style import Cell, Page, cut
 from tupli_mcap.recording.description import nan_text, spread_of
 
-__all__ = ["add_facts", "add_notes", "facts_of", "html_fragment", "html_page", "notes_of", "title_of"]
-
 _MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 _MOST_LISTED = 12  # recordings
 _HEAD, _LINE = 0.25, 0.175  # inches

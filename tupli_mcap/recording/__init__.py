@@ -26,7 +26,8 @@ from tupli_mcap.recording.opened import RecordedBenchmark
 from tupli_mcap.recording.recording import Recording
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording.check.verify import Problem, VerifyReport, verify_recording
+    from tupli_mcap.recording.check.report import Problem, VerifyReport
+    from tupli_mcap.recording.check.verify import verify_recording
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
@@ -39,28 +40,19 @@ if TYPE_CHECKING:
 
 # Imported on first use: who records or reads needs none of them.
 _HOMES = {
-    "EpisodeData": "write.from_values",
-    "MergeReport": "edit.merge",
-    "Part": "edit.split",
-    "Problem": "check.verify",
-    "RecoveryReport": "edit.repair.recover",
-    "VerifyReport": "check.verify",
-    "annotate_episodes": "edit.annotate",
-    "edit_run": "edit.annotate",
-    "finish_recording": "edit.repair.recover",
-    "made_of": "edit.made_of",
-    "merge_recordings": "edit.merge",
-    "recover_recording": "edit.repair.recover",
-    "relabel_recording": "edit.relabel",
-    "rewrite_recording": "edit.rewrite",
-    "say_made_of": "edit.made_of",
-    "split_recording": "edit.split",
-    "trim_recording": "edit.trim",
-    "undo_annotation": "edit.annotate",
-    "undo_edit": "edit.annotate",
-    "verify_recording": "check.verify",
-    "write_recording": "write.from_values",
+    "check.report": "Problem VerifyReport",
+    "check.verify": "verify_recording",
+    "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
+    "edit.made_of": "made_of say_made_of",
+    "edit.merge": "MergeReport merge_recordings",
+    "edit.relabel": "relabel_recording",
+    "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
+    "edit.rewrite": "rewrite_recording",
+    "edit.split": "Part split_recording",
+    "edit.trim": "trim_recording",
+    "write.from_values": "EpisodeData write_recording",
 }
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 __all__ = [
     "Columns",
@@ -96,8 +88,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     globals()[name] = value
     return value

@@ -14,8 +14,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Block", "blocks", "step_bytes", "whole_episodes"]
-
 BLOCK_BYTES = 8 << 20
 _VARIABLE_STEP_BYTES = 2048  # a guess, for steps of variable size
 _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")

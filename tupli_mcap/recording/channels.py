@@ -14,11 +14,6 @@ from tupli_mcap.messages.layout import IMAGE_NAME, IMAGE_SCHEMA
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 
-__all__ = [
-    "Channels",
-    "register_channels",
-]
-
 
 class Channels(NamedTuple):
     """MCAP channel ids."""

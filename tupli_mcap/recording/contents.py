@@ -16,12 +16,6 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.topics import FINAL_STATE, INFO, Topic, parse
 from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex
 
-__all__ = [
-    "Contents",
-    "NewerVersionError",
-    "check_version",
-]
-
 RECORDING_METADATA = "tupli_mcap.recording"
 REPEATED_METADATA = RECORDING_METADATA + REPEATED
 RECORDING_KEYS = (

@@ -27,21 +27,6 @@ from tupli_mcap.spaces.element_names import element_names, short_path
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = [
-    "ChannelFacts",
-    "RecordingDescription",
-    "Spread",
-    "claimed_signer",
-    "describe",
-    "describe_space",
-    "nan_text",
-    "space_lines",
-    "spread_of",
-    "state_of",
-    "success_rate",
-    "successes",
-]
-
 _MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each
 
 

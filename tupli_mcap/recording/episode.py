@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Episode", "Episodes", "Step", "item_getter", "reward_getter"]
-
 
 class _Step(NamedTuple):
     state: Any

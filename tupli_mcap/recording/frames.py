@@ -28,8 +28,6 @@ from tupli_mcap.recording.contents import Contents
 if TYPE_CHECKING:
     from tupli_mcap.recording.recording import Recording
 
-__all__ = ["Cameras", "Frames", "gathered"]
-
 _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
 

@@ -15,8 +15,6 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import CHUNK_ROWS
 
-__all__ = ["EPISODE_ROWS", "INDEX_NAME", "EpisodeIndex", "IndexBuilder"]
-
 INDEX_NAME = "episodes.index"
 INDEX_MEDIA_TYPE = "application/x-tupli-mcap-index"
 _HEAD = struct.Struct("<8sQQQ")

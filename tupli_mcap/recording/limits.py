@@ -14,14 +14,6 @@ from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
 from tupli_mcap.mcap.records import BODY, MAX_CHUNK, MAX_ROWS_A_BYTE
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 
-__all__ = [
-    "EPISODE_TOPICS",
-    "StepClaims",
-    "check_chunks",
-    "check_episodes",
-    "check_rows",
-]
-
 EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)
 
 _U32 = 2**32 - 1

@@ -13,11 +13,6 @@ from tupli_mcap.recording.contents import RECORDING_METADATA, REPEATED_METADATA,
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 from tupli_mcap.recording.limits import check_chunks
 
-__all__ = [
-    "read_contents",
-]
-
-
 _ATTEMPTS = 5
 _PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 

@@ -31,8 +31,6 @@ from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
 
-__all__ = ["CACHE_BYTES", "AttachmentInfo", "OpenFile", "OpenedRecording", "RecordedBenchmark"]
-
 CACHE_BYTES = 512 << 20
 
 

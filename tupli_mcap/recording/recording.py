@@ -25,8 +25,6 @@ from tupli_mcap.recording.verbs import DatasetVerbs
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
 
-__all__ = ["Recording"]
-
 _THREADS = min(4, os.cpu_count() or 1)
 
 

@@ -17,9 +17,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.spaces.element_names import element_names
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Series", "Sketch", "sketch"]
-
-
 READ_BYTES = 4 << 20
 """Steps of so many bytes are read at most; of longer recordings, some at a few places."""
 _PLACES, _AT_EACH = 16, 256

@@ -12,16 +12,6 @@ from tupli_mcap import signing, trust
 from tupli_mcap.environment import canonical_json
 from tupli_mcap.errors import FormatError
 
-__all__ = [
-    "SIGNATURE_MEDIA_TYPE",
-    "SIGNATURE_NAME",
-    "STATEMENTS",
-    "Signed",
-    "is_covered_kind",
-    "stays_signed",
-    "voucher",
-]
-
 SIGNATURE_NAME = "signature.ed25519"
 SIGNATURE_MEDIA_TYPE = "application/json"
 # What anybody may state about a recording at any time, so that no signature of it covers them.

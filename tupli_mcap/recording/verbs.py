@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.episode import Episode
     from tupli_mcap.recording.recording import Recording
 
-__all__ = ["DatasetVerbs"]
-
 
 class DatasetVerbs(SaysWhatIsMeant):
     """The verbs of `Dataset`: arguments and errors are the same, and are told there."""

@@ -16,8 +16,6 @@ from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, 
 from tupli_mcap.replay.recorded_values import Block, RecordedValues
 from tupli_mcap.replay.starts import EpisodePlan
 
-__all__ = ["Attempt", "Watch", "attempt", "repeats_itself"]
-
 Watch = Callable[[int], None]
 """Called with the number of each step whose state agrees, while the environment is in it; last for the final state."""
 

@@ -17,11 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tupli_mcap.recording import Recording
 
-__all__ = [
-    "REASONS", "Certificate", "Counts", "Divergence", "SkipKind", "Skipped", "content_digest", "platform_facts",
-    "versions_of",
-]  # fmt: skip
-
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
 SkipKind = Literal["unseeded", "after_divergence", "no_predecessor", "untrusted"]
 REASONS: dict[SkipKind, str] = {

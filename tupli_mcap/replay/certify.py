@@ -30,8 +30,6 @@ from tupli_mcap.replay.reapply import Replayer, brief
 from tupli_mcap.replay.recorded_values import RecordedValues, recorded_values
 from tupli_mcap.replay.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
 
-__all__ = ["Certifier", "certify"]
-
 _MAX_DIVERGENCES = 100
 
 

@@ -21,8 +21,6 @@ from tupli_mcap.replay.reapply import Moment
 from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Checker", "Difference", "Tally"]
-
 _SMALL = 1024  # bytes up to which values are compared as bytes objects
 _BITS = {2: "u2", 4: "u4", 8: "u8"}
 Same = Callable[[int, Any], bool]

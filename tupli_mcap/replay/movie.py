@@ -17,8 +17,6 @@ from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.images.pictures import FrameFormat, Picture, decode_picture, encode_picture, resized
 
-__all__ = ["Indexed", "RenderedFrames", "check_movie", "write_movie"]
-
 _GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
 _GIF_SAMPLE = 15_000  # pixels that the colours of a picture with more than that are chosen from

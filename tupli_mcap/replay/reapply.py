@@ -18,8 +18,6 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
 from tupli_mcap.replay.starts import EpisodePlan, ResetCall
 
-__all__ = ["EnvironmentFailedError", "Moment", "Replayer", "recorded_actions"]
-
 
 class EnvironmentFailedError(TupliError):
     """The environment raised: at `step` (-1: in reset)."""

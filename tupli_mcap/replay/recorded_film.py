@@ -16,8 +16,6 @@ from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.replay.movie import check_movie, write_movie
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["as_picture", "film", "has_pictures"]
-
 _KINDS = (".mp4", ".gif")
 _FPS = 30.0
 _BLOCK = 256  # states that are in memory together

@@ -11,8 +11,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 
-__all__ = ["Block", "RecordedValues", "recorded_values"]
-
 _BLOCK = 8 << 20  # bytes of columns
 
 

@@ -24,8 +24,6 @@ from tupli_mcap.replay.reapply import Replayer, brief
 from tupli_mcap.replay.starts import EpisodePlan
 from tupli_mcap.storage.sidecar import Notes
 
-__all__ = ["RenderReport", "RenderedEpisode", "render"]
-
 _KINDS: Final = (".mcap", ".mp4", ".gif")
 _FPS: Final = 30.0  # where neither recording nor environment says how long a step takes
 

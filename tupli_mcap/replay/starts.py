@@ -12,8 +12,6 @@ from typing import Literal, NamedTuple
 from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.recording import Recording
 
-__all__ = ["EpisodePlan", "How", "needed_for", "plan_episodes", "up_to_last"]
-
 How = Literal["seeded", "drawn", "captured", "follows", "continues", "unknown"]
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["element_names", "short_path"]
-
 
 def short_path(leaf: Leaf) -> str:
     """`arm.x[0]` for `state['arm']['x'][0]`; without keys, and before an index, the name of the root."""

@@ -15,16 +15,6 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.errors import StepError
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
 
-__all__ = [
-    "check_structure",
-    "decide_dtype",
-    "exact_array",
-    "exact_flag",
-    "leaf_value",
-    "shorten",
-    "structure_check",
-]
-
 _LONGEST = 120  # characters of a value in an error
 _MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
 

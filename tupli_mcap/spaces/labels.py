@@ -12,8 +12,6 @@ from gymnasium import spaces
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["LABELS_MEDIA_TYPE", "LABELS_NAME", "MAX_LABELS", "Labels", "chosen_labels"]
-
 LABELS_NAME = "labels.json"
 LABELS_MEDIA_TYPE = "application/json"
 MAX_LABELS = 1 << 20  # bytes of `labels.json`

@@ -19,17 +19,6 @@ from gymnasium import spaces
 from tupli_mcap.arrays import DType
 from tupli_mcap.errors import SpaceError
 
-__all__ = [
-    "ROS_TYPES",
-    "Leaf",
-    "NameRegistry",
-    "camel",
-    "flatten_space",
-    "ros_type",
-    "structure",
-]
-
-
 # float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
 ROS_TYPES: dict[str, str] = {
     "bool": "bool",

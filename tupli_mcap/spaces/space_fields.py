@@ -10,8 +10,6 @@ import numpy as np
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.spaces.leaves import ROS_TYPES
 
-__all__ = ["Fields", "Json", "dtype_name", "numbers", "short"]
-
 Json = dict[str, Any]
 
 _DTYPES = {name: np.dtype(name) for name in ROS_TYPES}

@@ -19,8 +19,6 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.spaces.space_fields import Fields, Json, dtype_name, numbers, short
 
-__all__ = ["MAX_DEPTH", "space_from_json", "space_to_json"]
-
 MAX_DEPTH = 64
 """Deepest nesting of spaces."""
 

@@ -18,7 +18,8 @@ from tupli_mcap.files import create
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
 from tupli_mcap.recording.check.signature import Signature, verify_signature
-from tupli_mcap.recording.sign.sign import SIGNATURE_NAME, episodes_alike, sign_recording
+from tupli_mcap.recording.sign.sign import episodes_alike, sign_recording
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA
 from tupli_mcap.schema import (
     ArtifactMetadata,

@@ -31,8 +31,6 @@ try:
 except ImportError as err:
     raise missing_extra("tupli_mcap.torch.d3rlpy needs d3rlpy", "d3rlpy") from err
 
-__all__ = ["RecordedBuffer", "RecordedEpisode", "RecordedReplayBuffer", "mdp_dataset", "replay_buffer"]
-
 _FIELDS = ("states", "actions", "rewards")
 
 

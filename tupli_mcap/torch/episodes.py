@@ -12,8 +12,6 @@ from tupli_mcap.dataset.items import Items, Steps, Window
 from tupli_mcap.dataset.items.steps import checked_fields, map_arrays
 from tupli_mcap.dataset.items.windows import FIVE
 
-__all__ = ["Episodes"]
-
 
 class Episodes(Items[Window]):
     """The episodes that have a step, by number: an index gives a `Window` of all its steps.

@@ -13,8 +13,6 @@ from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.packed import packed
 from tupli_mcap.torch.tensors import tensors
 
-__all__ = ["WORKER_CACHE_BYTES", "ReadItems", "check_state"]
-
 WORKER_CACHE_BYTES = 64 << 20
 
 

@@ -11,8 +11,6 @@ from tupli_mcap.dataset.items import Items
 from tupli_mcap.torch.mapped import MapDataset
 from tupli_mcap.torch.tensors import collate
 
-__all__ = ["loader"]
-
 
 def loader(
     items: Items[Any],

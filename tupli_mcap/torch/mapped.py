@@ -13,8 +13,6 @@ from tupli_mcap.dataset.items import Items
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import Samples
 
-__all__ = ["MapDataset"]
-
 
 class MapDataset(Dataset[dict[str, Any]]):
     """Windows, transitions or episodes by number, as dicts of tensors (see `tensors`).

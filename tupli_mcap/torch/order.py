@@ -19,8 +19,6 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items import Items
 
-__all__ = ["Batches", "Blocks", "Part", "blocks_of"]
-
 
 @dataclass(frozen=True)
 class Blocks:

@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from torch.multiprocessing.reductions import reduce_storage
 
-__all__ = ["PackedBatch", "packed"]
-
 _ALIGNED = 64  # bytes
 _NUMBERS = (np.ndarray, np.generic)
 _DYING = 0.5  # seconds until a process that has closed its files is seen to be dead

@@ -20,8 +20,6 @@ try:
 except ImportError as err:
     raise missing_extra("tupli_mcap.torch.rl needs TorchRL", "torchrl") from err
 
-__all__ = ["RecordedStorage", "replay_buffer"]
-
 
 class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
     """The transitions of a dataset, by number, read when they are sampled; nothing can be written.

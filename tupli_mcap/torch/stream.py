@@ -13,8 +13,6 @@ from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
 
-__all__ = ["StreamDataset"]
-
 _CHUNK_BYTES = 256 << 10  # where nobody knows
 
 

@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from torch.utils.data import default_collate
 
-__all__ = ["Samples", "collate", "tensors"]
-
 
 def tensors(column: Any) -> Any:
     """The column with a tensor in place of each array and number, nested as it is; lists stay as they are."""

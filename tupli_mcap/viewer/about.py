@@ -18,8 +18,6 @@ from tupli_mcap.viewer.names import plain, title_of
 from tupli_mcap.viewer.panels import PALETTE
 from tupli_mcap.viewer.sending import column_of, pooled, tensor_array
 
-__all__ = ["card", "run_title", "send_about"]
-
 _MOST_BARS = 1000
 _MOST_MARKS = 200
 _BAR, _MARK = PALETTE[:2]

@@ -11,8 +11,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import Block as Steps, blocks
 
-__all__ = ["Block", "Finals", "Piece", "blocks_of", "row_counts"]
-
 _MAX_ROWS = 65_536  # Rerun's viewer is no faster with larger chunks
 _MAX_BYTES = 32 << 20
 

@@ -8,8 +8,6 @@ from typing import Any
 from tupli_mcap.viewer.panels import Camera, Grid, HeatMap, Infos, Lanes, Panel, Picture, Series, Words
 from tupli_mcap.viewer.scene import Scene
 
-__all__ = ["blueprint_of"]
-
 _STACKED, _A_PAGE = 4, 12
 _WINDOW = 500  # rows that are shown of a rollout that goes on
 _SHARE = 3.0  # of a column's height, a panel like any other

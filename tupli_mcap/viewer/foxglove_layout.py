@@ -25,8 +25,6 @@ from tupli_mcap.viewer.names import dimension_names
 from tupli_mcap.viewer.scene import MOST_LINES
 from tupli_mcap.viewer.targets import check_new
 
-__all__ = ["foxglove_layout", "write_layout"]
-
 _WIDEST = 64  # elements of a leaf that is plotted
 _PLOT = {
     "isSynced": True,

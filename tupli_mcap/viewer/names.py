@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["dimension_names", "entity_of", "escaped", "plain", "title_of"]
-
 _LONGEST = 80  # characters of a part of an entity path
 
 

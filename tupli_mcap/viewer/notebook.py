@@ -10,8 +10,6 @@ from typing import Any, Literal
 
 from tupli_mcap.viewer.plan import Plan
 
-__all__ = ["Display", "in_notebook"]
-
 _HEIGHT = 700  # pixels
 
 

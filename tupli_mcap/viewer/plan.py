@@ -26,8 +26,6 @@ from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
 
-__all__ = ["Form", "Plan", "extremes_of", "plans_of"]
-
 Form = Literal["joined", "split", "compare"]
 _MOST_SPLIT = 200
 _MOST_COMPARED = 16

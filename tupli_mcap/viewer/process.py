@@ -20,20 +20,6 @@ from typing import IO
 
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk, version_of
 
-__all__ = [
-    "LOCAL",
-    "answers",
-    "end",
-    "free_port",
-    "has_display",
-    "run_quietly",
-    "scratch",
-    "start",
-    "stopped_by_signals",
-    "viewer_program",
-    "wait_for_ports",
-]
-
 LOCAL = "127.0.0.1"
 _PATIENCE = 30.0  # seconds for a viewer to start
 _ANSWER = 0.25  # seconds for one that listens to answer

@@ -31,8 +31,6 @@ from tupli_mcap.viewer.panels import (
     value_range,
 )
 
-__all__ = ["MOST_LINES", "Scene", "live_scene", "scene_of"]
-
 MOST_LINES: Final = 12  # in one plot; more cannot be told apart
 _MOST_SMALL: Final = 48  # dimensions that get small plots besides their heat map
 _LINES_SMALL: Final = 6

@@ -11,8 +11,6 @@ from typing import Any
 
 from tupli_mcap.errors import TupliError, missing_extra
 
-__all__ = ["OLDEST", "ViewerError", "import_quickly", "rerun_sdk"]
-
 OLDEST = (0, 39)
 
 

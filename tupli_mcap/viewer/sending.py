@@ -10,11 +10,6 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 
-__all__ = [
-    "Times", "blob_array", "column_of", "pooled", "send_blobs", "send_scalars", "send_tensors", "send_texts",
-    "tensor_array",
-]  # fmt: skip
-
 
 class Times:
     """Where rows lie on the timelines.

@@ -30,8 +30,6 @@ from tupli_mcap.viewer.process import (
 )
 from tupli_mcap.viewer.sdk import ViewerError
 
-__all__ = ["check_new", "to_browser", "to_file", "to_viewer", "to_window"]
-
 _ANSWER_SECONDS = 3.0
 _FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
 

@@ -30,8 +30,6 @@ from tupli_mcap.wrappers.stacks import format_version, with_stacks
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
-__all__ = ["EpisodeWrapper", "check_kind", "metadata_of", "wrong_kind"]
-
 
 class EpisodeWrapper:
     """Keeps the files that a wrapper records to. `step` and `reset` are the wrapper's own.

@@ -15,8 +15,6 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording.write.options import CaptureEnv
 from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["Captured"]
-
 _PICKLE = "env.cloudpickle"
 _MAX_PICKLE = 16 << 20
 

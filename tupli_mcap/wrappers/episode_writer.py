@@ -16,6 +16,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import ImageFormat
@@ -23,6 +24,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import Capture, Mode, RecordOptions
 from tupli_mcap.recording.write.rotation import Rotation
@@ -31,13 +33,11 @@ from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.wrappers.run import with_run
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
-
-__all__ = ["EpisodeWriter"]
 
 
 class EpisodeWriter:

@@ -15,8 +15,6 @@ from tupli_mcap.recording.write.options import Mode
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter
 
-__all__ = ["write_rollout"]
-
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
 _CHUNK: Final = 256 * 1024

@@ -12,8 +12,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.wrappers.benchmark import Captured
 
-__all__ = ["with_labels"]
-
 
 def with_labels(
     captured: Captured,

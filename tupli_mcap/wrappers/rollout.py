@@ -29,8 +29,6 @@ from tupli_mcap.recording.write.options import (
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
-__all__ = ["Policy", "RolloutSummary", "load_policy", "record_rollouts"]
-
 Policy = Callable[[Any], Any]
 """From one observation (never a batch) to one action."""
 

@@ -19,8 +19,6 @@ from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRun
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["with_run"]
-
 _PACKAGES: Final = {  # distributions, by the module that says whether one is at work
     "tupli_mcap": "tupli-mcap", "gymnasium": "gymnasium", "numpy": "numpy", "torch": "torch", "jax": "jax",
     "tensorflow": "tensorflow", "stable_baselines3": "stable-baselines3", "d3rlpy": "d3rlpy", "torchrl": "torchrl",

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.recording.write.writer import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.wrappers.base import wrong_kind
 from tupli_mcap.wrappers.vector import RecordEpisodes
 
@@ -30,8 +30,6 @@ try:
     )
 except ImportError as err:
     raise missing_extra("tupli_mcap.sb3 needs stable-baselines3", "sb3") from err
-
-__all__ = ["VecRecordEpisodes"]
 
 _FINAL = "terminal_observation"
 _TIMEOUT = "TimeLimit.truncated"

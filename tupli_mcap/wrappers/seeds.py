@@ -6,8 +6,6 @@ from typing import Any
 
 import gymnasium as gym
 
-__all__ = ["drawn_seed"]
-
 
 def drawn_seed(env: gym.Env[Any, Any]) -> int | None:
     """The seed an environment drew in a reset without one; None if it does not say."""

@@ -19,6 +19,7 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import success_of, with_success
 from tupli_mcap.recording.episode import Step
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.frames import FrameRecorder
 from tupli_mcap.recording.write.options import (
     Capture,
@@ -30,12 +31,10 @@ from tupli_mcap.recording.write.options import (
 )
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback
 from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
 from tupli_mcap.wrappers.seeds import drawn_seed
-
-__all__ = ["RecordEpisodes"]
 
 
 class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):

@@ -11,8 +11,6 @@ from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["format_version", "with_stacks"]
-
 _SIZES = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasium's FrameStack before it
 
 

@@ -21,6 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success, with_success
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.frames import VectorFrames
 from tupli_mcap.recording.write.options import (
     Capture,
@@ -33,12 +34,10 @@ from tupli_mcap.recording.write.options import (
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback
 from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
 from tupli_mcap.wrappers.seeds import drawn_seed
-
-__all__ = ["RecordEpisodes"]
 
 
 class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):

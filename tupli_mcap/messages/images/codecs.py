@@ -20,8 +20,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import parse
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["CODEC", "ImageCodec", "image_codecs", "png_leaves", "uses_codecs"]
-
 CODEC = "codec"  # key of the metadata of an image channel
 
 

@@ -9,21 +9,6 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, missing_extra
 
-__all__ = [
-    "FrameFormat",
-    "ImageFormat",
-    "Picture",
-    "check_format",
-    "check_image_format",
-    "check_picture",
-    "decode_picture",
-    "decode_pixels",
-    "encode_picture",
-    "encode_pixels",
-    "format_of",
-    "resized",
-]
-
 FrameFormat = Literal["png", "jpeg"]
 ImageFormat = Literal["raw", "png"]  # of image leaves of the state
 Picture = np.ndarray[Any, np.dtype[np.uint8]]

@@ -17,8 +17,6 @@ from tupli_mcap.messages.images.stack import new_frames
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["PngCodec"]
-
 _STAMP = struct.Struct("<iI")  # kept bit for bit, also one that no clock says
 
 

@@ -14,8 +14,6 @@ from tupli_mcap.mcap.records import BODY, MAX_CHUNK
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["StackCodec", "new_frames"]
-
 _LENGTH = struct.Struct("<Q")  # of a Message record, after its opcode
 _HEIGHT_WIDTH = struct.Struct("<II")
 _COUNT = struct.Struct("<I")

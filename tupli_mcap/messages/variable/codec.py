@@ -52,8 +52,6 @@ from tupli_mcap.messages.variable.nested_codecs import (
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
 from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel
 
-__all__ = ["VariableField"]
-
 _MAX_DEPTH = 64
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _DUMMY = "structure_needs_at_least_one_member"  # the name ROS 2 gives it

@@ -17,19 +17,6 @@ from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.exact import exact_array, shorten
 from tupli_mcap.spaces.leaves import ROS_TYPES, ros_type
 
-__all__ = [
-    "Codec",
-    "Decode",
-    "Encode",
-    "Leaf",
-    "empty_batch",
-    "expect_tuple",
-    "numeric",
-    "numeric_batch",
-    "numeric_items",
-    "text",
-]
-
 Encode = Callable[[Any, bytearray, int], None]
 Decode = Callable[[memoryview, int, int], tuple[Any, int]]
 

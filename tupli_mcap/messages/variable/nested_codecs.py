@@ -17,21 +17,6 @@ from tupli_mcap.messages import cdr
 from tupli_mcap.messages.variable.leaf_codecs import Codec, Decode, Encode, expect_tuple
 from tupli_mcap.spaces.exact import shorten
 
-__all__ = [
-    "Maybe",
-    "Step",
-    "decode_dict",
-    "decode_graph",
-    "decode_one_of",
-    "decode_tuple",
-    "encode_dict",
-    "encode_graph",
-    "encode_one_of",
-    "encode_tuple",
-    "items_of",
-    "with_dummy",
-]
-
 Step = tuple[Any, str, Encode]  # key, its path, its encoder
 
 

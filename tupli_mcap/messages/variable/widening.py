@@ -17,8 +17,6 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.spaces.exact import decide_dtype
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["EDGE_LINKS", "variable_dtypes"]
-
 EDGE_LINKS = np.dtype(np.int32)  # as Gymnasium samples them; the space does not say
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 

@@ -12,8 +12,6 @@ from typing import Any, Final, NamedTuple
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
 
-__all__ = ["ANNOTATIONS_MEDIA_TYPE", "ANNOTATIONS_NAME", "MAX_ANNOTATIONS", "Annotation", "Annotations"]
-
 ANNOTATIONS_NAME: Final = "annotations.json"
 ANNOTATIONS_MEDIA_TYPE: Final = "application/json"
 MAX_ANNOTATIONS: Final = 1 << 26  # bytes of `annotations.json`

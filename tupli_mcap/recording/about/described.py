@@ -16,8 +16,6 @@ from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTAT
 from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.opened import OpenedRecording
 
-__all__ = ["DescribedRecording"]
-
 
 class DescribedRecording(OpenedRecording):
     """An open recording with its runs, metadata and annotations."""

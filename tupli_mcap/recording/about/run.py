@@ -16,8 +16,6 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, SaysWhatIsMeant
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["MAX_RUN", "RUN_MEDIA_TYPE", "RUN_NAME", "RecordedRuns", "Run", "file_name"]
-
 RUN_NAME: Final = "run.json"
 RUN_MEDIA_TYPE: Final = "application/json"
 MAX_RUN: Final = 1 << 20  # bytes of `run.json`

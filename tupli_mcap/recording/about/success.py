@@ -9,8 +9,6 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 
-__all__ = ["KEYS", "success_of", "tells_success", "with_success"]
-
 KEYS = ("is_success", "success")
 """What infos and metadata call it."""
 

@@ -25,8 +25,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["verify_episodes"]
-
 
 def verify_episodes(recording: Recording, findings: Findings) -> None:
     """Holds the rows of all channels, the messages of the episodes and the index against each other."""

@@ -13,8 +13,6 @@ from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["verify_frames"]
-
 _TOLD = 3  # rows of a channel that are named, of each defect
 
 

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-__all__ = ["RECOVER", "Findings", "Problem", "VerifyReport"]
-
 _MOST = 1000  # problems that are kept of a file; the others are counted
 RECOVER = "save what is good with tupli-mcap recover"
 

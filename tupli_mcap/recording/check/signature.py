@@ -22,15 +22,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 
-__all__ = [
-    "Signature",
-    "check_readers",
-    "manifest",
-    "manifest_of_episodes",
-    "verify_signature",
-]
-
-
 # Of the metadata; the other keys are about the file as it happened to be written.
 _IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
 

@@ -29,8 +29,6 @@ from tupli_mcap.recording.contents import (
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = ["Structure"]
-
 _CDR = int.from_bytes(CDR_HEADER, "little")
 _SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length
 _KINDS = {

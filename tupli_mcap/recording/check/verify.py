@@ -23,7 +23,7 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
-from tupli_mcap.recording.check.report import Findings, Problem, VerifyReport
+from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
@@ -33,8 +33,6 @@ from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.recover.find_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.recover.prefix import head
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-
-__all__ = ["Problem", "VerifyReport", "verify_recording"]
 
 _ARTIFACT = "artifacts/"
 _UNVERIFIED = "; steps that are still in its journal are not verified: they get a checksum when they leave it"

@@ -29,8 +29,6 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 from tupli_mcap.remote import RemoteSource
 
-__all__ = ["IN_MEMORY", "ChunkCache", "ChunkStore", "KeptChunk", "Span"]
-
 IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
 _MESSAGE_HEAD = np.dtype(
     {

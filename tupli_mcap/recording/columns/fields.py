@@ -8,8 +8,6 @@ from typing import Any
 
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, did_you_mean
 
-__all__ = ["FIELDS", "FIVE", "GymnasiumNames", "field_names"]
-
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 FIELDS = (*FIVE, "next_states", "times", "infos", "frames")
 _OTHER_NAMES = MappingProxyType(

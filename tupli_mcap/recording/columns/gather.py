@@ -25,19 +25,6 @@ from tupli_mcap.recording.columns.runs import Part
 from tupli_mcap.recording.columns.threads import do_all
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = [
-    "EPISODE",
-    "Column",
-    "Files",
-    "Plan",
-    "Rows",
-    "final_rows",
-    "image_names",
-    "image_rows",
-    "put",
-    "step_rows",
-]
-
 EPISODE = "episode"  # the column of the number that a final state says its episode has
 _BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
 _FEW = 2048  # bytes

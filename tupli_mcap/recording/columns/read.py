@@ -19,8 +19,6 @@ from tupli_mcap.recording.columns.gather import EPISODE, Files, Plan, Rows, fina
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
 from tupli_mcap.recording.columns.threads import do_all
 
-__all__ = ["ColumnReader", "Columns", "StoredSteps"]
-
 _MOST_KEYS = 20  # of infos that are shown
 
 

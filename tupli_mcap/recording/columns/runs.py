@@ -11,8 +11,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
-__all__ = ["Part", "Runs", "Segments", "SegmentsBuilder", "final_runs", "parts_of", "runs_of"]
-
 _FEW = 4  # so many pieces are copied one by one
 Numbers = Array | Sequence[int]
 

@@ -11,8 +11,6 @@ from gymnasium import spaces
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["ElementStatistics", "columns_of", "element_bounds"]
-
 _MOST_CHOICES = 1 << 14  # of all elements together, up to which they are counted
 _NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
 _INT64_MAX = 2**63 - 1

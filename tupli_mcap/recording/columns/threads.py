@@ -7,8 +7,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-__all__ = ["do_all"]
-
 _FEW = 4  # so many are done before a thread has started
 
 

@@ -26,8 +26,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
-__all__ = ["annotate_episodes", "edit_run", "undo_annotation", "undo_edit", "user_name"]
-
 _MOST_EDITS = 20  # that can be taken back
 
 

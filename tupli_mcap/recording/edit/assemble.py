@@ -21,8 +21,6 @@ from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
 
-__all__ = ["Assembler", "CopiedEpisode"]
-
 _CHUNK = 256 * 1024
 
 

@@ -19,8 +19,6 @@ from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.open import read_contents
 from tupli_mcap.recording.write.resume import restore_container
 
-__all__ = ["add_attachments", "attach", "held"]
-
 _COPY = 1 << 22
 
 

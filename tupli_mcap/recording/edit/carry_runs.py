@@ -12,8 +12,6 @@ from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOT
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["carry_runs"]
-
 
 def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple[str, bytes]]:
     """The attachments that say of each episode which run it is of, and what was said about it.

@@ -18,8 +18,6 @@ from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.opened import OpenFile
 
-__all__ = ["first_chunks"]
-
 
 def first_chunks(
     file: OpenFile,

@@ -19,9 +19,6 @@ from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
 
-__all__ = ["EpisodeCopier", "NewFrames", "NewValues", "Trim"]
-
-
 _NUMBERS = struct.Struct("<II")  # an episode's, and a step's or a sub-environment's
 
 

@@ -11,8 +11,6 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.recording import Recording
 
-__all__ = ["MADE_OF_NAME", "made_of", "say_made_of"]
-
 MADE_OF_NAME: Final = "made_of.json"
 _MEDIA_TYPE: Final = "application/json"
 _MOST: Final = 1 << 22  # bytes of `made_of.json`

@@ -32,8 +32,6 @@ from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metad
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 
-__all__ = ["Excerpt", "MergeReport", "merge_excerpts", "merge_recordings"]
-
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 _MOST_TURNS = 100
 _SPACES = ("observation_space", "action_space", "reward_space")

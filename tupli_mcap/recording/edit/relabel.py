@@ -29,8 +29,6 @@ from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["relabel_recording"]
-
 _FIELDS = ("rewards", "actions", "states")
 
 

@@ -10,8 +10,6 @@ from pathlib import Path
 from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, os_reason
 
-__all__ = ["replacing", "tidy"]
-
 
 @contextlib.contextmanager
 def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]]:

@@ -24,17 +24,6 @@ from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 
-__all__ = [
-    "NewFrames",
-    "camera_channels",
-    "define",
-    "kept_metadata",
-    "new_metadata",
-    "return_of",
-    "rewrite_recording",
-    "write",
-]
-
 
 def rewrite_recording(
     source: Recording,

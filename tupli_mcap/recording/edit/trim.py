@@ -17,8 +17,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rows.variable import final_encoder
 
-__all__ = ["TrimReport", "trim_recording"]
-
 
 class TrimReport(NamedTuple):
     """What trimming wrote, or would write; `left_out` counts steps, `size` bytes, 0 where nothing was written."""

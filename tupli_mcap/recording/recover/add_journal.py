@@ -32,8 +32,6 @@ from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, Recorde
 from tupli_mcap.recording.recover.find_journal import STEPS_IN_JOURNAL, belongs, misplaced_journal
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["add_journal", "define", "take_journal", "take_rows"]
-
 _Taken = TypeVar("_Taken", Array, Rows)
 
 

@@ -26,8 +26,6 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk
 from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = ["gather", "is_recording", "may_be_recording"]
-
 _HEAD = 4096  # the recording's metadata record begins within so many bytes
 
 

@@ -18,18 +18,6 @@ from tupli_mcap.recording.index import HAS_SEED, EpisodeIndex
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
-__all__ = [
-    "IN_A_HOLE",
-    "RUNNING",
-    "End",
-    "NewPlaces",
-    "Plan",
-    "PlannedEpisode",
-    "Start",
-    "final_state",
-    "make_plan",
-]
-
 RUNNING, IN_A_HOLE = -1, -2  # instead of the row of a final state: where in the journal it is
 
 

@@ -24,8 +24,6 @@ from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = ["Evidence", "PackedStore", "Piece", "RecordedChannels", "RepairedChunk", "memory_entry"]
-
 _CACHE = 64 << 20
 _HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
 

@@ -22,8 +22,6 @@ from tupli_mcap.mcap.summary import FOOTER_SIZE, Summary, has_summary, read_summ
 from tupli_mcap.mcap.walk import ChunkClaim
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 
-__all__ = ["Tail", "read_tail"]
-
 _NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
 _BEFORE_NAME = 9 + 16  # opcode, length and two times
 _WINDOW = 1 << 20

@@ -14,8 +14,6 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.recording.recover.prefix import head
 
-__all__ = ["KEEP_JOURNAL", "STEPS_IN_JOURNAL", "belongs", "find_journal", "misplaced_journal"]
-
 STEPS_IN_JOURNAL = "steps that are not yet in a chunk are nowhere else"
 KEEP_JOURNAL = (
     "keep it, and update tupli-mcap if a later version recorded this; tupli-mcap recover writes what the file itself "

@@ -8,8 +8,6 @@ from typing import NamedTuple
 from tupli_mcap.recording.recover.episodes import Plan
 from tupli_mcap.recording.recover.step_runs import StepRun
 
-__all__ = ["Losses", "losses"]
-
 _END = 1 << 64  # beyond any row number
 
 

@@ -20,8 +20,6 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.evidence import Evidence, Piece
 from tupli_mcap.recording.recover.file_end import Tail
 
-__all__ = ["head", "metadata_at", "prefix"]
-
 
 def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
     """What a reader takes of a file: its records until it ends, is damaged, or its data section ends.

@@ -17,8 +17,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
-__all__ = ["Ranges", "StepFacts", "StepRun", "intersection", "runs_in", "step_facts", "step_runs"]
-
 _TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
 

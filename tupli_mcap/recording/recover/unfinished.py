@@ -32,8 +32,6 @@ from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, Recorde
 from tupli_mcap.recording.recover.find_journal import belongs, find_journal, misplaced_journal
 from tupli_mcap.recording.recover.prefix import head, prefix
 
-__all__ = ["recover_contents"]
-
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
     """The contents of a recording that has no summary.

@@ -27,16 +27,6 @@ from tupli_mcap.recording.description import claimed_signer
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
-__all__ = [
-    "CarriedCode",
-    "EntryPoint",
-    "carried_code",
-    "foreign_options",
-    "options_are_trusted",
-    "set_trust",
-    "untrust",
-]
-
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 _MAX_OPTIONS = 20  # that are shown
 

@@ -24,12 +24,6 @@ from tupli_mcap.recording.signature_file import (
     Signed,
 )
 
-__all__ = [
-    "SIGNATURE_NAME",
-    "episodes_alike",
-    "sign_recording",
-]
-
 
 def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Signature:
     """Adds the signature of a key to a finished recording, instead of one that is there; it is replaced in one rename.

@@ -7,10 +7,6 @@ from tupli_mcap.journal.rows import rows_per_half
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.rows.single import CHUNKS_PER_HALF
 
-__all__ = [
-    "plan_areas",
-]
-
 _HALF = 8 << 20  # bytes of images in half a journal
 
 

@@ -28,8 +28,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.spaces.exact import shorten
 
-__all__ = ["Autoreset"]
-
 Mode = Literal["NextStep", "SameStep", "Disabled"]
 _MODES: tuple[Mode, ...] = ("NextStep", "SameStep", "Disabled")
 _OTHERWISE = (

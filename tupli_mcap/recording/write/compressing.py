@@ -12,8 +12,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["LARGE", "WORTH_A_THREAD", "ChunkWorker"]
-
 T = TypeVar("T")
 # Seconds of work: handing a chunk over costs the recording thread some 0.05 ms, on virtual machines ten times as much.
 WORTH_A_THREAD = 0.001

@@ -33,8 +33,6 @@ from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
-__all__ = ["EPISODE_AND_ENV", "EpisodeLog", "ResetFacts", "StartedEpisode"]
-
 _RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
 _LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")

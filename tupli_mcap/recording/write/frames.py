@@ -17,8 +17,6 @@ from tupli_mcap.recording.write.options import CAMERA, RecordOptions
 from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["FrameRecorder", "VectorFrames", "put_frame"]
-
 Ask = Callable[..., Any]
 
 

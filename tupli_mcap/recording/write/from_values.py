@@ -15,15 +15,14 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.frames import put_frame
 from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.options import Mode, RecordOptions
 from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_flag, shorten
-
-__all__ = ["EpisodeData", "write_recording"]
 
 
 @dataclass

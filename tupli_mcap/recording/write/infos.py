@@ -14,8 +14,6 @@ from tupli_mcap.recording.write.options import RecordInfo
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
 
-__all__ = ["InfoRecorder", "entries_of"]
-
 
 def entries_of(given: Any, what: str) -> dict[str, Any]:
     """A copy of a dict of entries, empty for None; RecordingError if it is something else."""

@@ -23,18 +23,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.episode import Step
     from tupli_mcap.schema import EpisodeMetadataCallback
 
-__all__ = [
-    "CAMERA",
-    "RENDER_MODE",
-    "Capture",
-    "CaptureEnv",
-    "Mode",
-    "RecordInfo",
-    "RecordOptions",
-    "StepCallback",
-    "check_place",
-]
-
 Mode = Literal["x", "w", "a"]
 CaptureEnv = Literal["spec", "pickle"] | None
 Capture = Literal["all", "versions", "none"]

@@ -29,8 +29,6 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 if TYPE_CHECKING:
     from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["restore_container", "resume"]
-
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 
 

@@ -25,8 +25,6 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
 
-__all__ = ["Rotation", "series"]
-
 _NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
 _MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 million steps is left
 

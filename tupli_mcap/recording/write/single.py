@@ -8,16 +8,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from tupli_mcap.errors import StepError
+from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value
-
-__all__ = ["SingleRecorder", "decide_layout"]
 
 
 def decide_layout(

@@ -13,20 +13,20 @@ from gymnasium.vector.utils import batch_space
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
+from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success
 from tupli_mcap.recording.write.autoreset import Autoreset
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
-from tupli_mcap.recording.write.writer import RecordingWriter, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
-
-__all__ = ["VectorRecorder"]
 
 _BOOL = np.dtype(np.bool_)
 

@@ -14,8 +14,6 @@ import numpy as np
 from tupli_mcap.errors import StepError
 from tupli_mcap.spaces.exact import shorten
 
-__all__ = ["check_infos", "final_info_of", "final_states", "info_of", "reset_info_of"]
-
 # Gymnasium's, Gymnasium's before 1.0 and ManiSkill's, Stable-Baselines3's
 _STATES = ("final_obs", "final_observation", "terminal_observation")
 _FINAL = frozenset([*_STATES, "final_info", *(f"_{name}" for name in (*_STATES, "final_info"))])

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = ["ASKING", "BEGUN", "DONE", "Recorder", "Work"]
-
 T = TypeVar("T")
 
 DONE: Final = 0

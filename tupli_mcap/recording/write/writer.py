@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
+from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.journal.file import (
     Area,
     Journal,
@@ -41,20 +42,11 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilde
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
-from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts, StartedEpisode
+from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.stores import Stores
-
-__all__ = [
-    "EPISODE_AND_ENV",
-    "RECORDING_METADATA",
-    "RecordingWriter",
-    "ResetFacts",
-    "StartedEpisode",
-    "finish_recording",
-]
 
 RECORDING_METADATA = "tupli_mcap.recording"
 _MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the journal must not come to LAST_ROW

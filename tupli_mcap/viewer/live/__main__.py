@@ -21,8 +21,6 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.viewer.live.follow import Follower, follow
 from tupli_mcap.viewer.live.target import Target, parse_target
 
-__all__ = ["LiveView"]
-
 _SHORTEST_REST = 1 / 20  # seconds between two looks
 _IDLE_REST = 0.25  # the same while there is no viewer
 _LONGEST_REST = 3.0

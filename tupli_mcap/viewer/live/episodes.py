@@ -23,8 +23,6 @@ from tupli_mcap.recording.recover.evidence import Evidence
 from tupli_mcap.recording.recover.step_runs import StepRun, runs_in
 from tupli_mcap.viewer.live.new_rows import NewSteps, messages_of
 
-__all__ = ["EpisodeNews"]
-
 _STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8")])
 _ENDS = np.dtype([*_STARTS.descr, ("length", "<u8"), ("return", "<f8")])
 _NUMBER = len(CDR_HEADER)  # where messages have the number of their episode

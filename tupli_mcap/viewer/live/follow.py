@@ -49,8 +49,6 @@ from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 from tupli_mcap.viewer.live.episodes import EpisodeNews
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps, messages_of
 
-__all__ = ["Follower", "follow"]
-
 _ENVS = 8  # sub-environments whose steps are read
 _STEPS = 5000  # of a sub-environment at a time, the newest
 _DECODED = 200  # the same where each message is decoded on its own

@@ -16,8 +16,6 @@ from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewSteps
 from tupli_mcap.viewer.live.target import Target
 
-__all__ = ["FoxgloveView"]
-
 _STEPS = 250  # of a sub-environment at a time
 _IMAGES = 2
 _EVENTS = 250

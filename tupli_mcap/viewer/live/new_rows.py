@@ -10,8 +10,6 @@ from tupli_mcap.mcap.records import RECORD_HEADER
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recover.step_runs import StepFacts
 
-__all__ = ["NewInfo", "NewSteps", "messages_of"]
-
 
 class NewSteps(NamedTuple):
     """Consecutive steps of a sub-environment: rows `first`, `first + 1`, … of its channel.

@@ -22,8 +22,6 @@ from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Place, R
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["MOST_INFOS", "LiveEnv", "columns_of"]
-
 _STEPS = 1000  # at a time, the newest, of all sub-environments together
 _DECODED = 200  # the same where each message is decoded on its own
 MOST_INFOS = 300

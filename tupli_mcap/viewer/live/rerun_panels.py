@@ -21,8 +21,6 @@ from tupli_mcap.viewer.panels import PALETTE, Place, numbers_in
 from tupli_mcap.viewer.scene import live_scene
 from tupli_mcap.viewer.sending import tensor_array
 
-__all__ = ["LivePanels"]
-
 _SAMPLE = 100  # steps that are looked at to decide which panels there are, and which dimensions share an axis
 _PATIENCE = 1.0  # seconds to wait for so many
 _BARS = 500

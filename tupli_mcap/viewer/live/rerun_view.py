@@ -15,8 +15,6 @@ from tupli_mcap.viewer.live.target import Target
 from tupli_mcap.viewer.process import has_display, start, viewer_program
 from tupli_mcap.viewer.sdk import import_quickly, rerun_sdk
 
-__all__ = ["RerunView"]
-
 _TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
 _PATIENCE = 0.5  # seconds for a viewer to take what it was sent
 _FAREWELL = 5.0  # the same for the rest, when the rollout is over

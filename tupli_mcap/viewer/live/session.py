@@ -18,8 +18,6 @@ from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.viewer.live.target import parse_target
 
-__all__ = ["LiveSession", "open_session"]
-
 _FAREWELL = 10.0  # seconds that closing waits for the process, at most
 
 

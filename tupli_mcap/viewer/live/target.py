@@ -8,8 +8,6 @@ from typing import NamedTuple
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.viewer.process import LOCAL, answers
 
-__all__ = ["Target", "parse_target"]
-
 RERUN_PORT, FOXGLOVE_PORT = 9876, 8765
 _URL = re.compile(
     r"(?P<scheme>[a-z+]+)://(?P<host>\[[0-9a-fA-F:.]+\]|[^/:\[\]@?#\s]+)(:(?P<port>\d{1,5}))?(?P<path>/\S*)?"

@@ -16,8 +16,6 @@ from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels.panel import Place, flat_values, named
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
-__all__ = ["Camera", "Grid", "HeatMap", "Picture", "value_range"]
-
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
 # By dimensions of a leaf. The viewer knows height and width by these names, and would lay other ones on their side.
 _AXES = {2: ("row", "column"), 3: ("[0]", "height", "width")}

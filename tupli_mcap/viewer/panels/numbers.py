@@ -14,8 +14,6 @@ from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels.panel import Place, flat_values, plot, send_lines
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["Rewards", "Series"]
-
 _ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
 """How an episode may end, by code, and the colour of its marker (RGBA)."""
 

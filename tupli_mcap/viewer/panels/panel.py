@@ -12,8 +12,6 @@ from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.sending import Times, send_scalars
 
-__all__ = ["PALETTE", "Panel", "Place", "flat_values", "named", "plot", "send_lines"]
-
 PALETTE: Final = (
     0x4C9BE8FF, 0xF28E2BFF, 0x59C36AFF, 0xE15759FF, 0xB07AD9FF, 0xEDC948FF,
     0x3FBFB5FF, 0xFF9DA7FF, 0xB58A6BFF, 0x8FA6C8FF, 0xA8C64DFF, 0xD264B6FF,

@@ -16,8 +16,6 @@ from tupli_mcap.viewer.names import escaped
 from tupli_mcap.viewer.panels.panel import PALETTE, Place, named, plot
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
-__all__ = ["Infos", "Lanes", "LiveInfos", "Words", "infos_of", "numbers_in"]
-
 _LONGEST = 2000  # characters of a text that is shown
 _NO_STATE = ""  # as the viewer reads it: a gap in the lane
 

@@ -21,8 +21,6 @@ from tupli_mcap.recording.recover.episodes import NewPlaces, PlannedEpisode
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore
 from tupli_mcap.recording.recover.step_runs import intersection
 
-__all__ = ["OldCameras", "frames_lost", "kept_frames"]
-
 
 class KeptFrame(NamedTuple):
     """A picture's message, and the message of its row with the new numbers; `time_ns` is that of both."""

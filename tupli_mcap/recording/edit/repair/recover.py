@@ -34,16 +34,6 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 
-__all__ = [
-    "CutEpisode",
-    "DamagedPlace",
-    "LostSteps",
-    "RecoveryReport",
-    "finish_recording",
-    "recover_recording",
-    "recovered_path",
-]
-
 
 class DamagedPlace(NamedTuple):
     """`size` bytes from `offset` on that could not be read, and why."""

@@ -27,8 +27,6 @@ from tupli_mcap.recording.edit.repair.frames import OldCameras, kept_frames
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
-__all__ = ["RECOVERED", "RepairWriter"]
-
 RECOVERED = "recovered"  # key of the episode metadata that says where the steps of a piece were
 _METADATA = {
     "uuid": re.compile("[0-9a-f]{32}"),

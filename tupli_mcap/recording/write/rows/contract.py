@@ -17,8 +17,6 @@ from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import Sink
 from tupli_mcap.mcap.container import Rows
 
-__all__ = ["BatchStore", "MovingStore", "Put", "RowStore", "StartChunks", "StepStore", "ToFile"]
-
 Put = Callable[[Any, Any, Any, Any, Any], None]
 StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
 

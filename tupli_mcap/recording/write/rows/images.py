@@ -21,9 +21,6 @@ from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["ImageRows"]
-
-
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
 # takes a fraction of the time that fields of a structured row do
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")

@@ -21,8 +21,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.spaces.exact import exact_array, leaf_value
 
-__all__ = ["CHUNKS_PER_HALF", "SingleRows"]
-
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2
 

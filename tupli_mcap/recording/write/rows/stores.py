@@ -21,8 +21,6 @@ from tupli_mcap.recording.write.rows.variable import StepLog, StepLogs
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Stores"]
-
 _LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
 
 

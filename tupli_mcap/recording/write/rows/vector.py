@@ -28,8 +28,6 @@ from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["VectorRows"]
-
 _ACTION, _REWARD, _STATE = range(3)
 _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
 _Values = list[
