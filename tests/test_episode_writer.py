@@ -155,7 +155,7 @@ def test_a_killed_process_loses_no_step(
         path, rng = tmp_path / f"{seed}.mcap", random.Random(seed)
         script = Script(SPACES[name], num_envs, seed)
         times = sum(one[0] == call for one in script.calls)
-        moment = Moment("by hand", (f"EpisodeWriter.{call}",), times=min(times, 40))
+        moment = Moment("by hand", (f"EpisodeWriter.{call}", f"Recorder.{call}"), times=min(times, 40))
         done = _die(script, SPACES[name], moment, rng, path, num_envs=num_envs, durability=durability)
         assert done < len(script.calls)
         if not path.exists():

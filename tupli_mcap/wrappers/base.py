@@ -1,4 +1,4 @@
-"""What `RecordEpisodes` for one environment and for many have in common: options, files, rotation, closing."""
+"""What those that record have in common: options, files, rotation, closing."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from tupli_mcap.recording.write.frames import FrameRecorder, VectorFrames
 from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.rotation import Rotation
-from tupli_mcap.recording.write.work import BEGUN, Recorder, Work
+from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.wrappers.benchmark import Captured
-from tupli_mcap.wrappers.labels import with_labels
 from tupli_mcap.wrappers.run import with_run
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
@@ -31,17 +30,58 @@ if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
 
-class EpisodeWrapper:
-    """Keeps the files that a wrapper records to. `step` and `reset` are the wrapper's own.
-
-    Its constructor sets `_parts` and calls `_open`; `_recorder_of` says what records into a file.
+class Recorder:
+    """What records to a file, or to one after another.
 
     Attributes:
         rotation: which files there are.
     """
 
-    env: Any
     rotation: Rotation
+    _work: Work
+
+    @property
+    def path(self) -> Path:
+        """The file that is recorded to."""
+        return self.rotation.path
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that were recorded to, in their order."""
+        return self.rotation.paths
+
+    def flush(self) -> None:
+        """Writes everything recorded so far into chunks; the journal already protects it."""
+        self._work.flush()
+
+    def close(self) -> None:
+        """Finishes the recording. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> Literal[False]:
+        self.close()
+        return False
+
+    def __getstate__(self) -> dict[str, Any]:
+        raise RecordingError(
+            f"what records to {self.path} cannot be pickled or copied; make another recorder there"
+        )
+
+
+class EpisodeWrapper(Recorder):
+    """Keeps the files that a wrapper records to. `step` and `reset` are the wrapper's own.
+
+    Its constructor sets `_parts` and calls `_open`; `_recorder_of` says what records into a file.
+    """
+
+    env: Any
     # what follows the rows of a step; not bound, for the wrapper must not hold itself
     _parts: Sequence[Callable[[Any, Any, Any], None]]
     _recorder: Any
@@ -68,7 +108,7 @@ class EpisodeWrapper:
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
         spaces.to_metadata()
         environment = type(env.unwrapped).__name__ if env.spec is None else env.spec.id
-        attachments = with_run(with_labels(captured, env, spaces, options.labels), options, environment)
+        attachments = with_run(captured.with_labels(spaces, options.labels), options, environment)
         options = replace(options, attachments=attachments)
         name = options.name or environment
         self.rotation = Rotation(path, options, format_version(spaces, options.image_format), name)
@@ -91,23 +131,13 @@ class EpisodeWrapper:
                 writer.close()
             raise
 
-    def _recorder_of(self, writer: RecordingWriter) -> Recorder:
+    def _recorder_of(self, writer: RecordingWriter) -> FileRecorder:
         """What records the episodes that go to a file."""
         raise NotImplementedError
 
     def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder | VectorFrames:
         """What records the frames that go to a file."""
         raise NotImplementedError
-
-    @property
-    def path(self) -> Path:
-        """The file that is recorded to."""
-        return self.rotation.path
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files that this wrapper has recorded to, in their order."""
-        return self.rotation.paths
 
     def _finish_step(self, taken: Any, result: Any) -> BaseException | None:
         """Everything that follows a step's rows; returns what a callback raised, which changes nothing about that.
@@ -151,10 +181,6 @@ class EpisodeWrapper:
             entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
         return entries
 
-    def flush(self) -> None:
-        """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._work.flush()
-
     def close(self, **kwargs: Any) -> None:
         """Finishes the recording, then closes the environment. Calling it twice is fine.
 
@@ -175,18 +201,6 @@ class EpisodeWrapper:
     def _when_closed(self) -> None:
         """After the files are finished."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> Literal[False]:
-        self.close()
-        return False
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise RecordingError(
-            f"a wrapper that records to {self.path} cannot be pickled or copied; wrap the environment there"
-        )
-
 
 def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
     """What a metadata callback returns, as JSON; RecordingError unless it is a dict of what JSON can hold."""
@@ -203,6 +217,12 @@ def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
         return jsonvalue.dumps_plain(dict(metadata))
     except (TypeError, ValueError) as err:
         raise RecordingError(f"metadata_callback: {err}") from err
+
+
+def drawn_seed(env: gym.Env[Any, Any]) -> int | None:
+    """The seed an environment drew by itself in a reset without one; None if it does not say."""
+    seed = getattr(env.unwrapped, "_np_random_seed", None)
+    return seed if isinstance(seed, int) and seed >= 0 else None
 
 
 def check_kind(env: object, *, vector: bool) -> None:

@@ -1,19 +1,21 @@
-"""The attachments that describe the environment of a recording: `benchmark.json`, and a pickle on request."""
+"""The attachments that describe the environment of a recording: `benchmark.json`, a pickle on request, and labels."""
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import capture, note
+from tupli_mcap.environment import capture, documented_labels, note
 from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.options import CaptureEnv
 from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 
 _PICKLE = "env.cloudpickle"
 _MAX_PICKLE = 16 << 20
@@ -24,7 +26,6 @@ class Captured:
 
     Attributes:
         attachments: name -> (media type, bytes).
-        documented: whether the recording may say what the environment's documentation says.
 
     Raises:
         RecordingError: the environment is no pickle of up to 16 MiB.
@@ -37,7 +38,7 @@ class Captured:
         given: Mapping[str, tuple[str, bytes]] | None,
     ) -> None:
         self.attachments = {} if given is None else dict(given)
-        self.documented = capture_env is not None or given is not None
+        self._env, self._documented = env, capture_env is not None or given is not None
         self._digest = ""  # of a pickle that the recording would carry
         self._began = 0
         if given is not None or capture_env is None:
@@ -54,6 +55,15 @@ class Captured:
         self.attachments[_PICKLE] = ("application/octet-stream", record.pickle)
         self._digest, self._began = record.digest, time.time_ns()
 
+    def with_labels(
+        self, spaces: StepLayout, given: Mapping[str, Sequence[str]] | None
+    ) -> dict[str, tuple[str, bytes]]:
+        """What was captured, and the labels that were given or that the environment documents, if there are any."""
+        if LABELS_NAME in self.attachments:
+            return self.attachments
+        documented = documented_labels(self._env) if self._documented else Labels.none()
+        return with_labels(self.attachments, spaces, given, documented)
+
     def trust_stored(self, writer: RecordingWriter) -> None:
         """Signs a pickle that the writer has just stored as this user's own, to be rebuilt without a question.
 
@@ -64,6 +74,17 @@ class Captured:
             with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
                 if not trust.is_trusted(self._digest):
                     trust.trust(self._digest)
+
+
+def with_labels(
+    attachments: Mapping[str, tuple[str, bytes]],
+    spaces: StepLayout,
+    given: Mapping[str, Sequence[str]] | None,
+    documented: Labels,
+) -> dict[str, tuple[str, bytes]]:
+    """The attachments, and the labels that were given or are documented, if there are any."""
+    labels = chosen_labels(given or {}, spaces.leaves, documented)
+    return {**attachments, **({LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json())} if labels else {})}
 
 
 def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym.Env[Any, Any]:

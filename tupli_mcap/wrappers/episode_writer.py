@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -35,12 +35,14 @@ from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
-from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
+from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.wrappers.base import Recorder
+from tupli_mcap.wrappers.benchmark import with_labels
 from tupli_mcap.wrappers.run import with_run
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
 
 
-class EpisodeWriter:
+class EpisodeWriter(Recorder):
     """Records episodes without an environment: of robots, teleoperation, simulators.
 
         with EpisodeWriter("run.mcap", observation_space, action_space) as writer:
@@ -98,10 +100,7 @@ class EpisodeWriter:
             raise RecordingError(f"num_envs: expected a positive number or None, found {num_envs!r:.80}")
         spaces = with_stacks(None, StepLayout(observation_space, action_space, reward_space), stack_size)
         spaces.to_metadata()
-        named = chosen_labels(labels or {}, spaces.leaves, Labels.none())
-        given = dict(attachments or {})
-        if named:
-            given[LABELS_NAME] = (LABELS_MEDIA_TYPE, named.to_json())
+        given = with_labels(attachments or {}, spaces, labels, Labels.none())
         options = RecordOptions(
             compression=compression, mode=mode, benchmark_id=benchmark_id, capture_env=None, attachments=given,
             flush_seconds=flush_seconds, journal_dir=journal_dir, chunk_size=chunk_size, durability=durability,
@@ -110,11 +109,11 @@ class EpisodeWriter:
         )  # fmt: skip
         options = replace(options, attachments=with_run(given, options, ""))
         self._spaces, self._num_envs = spaces, None if num_envs is None else int(num_envs)
-        self._rotation = Rotation(path, options, format_version(spaces, image_format), name or "run")
+        self.rotation = Rotation(path, options, format_version(spaces, image_format), name or "run")
         self._work = Work()
         self._discarded: dict[Path, list[int]] = {}
         self._compression, self._is_plain = compression, options.is_plain
-        writer = self._rotation.open_first()
+        writer = self.rotation.open_first()
         try:
             self._record_to(writer)
             writer.check_spaces(spaces, self._num_envs or 1, vector=num_envs is not None)
@@ -127,16 +126,6 @@ class EpisodeWriter:
         self._writer = writer
         self._streams = _Streams(writer, self._spaces, self._num_envs)
         self._work.recorders.append(self._streams)
-
-    @property
-    def path(self) -> Path:
-        """The file that is recorded to."""
-        return self._rotation.path
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files that this writer has recorded to, in their order."""
-        return self._rotation.paths
 
     @property
     def closed(self) -> bool:
@@ -172,7 +161,7 @@ class EpisodeWriter:
         entries = _metadata(metadata)
         with _Whole(self._work, self._writer):
             stream.end()
-            if self._rotation.is_due(self._writer) and not self._streams.is_running:
+            if self.rotation.is_due(self._writer) and not self._streams.is_running:
                 self._go_on()
                 stream = self._streams.streams[env]
             stream.begin(facts, entries)
@@ -180,7 +169,7 @@ class EpisodeWriter:
     def _go_on(self) -> None:
         """In the next file."""
         before, left = self._streams, self._writer
-        self._record_to(self._work.ask(self._rotation.open_next))
+        self._record_to(self._work.ask(self.rotation.open_next))
         self._writer.layout = left.layout
         before.close()
         self._work.recorders.remove(before)
@@ -298,16 +287,7 @@ class EpisodeWriter:
                 self._discarded.setdefault(self._writer.path, []).append(number)
             self._writer.sync_step()
 
-    def flush(self) -> None:
-        """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._work.flush()
-
     def close(self) -> None:
-        """Finishes the recording. Calling it twice is fine.
-
-        Raises:
-            RecordingError: the disk refuses; everything that was recorded is safe.
-        """
         _close(self._work, self._discarded, self._compression)
         self._finalizer.detach()
 
@@ -334,18 +314,6 @@ class EpisodeWriter:
         if not stream.is_running:
             raise StepError(f"no episode is running{_in(self._num_envs, env)}; call begin() first")
         return stream
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> Literal[False]:
-        self.close()
-        return False
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise RecordingError(
-            f"what records to {self.path} cannot be pickled or copied; make another one there"
-        )
 
 
 class _Whole:

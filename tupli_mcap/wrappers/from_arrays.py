@@ -102,31 +102,44 @@ def write_rollout(
         SpaceError: a space that cannot be recorded.
         RecordingError: the file exists, is being written, or cannot be written.
     """
-    states = _one_of("states", states, "observations", observations)
-    terminals = _one_of("terminals", terminals, "terminations", terminations)
-    timeouts = _one_of("timeouts", timeouts, "truncations", truncations)
-    next_states = _one_of("next_states", next_states, "next_observations", next_observations)
-    for name, given in (("states", states), ("actions", actions), ("rewards", rewards)):
-        if given is None:
-            raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
-    data = _Given(states, actions, rewards, terminals, timeouts, next_states, final_states, infos, metadata)
-    if isinstance(rewards, list | tuple) and rewards and _array(rewards[0]).ndim:
-        lead, count, first = 1, None, _episode(data, 0)
-        parts: Iterable[_Part] = _episodes(data)
-    else:
-        first = data = _Given._make([*(map_arrays(one, _array) for one in data[:-1]), metadata])
-        lead = _lead(data.rewards, reward_space)
-        count = data.rewards.shape[1] if lead == 2 else None
-        parts = list(_streams(data, lead, _mode(autoreset)))  # looked at before anything is written
+    given = _Given(
+        _one_of("states", states, "observations", observations), actions, rewards,
+        _one_of("terminals", terminals, "terminations", terminations),
+        _one_of("timeouts", timeouts, "truncations", truncations),
+        _one_of("next_states", next_states, "next_observations", next_observations),
+        final_states, infos, metadata,
+    )  # fmt: skip
+    rollout = _rollout_of(given, autoreset, reward_space)
+    first, lead, count = rollout.first, rollout.lead, rollout.num_envs
     observations = observation_space or _space(first.states, lead, "states")
-    actions = action_space or _space(first.actions, lead, "actions")
     with EpisodeWriter(
-        path, observations, actions, reward_space=reward_space, num_envs=count, labels=labels,
-        attachments=attachments, compression=compression, mode=mode, benchmark_id=benchmark_id,
-        chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
+        path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
+        num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
+        benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
     ) as writer:  # fmt: skip
-        for part in parts:
+        for part in rollout.parts:
             _write(writer, part)
+
+
+class _Rollout(NamedTuple):
+    """What is to be written; `first` has values whose axes before those of one step are `lead` many."""
+
+    parts: Iterable[_Part]
+    first: _Given
+    lead: int
+    num_envs: int | None
+
+
+def _rollout_of(given: _Given, autoreset: Any, reward_space: gym.Space[Any] | None) -> _Rollout:
+    for name, value in zip(given._fields[:3], given, strict=False):
+        if value is None:
+            raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
+    if isinstance(given.rewards, list | tuple) and given.rewards and _array(given.rewards[0]).ndim:
+        return _Rollout(_episodes(given), _episode(given, 0), 1, None)
+    given = _Given._make([*(map_arrays(one, _array) for one in given[:-1]), given.metadata])
+    lead = _lead(given.rewards, reward_space)
+    parts = list(_streams(given, lead, _mode(autoreset)))  # looked at before anything is written
+    return _Rollout(parts, given, lead, given.rewards.shape[1] if lead == 2 else None)
 
 
 class _Given(NamedTuple):

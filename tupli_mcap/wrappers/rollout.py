@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +15,11 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError
-from tupli_mcap.journal.seals import Durability
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.options import (
     RENDER_MODE,
-    Capture,
-    CaptureEnv,
     Mode,
-    RecordInfo,
     RecordOptions,
 )
 from tupli_mcap.wrappers.single import RecordEpisodes
@@ -60,21 +56,8 @@ def record_rollouts(
     seed: int | None = None,
     num_envs: int = 1,
     policy: Policy | None = None,
-    mode: Mode = "x",
-    compression: str = "zstd",
-    record_info: RecordInfo = False,
-    durability: Durability = "os",
-    live: str | None = None,
-    frames: bool | int = False,
-    capture_env: CaptureEnv = "spec",
-    max_bytes: int | None = None,
-    max_seconds: float | None = None,
-    name: str | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    tags: Sequence[str] = (),
-    split: str = "",
-    capture: Capture = "all",
     progress: Callable[[int], None] | None = None,
+    **options: Any,
 ) -> RolloutSummary:
     """Records `steps` steps of a registered environment into the MCAP file `path`.
 
@@ -85,10 +68,8 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        mode, compression, record_info, durability, live, capture_env, max_bytes, max_seconds, name, metadata, tags,
-            split, capture: as `RecordEpisodes` has them.
-        frames: as `RecordEpisodes` has it; the environment is made with render_mode="rgb_array".
         progress: called with the number of steps so far, a few hundred times.
+        options: those of `RecordEpisodes`; for `frames` the environment is made with render_mode="rgb_array".
 
     Raises:
         RecordingError: the environment cannot be made, the policy or the environment failed (what was
@@ -98,20 +79,14 @@ def record_rollouts(
     if steps < 1 or num_envs < 1:
         raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
     began = time.perf_counter()
-    options = RecordOptions(
-        mode=mode, compression=compression, record_info=record_info, durability=durability, live=live,
-        frames=frames, capture_env=capture_env, max_bytes=max_bytes, max_seconds=max_seconds,
-        name=name, metadata=metadata, tags=tags, split=split, capture=capture,
-    )  # fmt: skip
+    asked = RecordOptions(**options)
     rollout = _Rollout(steps, seed, policy, _every(max(1, steps // _REPORTS), progress))
-    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if options.every else None)) as made:
-        wrapped = _wrapped(made, path, options)
+    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if asked.every else None)) as made:
+        is_vector = isinstance(made, gym.vector.VectorEnv)
+        wrapped: Any = (RecordVectorEpisodes if is_vector else RecordEpisodes)(made, path, **options)
         known = wrapped._writer.index.count
-        with _closing(wrapped, mode):
-            if isinstance(wrapped, RecordEpisodes):
-                done = _run(wrapped, rollout)
-            else:
-                done = _run_vector(wrapped, rollout)
+        with _closing(wrapped, asked.mode):
+            done = (_run_vector if is_vector else _run)(wrapped, rollout)
     return _summary(wrapped.paths, known, done, time.perf_counter() - began)
 
 
@@ -122,14 +97,6 @@ class _Rollout(NamedTuple):
     seed: int | None
     policy: Policy | None
     report: Callable[[int], None]
-
-
-def _wrapped(
-    env: gym.Env[Any, Any] | gym.vector.SyncVectorEnv, path: str | os.PathLike[str], options: RecordOptions
-) -> RecordEpisodes | RecordVectorEpisodes:
-    if isinstance(env, gym.vector.VectorEnv):
-        return RecordVectorEpisodes(env, path, **vars(options))
-    return RecordEpisodes(env, path, **vars(options))
 
 
 def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> RolloutSummary:
@@ -167,9 +134,9 @@ def load_policy(name: str) -> Policy:
     return policy
 
 
-def _make(
-    env_id: str, num_envs: int, render_mode: str | None
-) -> gym.Env[Any, Any] | gym.vector.SyncVectorEnv:
+def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:
+    """The environment, or a vector environment of several."""
+
     def make() -> gym.Env[Any, Any]:
         return gym.make(env_id) if render_mode is None else gym.make(env_id, render_mode=render_mode)
 

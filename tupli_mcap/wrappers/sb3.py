@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +15,8 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.wrappers.base import wrong_kind
+from tupli_mcap.recording.write.work import Work
+from tupli_mcap.wrappers.base import Recorder, wrong_kind
 from tupli_mcap.wrappers.vector import RecordEpisodes
 
 try:
@@ -35,7 +35,7 @@ _FINAL = "terminal_observation"
 _TIMEOUT = "TimeLimit.truncated"
 
 
-class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are not followed
+class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its types are not followed
     """Records every sub-environment of a Stable-Baselines3 `VecEnv` into the MCAP file `path`.
 
         venv = VecRecordEpisodes(make_vec_env("CartPole-v1", n_envs=4), "runs/")
@@ -69,17 +69,8 @@ class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are n
         self._shown = StableBaselinesVecEnv(venv)
         self._recorder = _Recorder(self._shown, path, **options)
         self._shown.tells_infos = self._recorder.uses_infos
+        self.rotation, self._work = self._recorder.rotation, self._recorder.work
         self._actions: Any = None
-
-    @property
-    def path(self) -> Path:
-        """The file that is recorded to."""
-        return self._recorder.path
-
-    @property
-    def paths(self) -> list[Path]:
-        """The files that this wrapper has recorded to, in their order."""
-        return self._recorder.paths
 
     def step_async(self, actions: Any) -> None:
         self._actions = actions
@@ -92,10 +83,6 @@ class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are n
     def reset(self) -> Any:
         return self._recorder.reset()[0]
 
-    def flush(self) -> None:
-        """Writes everything recorded so far into chunks; the journal already protects it."""
-        self._recorder.flush()
-
     def close(self) -> None:
         """Finishes the recording, then closes the environments. Calling it twice is fine.
 
@@ -103,13 +90,6 @@ class VecRecordEpisodes(VecEnvWrapper):  # type: ignore[misc]  # its types are n
             RecordingError: the disk refuses; everything that was recorded is safe.
         """
         self._recorder.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> Literal[False]:
-        self.close()
-        return False
 
 
 class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
@@ -195,6 +175,11 @@ class _Recorder(RecordEpisodes):
     def uses_infos(self) -> bool:
         """True if infos of steps are recorded, or given to a callback."""
         return self._watches
+
+    @property
+    def work(self) -> Work:
+        """The mark of unfinished work."""
+        return self._work
 
     def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
         facts = super()._facts(self._seeds, unseeded, options, infos)

@@ -33,8 +33,7 @@ from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, metadata_of
-from tupli_mcap.wrappers.seeds import drawn_seed
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of
 
 
 class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):

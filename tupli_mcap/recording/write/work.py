@@ -32,7 +32,7 @@ CLOSED: Final = 3
 """The files are finished."""
 
 
-class Recorder(Protocol):
+class FileRecorder(Protocol):
     """Records the episodes that go to one file."""
 
     @property
@@ -57,7 +57,7 @@ class Work:
 
     def __init__(self) -> None:
         self.state = DONE
-        self.recorders: list[Recorder] = []
+        self.recorders: list[FileRecorder] = []
 
     def ask(self, function: Callable[..., T], *args: Any) -> T:
         """Calls what is not the recorder's within a step: a callback, or what renders."""
