@@ -23,6 +23,7 @@ from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.frames import VectorFrames
+from tupli_mcap.recording.write.infos import final_info_of, info_of
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
@@ -32,7 +33,6 @@ from tupli_mcap.recording.write.options import (
     StepCallback,
 )
 from tupli_mcap.recording.write.vector import VectorRecorder
-from tupli_mcap.recording.write.vector_infos import final_info_of, info_of
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback

@@ -2,8 +2,8 @@
 
 single, vector                               record the episodes of one environment, and of many
 rows/                                        the rows that are not in the file, a store for each channel
-episodes, infos, vector_infos, frames        put what else is recorded into the journal
-writer, areas                                the file and its journal; the journal's areas
+episodes, infos, frames                      put what else is recorded into the journal
+writer, journals                             the file and its journal; journals that others have left
 resume                                       goes on in a recording that exists
 rotation                                     what the files are called, and when the next one begins
 work                                         the mark of unfinished work, for interruptions

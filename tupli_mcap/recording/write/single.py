@@ -7,6 +7,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
@@ -21,9 +23,18 @@ from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, 
 
 
 def decide_layout(
-    spaces: StepLayout, states: list[Any], actions: list[Any], rewards: list[Any], recorded: StepLayout | None
+    spaces: StepLayout,
+    states: list[Any],
+    actions: list[Any],
+    rewards: list[Any],
+    recorded: StepLayout | None,
+    *,
+    batched: bool = False,
 ) -> StepLayout:
     """The layout of a recording from its first values; on append, the one the file has.
+
+    Args:
+        batched: the values are batches; their shapes are checked when they are stored.
 
     Raises:
         StepError: a value whose structure, shape or kind differs from its space.
@@ -38,8 +49,9 @@ def decide_layout(
                 inner[leaf.name] = variable_dtypes(leaf.space, values, leaf.path)
                 continue
             default_reward = leaf.name == "reward" and spaces.reward_space is None
+            values = [np.asarray(value) for value in values] if batched else values
             dtype = leaf.dtype if default_reward else decide_dtype(leaf, values)
-            for value in values:
+            for value in () if batched else values:
                 exact_array(value, dtype, leaf.shape, leaf.path)
             dtypes[leaf.name] = dtype
     return StepLayout(

@@ -19,14 +19,13 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success
 from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.infos import InfoRecorder, check_infos, final_states, info_of, reset_info_of
 from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.single import decide_layout
-from tupli_mcap.recording.write.vector_infos import check_infos, final_states, info_of, reset_info_of
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import decide_dtype, leaf_value, shorten
+from tupli_mcap.spaces.exact import shorten
 
 _BOOL = np.dtype(np.bool_)
 
@@ -135,7 +134,10 @@ class VectorRecorder:
             raise self._needs_reset()
         resets = self._autoreset
         try:
-            rewards, terminals, timeouts = self._numbers_of(rewards, terminals, timeouts)
+            # the rewards' shape is checked when they are stored
+            rewards, terminals, timeouts = (
+                np.asarray(rewards), self._flag("terminal", terminals), self._flag("timeout", timeouts),
+            )  # fmt: skip
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
             begins = self._writer.vector is None
@@ -202,10 +204,6 @@ class VectorRecorder:
             f"{refused if self._refused else 'there was no reset yet'}; call env.reset() to go on"
         )
 
-    def _numbers_of(self, rewards: Any, terminals: Any, timeouts: Any) -> tuple[Array, Array, Array]:
-        """Rewards and flags as arrays; the rewards' shape is checked when they are stored."""
-        return np.asarray(rewards), self._flag("terminal", terminals), self._flag("timeout", timeouts)
-
     def _flag(self, name: str, values: Any) -> Array:
         if values.__class__ is np.ndarray and values.dtype is _BOOL and values.shape == self._shape:
             flag: Array = values
@@ -263,18 +261,13 @@ class VectorRecorder:
                 self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
 
     def _begin(self, actions: Any, states: Any, rewards: Array) -> BatchStore:
-        if self._spaces.constant:
-            batches = [self._first, states], [actions], [rewards]
-            layout = self._batch_layout(*batches)
+        spaces, known, first = self._spaces, self._writer.layout, self._first
+        if spaces.constant:
+            layout = decide_layout(spaces, [first, states], [actions], [rewards], known, batched=True)
         else:
-            firsts = [*self._each(self._observations, self._first), *self._each(self._observations, states)]
-            layout = decide_layout(
-                self._spaces,
-                firsts,
-                self._each(self._actions, actions),
-                list(rewards),
-                self._writer.layout,
-            )
+            firsts = [*self._each(self._observations, first), *self._each(self._observations, states)]
+            each = self._each(self._actions, actions)
+            layout = decide_layout(spaces, firsts, each, list(rewards), known)
         schema = None if self._infos is None else self._infos.codec.schema()
         self._writer.begin(layout, self._n, vector=True, info_schema=schema)
         store = self._writer.vector
@@ -282,27 +275,6 @@ class VectorRecorder:
         store.put_state(self._first)
         self._first = None
         return store
-
-    def _batch_layout(self, states: list[Any], actions: list[Any], rewards: list[Any]) -> StepLayout:
-        """`decide_layout` on whole batches: only dtypes are decided, shapes are checked when a batch is stored."""
-        if self._writer.layout is not None:
-            return self._writer.layout
-        dtypes = {}
-        for leaves, roots in (
-            (self._spaces.state, states),
-            (self._spaces.action, actions),
-            (self._spaces.reward, rewards),
-        ):
-            for leaf in leaves:
-                if leaf.dtype is None:
-                    continue
-                if leaf.name == "reward" and self._spaces.reward_space is None:
-                    continue
-                dtypes[leaf.name] = decide_dtype(leaf, [np.asarray(leaf_value(root, leaf)) for root in roots])
-        return StepLayout(
-            self._spaces.observation_space, self._spaces.action_space, self._spaces.reward_space, dtypes,
-            stacks=self._spaces.stacks,
-        )  # fmt: skip
 
     def _finals(self, done: Array, states: Any, infos: Any) -> dict[int, Any]:
         """The final states of a same-step autoreset, which may show only now."""

@@ -20,15 +20,7 @@ import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
 from tupli_mcap.journal.derive import StartedEpisode
-from tupli_mcap.journal.file import (
-    Area,
-    Journal,
-    journal_aside,
-    journal_in,
-    journal_info,
-    journal_path,
-    owner_among,
-)
+from tupli_mcap.journal.file import Area, Journal
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
@@ -38,17 +30,24 @@ from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.recover.prefix import metadata_at
-from tupli_mcap.recording.write.areas import plan_areas
 from tupli_mcap.recording.write.compressing import ChunkWorker
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts
+from tupli_mcap.recording.write.journals import (
+    is_left,
+    journal_place,
+    remove_left,
+    remove_of_killed,
+    remove_unnamed,
+    remove_unstarted,
+)
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
-from tupli_mcap.recording.write.rows.stores import Stores
+from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
 
-RECORDING_METADATA = "tupli_mcap.recording"
 _MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the journal must not come to LAST_ROW
 
 
@@ -108,7 +107,7 @@ class RecordingWriter:
         # the recording whose journal a writer that was killed has left in this one's place
         self.replaced = ""
         self._replaces = ""  # the recording that this one takes the place of with its first step
-        self.journal_place = self._choose_journal_place()
+        self.journal_place = journal_place(self._place, options.journal_dir, self.uuid)
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
@@ -136,14 +135,14 @@ class RecordingWriter:
             self._is_cut = False
             resume(self)
             self._old_journal = self.journal_place
-            self._remove_journal_of(self.replaced)
-            self._remove_journal_without_recording(self.uuid)
+            remove_left(self._place, self.replaced)
+            remove_unstarted(self._place, self.uuid)
             return
         there = _metadata_of(self._place) if self.options.mode == "w" else {}
         self._replaces = there.get("uuid", "")
-        self._remove_journal_of(there.get("replaced", ""))  # whose file is gone
-        self._remove_journal_without_recording(self._replaces)
-        if any(owner_among(place, [self._replaces]) for place in self._journals_of(self._replaces)):
+        remove_left(self._place, there.get("replaced", ""))  # whose file is gone
+        remove_unstarted(self._place, self._replaces)
+        if is_left(self._place, self._replaces):
             self.replaced = self._replaces
         try:
             os.ftruncate(self.lock.fd, 0)
@@ -213,7 +212,7 @@ class RecordingWriter:
         """The file that this one replaces goes when this one has a step."""
         if self.lock.replaces:
             self.lock.publish()
-            self._remove_journal_of(self.replaced)
+            remove_left(self._place, self.replaced)
             if self._durable:
                 sync_directory(self._place.parent)
 
@@ -464,12 +463,6 @@ class RecordingWriter:
         }
         return Journal(self.journal_place, list(areas), description)
 
-    def _choose_journal_place(self) -> Path:
-        directory = self.options.journal_dir
-        if directory is None:
-            return journal_path(self._place)
-        return journal_in(os.path.realpath(directory), self._place, self.uuid)
-
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal.
 
@@ -492,7 +485,7 @@ class RecordingWriter:
         if self.journal is not None:
             self.journal.remove()
         elif self._old_journal is not None:
-            self._remove_old_journal(self._old_journal, self.uuid)
+            remove_of_killed(self._old_journal, self.uuid)
         self.closed = True
         self.let_go()
 
@@ -536,7 +529,7 @@ class RecordingWriter:
         is_there = os.path.realpath(self.path) == str(self._place)
         try:
             self.let_go()
-            self._remove_unnamed(self.journal_place)
+            remove_unnamed(self.journal_place)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
                 finish_recording(self.path if is_there else self._place, options)
@@ -550,36 +543,6 @@ class RecordingWriter:
         self.closed = True
         self.let_go()
 
-    def _remove_old_journal(self, place: Path, uuid: str) -> None:
-        """What a killed writer left of its journal, and of one that was not in its place yet."""
-        with contextlib.suppress(OSError):
-            if owner_among(place, [uuid]):
-                place.unlink()
-        self._remove_unnamed(place)
-
-    def _remove_unnamed(self, place: Path) -> None:
-        with contextlib.suppress(OSError):
-            place.with_name(f"{place.name}.tmp").unlink()
-
-    def _remove_journal_of(self, uuid: str) -> None:
-        """The journal of a recording that this one, or the one before it, took the place of."""
-        for place in self._journals_of(uuid):
-            with contextlib.suppress(OSError):
-                if owner_among(place, [uuid]):
-                    place.unlink()
-
-    def _journals_of(self, uuid: str) -> tuple[Path, Path]:
-        """Where the journal of a recording at this path may lie, if it lies beside it."""
-        beside = journal_path(self._place)
-        return beside, journal_aside(beside, uuid)
-
-    def _remove_journal_without_recording(self, uuid: str) -> None:
-        """That of a recording that was to take the place of this one, which is still there: it never had a step."""
-        place = journal_path(self._place)
-        with contextlib.suppress(OSError, FormatError):
-            if uuid and journal_info(place).get("replaces") == uuid:
-                place.unlink()
-
     def _is_new_and_empty(self) -> bool:
         return self.options.mode != "a" and not self._keep_empty
 
@@ -589,11 +552,11 @@ class RecordingWriter:
         if self.journal is not None:
             self.journal.remove()
         with contextlib.suppress(OSError):
-            self._remove_unnamed(self.journal_place)
+            remove_unnamed(self.journal_place)
             if self._is_cut:
                 self.lock.unlink()
             if self._old_journal is not None:
-                self._remove_old_journal(self._old_journal, self.uuid)
+                remove_of_killed(self._old_journal, self.uuid)
         self.closed = True
         self.let_go()
 

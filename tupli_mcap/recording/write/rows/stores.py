@@ -1,4 +1,4 @@
-"""What the rows of a recording go into on their way to chunks: a store for each channel, in one journal."""
+"""What the rows of a recording go into on their way to chunks: a store for each channel, in an area of one journal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tupli_mcap.journal.file import FRAMES_AREA, Journal
+from tupli_mcap.journal.file import FRAMES_AREA, Area, Journal, LogArea, RowArea
 from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.journal.rows import RowDeriver
+from tupli_mcap.journal.rows import RowDeriver, rows_per_half
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import Channels
@@ -16,12 +16,54 @@ from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.recording.write.rows.contract import MovingStore, RowStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
-from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.single import CHUNKS_PER_HALF, SingleRows
 from tupli_mcap.recording.write.rows.variable import StepLog, StepLogs
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.spaces.leaves import Leaf
 
+_HALF = 8 << 20  # bytes of images in half a journal
 _LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
+
+
+def plan_areas(
+    layout: StepLayout,
+    n: int,
+    size: int,
+    step_capacity: int,
+    *,
+    vector: bool,
+    infos: bool,
+    frames: bool = False,
+) -> list[Area]:
+    """The areas of a journal for `n` sub-environments (of a `vector` environment) and chunks of `size` bytes.
+
+    `step_capacity` is the least room (bytes) for steps of variable size.
+    """
+    if n > 1:  # one chunk a sub-environment: smaller ones, but never below 64 KiB
+        size = max(64 * 1024, size // n)
+    areas: list[Area] = []
+    if not layout.constant:
+        areas += [LogArea(f"steps/{i}", max(size, step_capacity), 2) for i in range(n)]
+    else:
+        row = layout.step_message.record_size
+        chunks = 1 if vector else CHUNKS_PER_HALF
+        areas.append(RowArea("steps", row, chunks * rows_per_half(row, size), n))
+    for leaf in layout.images:
+        row = layout.image_messages[leaf.name].dtype.itemsize
+        # of a stack, most rows store one frame
+        stored = row // leaf.stored_shape[0] if leaf.kind == "stack" else row
+        # some images a chunk: what is done once a chunk takes as long for few of them as for many; of many
+        # sub-environments fewer, for the room that their journals take
+        some, within = (32, 3 << 20) if n == 1 else (16, 2 << 20)
+        rows = rows_per_half(stored, max(size, min(some * stored, within)))
+        rows = max(1, min(rows, _HALF // row))
+        areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
+    areas.append(LogArea("events", 512 * 1024))
+    if infos:
+        areas.append(LogArea("info", size))
+    if frames:  # pictures are large: a few a chunk
+        areas += [LogArea(f"{FRAMES_AREA}{i}", 4 * size) for i in range(n)]
+    return areas
 
 
 class Stores:
