@@ -28,7 +28,7 @@ from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording, finish_recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
-from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 

@@ -1,8 +1,7 @@
 """One recording, one `.mcap` file: written, appended to, read, recovered, rewritten.
 
 recording, episode, frames    `Recording`, and what it gives; `verbs` are those that it has in common with a dataset
-opened                        what `Recording` is built on: an open file whose structure is checked
-open, contents                opening a file: everything that is known of it then
+opened, contents              what `Recording` is built on: an open file, and everything that is known of it then
 index, limits                 the episode index, and whether it can be true
 channels                      the channels that a layout needs
 description, series           what `info` shows

@@ -1,8 +1,10 @@
-"""Opening a recording: the file is read as far as its summary and index, and checked before anything is allocated."""
+"""Opening a recording: the file is read as far as its summary and index, or recovered in memory, and checked before
+anything is allocated."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -13,18 +15,26 @@ from mcap.records import Channel
 
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
-from tupli_mcap.mcap.records import BODY, read_attachment
+from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.records import BODY, read_attachment, read_metadata
 from tupli_mcap.mcap.source import Source, open_source
+from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summary
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import ColumnReader
-from tupli_mcap.recording.contents import Contents, step_channels
+from tupli_mcap.recording.contents import (
+    RECORDING_METADATA,
+    REPEATED_METADATA,
+    Contents,
+    check_metadata,
+    step_channels,
+)
 from tupli_mcap.recording.frames import Cameras
-from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_episodes, check_rows
-from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_chunks, check_episodes, check_rows
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.remote import is_url
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
@@ -32,6 +42,8 @@ from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
 
 CACHE_BYTES = 512 << 20
+_ATTEMPTS = 5
+_PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
 
 
 class AttachmentInfo(NamedTuple):
@@ -315,3 +327,62 @@ def _spaces_of(channel: Channel) -> dict[str, str]:
 def _absolute(source: str | os.PathLike[str]) -> str:
     name = os.fspath(source)
     return name if is_url(name) else os.path.abspath(name)  # noqa: PTH100 - links stay
+
+
+# ---- the contents: by the summary, or by recovery in memory
+
+
+def read_contents(source: Source) -> Contents:
+    """Reads a finished file by its summary, another by recovery; anew if a writer changes it meanwhile.
+
+    Raises:
+        FormatError: no MCAP file, no recording of ours, or damaged.
+    """
+    for _ in range(_ATTEMPTS):
+        size = source.size
+        try:
+            return _read_contents(source)
+        except FormatError:
+            source.refresh()
+            if source.size == size and (source.path is None or not is_locked(source.path)):
+                raise
+        time.sleep(_PAUSE)
+    return _read_contents(source)
+
+
+def _read_contents(source: Source) -> Contents:
+    if not has_summary(source):
+        check_magic(source)
+        from tupli_mcap.recording.recover.find_journal import find_journal
+        from tupli_mcap.recording.recover.unfinished import recover_contents
+
+        journal = find_journal(source)  # a writer that closed in between has left a summary, and no journal
+        if not has_summary(source):
+            return recover_contents(source, journal)
+    summary = read_summary(source)
+    # the one at the end where it is there, so that all that is read here lies at the end of the file
+    place = summary.metadata.get(REPEATED_METADATA, summary.metadata.get(RECORDING_METADATA))
+    if place is None:
+        raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
+    metadata = check_metadata(source, read_metadata(source, place))
+    if INDEX_NAME not in summary.attachments:
+        raise FormatError(
+            f"{source.name}: the recording has no episode index {INDEX_NAME!r}; recover it into a new file"
+        )
+    attachment = summary.attachments.pop(INDEX_NAME)
+    index = EpisodeIndex.decode(read_attachment(source, attachment), source.name)
+    if len(index.chunks) != summary.chunks:
+        raise FormatError(
+            f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}"
+        )
+    check_chunks(index.chunks, attachment.offset, source.name)
+    return Contents(
+        metadata,
+        summary.schemas,
+        summary.channels,
+        summary.attachments,
+        [place for place in summary.metadata.values() if place.offset < attachment.offset],
+        index.chunks,
+        index=index,
+        data_end=attachment.offset,
+    )

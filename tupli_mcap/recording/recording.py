@@ -91,14 +91,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def episode_start(self, i: int) -> EpisodeStart:
         """The `/episode_start` message of episode `i`."""
-        row = self.index[i]
-        (body,) = self._store.bodies(self._channel(EPISODE_START), int(row["start_row"]), 1)
-        start = EpisodeStart.decode(body)
-        if start.episode != row["episode"]:
-            raise FormatError(
-                f"{self.name}: expected the start of episode {row['episode']}, found {start.episode}"
-            )
-        return start
+        return self.episode_starts([i])[0]
 
     @property
     def seeds(self) -> list[int | None]:

@@ -12,7 +12,6 @@ from mcap.records import Channel
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
@@ -184,13 +183,8 @@ class _Checker:
 
     def _messages(self, topic: str) -> Iterator[tuple[int, int, memoryview]]:
         """(row, log_time, body) of a channel's messages."""
-        channel, row = self._topics.get(topic, 0), 0
         try:
-            for chunk in self._store.chunks(channel):
-                data = memoryview(self._store.load(chunk, keep=False))
-                for time, body in messages(data):
-                    yield row, time, body
-                    row += 1
+            yield from self._store.all_messages(self._topics.get(topic))
         except FormatError as err:
             self._error("rows", _plain(err, self._recording), channel=topic)
 

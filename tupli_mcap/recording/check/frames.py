@@ -6,7 +6,6 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import messages
 from tupli_mcap.messages.frames import FRAME_LAYOUT, CameraTopics, decode_frame
 from tupli_mcap.messages.images.pictures import format_of
 from tupli_mcap.recording.check.report import Findings
@@ -79,14 +78,10 @@ class _Pair:
         return rows["#log_time"].astype(np.int64)
 
     def _pictures(self, channel: int, times: Array) -> None:
-        row = 0
-        for chunk in self._store.chunks(channel):
-            data = memoryview(self._store.load(chunk, keep=False))
-            for time, body in messages(data):
-                why = self._defect(body, time, int(times[row]) if row < len(times) else None)
-                if why:
-                    self._error(f"row {row} {why}", self._topics.camera)
-                row += 1
+        for row, time, body in self._store.all_messages(channel):
+            why = self._defect(body, time, int(times[row]) if row < len(times) else None)
+            if why:
+                self._error(f"row {row} {why}", self._topics.camera)
 
     def _defect(self, body: memoryview, log_time: int, pair_time: int | None) -> str:
         """What is wrong with a picture's message; empty if nothing is."""

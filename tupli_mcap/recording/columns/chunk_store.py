@@ -20,7 +20,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import message_places
+from tupli_mcap.mcap.chunk_records import message_places, messages
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.crc import crc32
@@ -425,10 +425,17 @@ class ChunkStore:
             _check_sequence(heads["sequence"], int(self.table["first"][i]), where)
         return found
 
-    def messages(self, i: int) -> list[list[int]]:
-        """The same as a list of [start, end]."""
-        found: list[list[int]] = self.records(i)[1].tolist()
-        return found
+    def all_messages(self, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
+        """(row, log_time, body) of the messages of a channel, of which no chunk is kept; none if it is None.
+
+        Raises:
+            FormatError: a chunk is damaged; the messages before it were given out.
+        """
+        row = 0
+        for chunk in [] if channel is None else self.chunks(channel):
+            for log_time, body in messages(memoryview(self.load(chunk, keep=False))):
+                yield row, log_time, body
+                row += 1
 
     def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
         """The CDR bodies of messages of a channel of variable layout."""

@@ -60,6 +60,6 @@ def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtyp
     first = int(store.table[chunk]["first"])
     if dtype is not None:
         return even_rows(channel, first, data, store.rows(chunk, dtype, keep=False))
-    starts = [start for start, _ in store.messages(chunk)]
+    starts = store.records(chunk)[1][:, 0].tolist()
     times = [int.from_bytes(memoryview(data)[start + 15 : start + 23], "little") for start in starts]
     return Rows(channel, first, data, np.array(starts, np.uint64), np.array(times, np.uint64))

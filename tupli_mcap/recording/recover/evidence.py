@@ -13,7 +13,7 @@ from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunk_records import message_headers, messages
+from tupli_mcap.mcap.chunk_records import message_headers
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.mcap.source import Source
@@ -220,14 +220,6 @@ class PackedStore(ChunkStore):
         firsts, counts = self._firsts[channel]
         at = bisect.bisect_right(firsts, row) - 1
         return counts[at] + row - firsts[at]
-
-    def all_messages(self, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
-        """(row, log_time, body) of the messages of a channel, numbered without gaps; none if it is None."""
-        row = 0
-        for chunk in [] if channel is None else self.chunks(channel):
-            for log_time, body in messages(memoryview(self.load(chunk, keep=False))):
-                yield row, log_time, body
-                row += 1
 
     def messages_of(self, span: Span) -> Iterator[tuple[int, memoryview]]:
         """(log_time, body) of the messages of a span."""

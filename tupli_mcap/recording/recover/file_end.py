@@ -37,7 +37,6 @@ class Tail:
     finished: bool = False
     summary: Summary | None = None
     index: EpisodeIndex | None = None
-    index_place: AttachmentIndex | None = None
     statistics: Statistics | None = None
     why: list[str] = field(default_factory=list)
 
@@ -77,7 +76,6 @@ def read_tail(source: Source) -> Tail:
         return tail
     try:
         tail.index = EpisodeIndex.decode(read_attachment(source, place), source.name)
-        tail.index_place = place
         tail.finished = True
     except FormatError as err:
         tail.why.append(str(err).removeprefix(f"{source.name}: "))

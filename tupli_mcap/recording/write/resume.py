@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
-from tupli_mcap.recording.open import read_contents
+from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.recover.find_journal import belongs, misplaced_journal
 from tupli_mcap.recording.recover.prefix import head, metadata_at
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
