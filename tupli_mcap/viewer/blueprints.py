@@ -93,7 +93,8 @@ def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) 
     maps = [panel for panel in panels if isinstance(panel, HeatMap)]
     wide = {panel.leaf.path for panel in maps}
     lines = [panel for panel in panels if isinstance(panel, Series) and panel.leaf.path in wide]
-    others = [panel for panel in panels if not any(panel is taken for taken in (*maps, *lines))]
+    apart = {id(panel) for panel in (*maps, *lines)}
+    others = [panel for panel in panels if id(panel) not in apart]
     pages = []
     for group, title in ((others, name), (lines, f"{name}: lines")):
         for start in range(0, len(group), _A_PAGE):

@@ -101,10 +101,7 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
     material = _Material(recording.labels, _sample(recording, positions), rows, apart)
     for name in recording.cameras:
         scene.beside.append(Camera(name, f"/camera/{escaped(name)}", f"camera {name}"))
-    for leaf in layout.state:
-        _add(scene, scene.states, leaf, "states", material)
-    for leaf in layout.action:
-        _add(scene, scene.actions, leaf, "actions", material)
+    _add_leaves(scene, layout, material)
     infos, unseen = infos_of(recording, _spread(positions), _MOST_INFOS)
     if infos is not None:
         scene.beside.append(infos)
@@ -132,15 +129,19 @@ def live_scene(
     if camera is not None:
         scene.beside.append(Camera(camera, f"/camera/{escaped(camera)}", f"camera {camera}"))
     material = _Material(labels, sample, _MOST_LANE_ROWS + 1, apart)
-    for leaf in layout.state:
-        _add(scene, scene.states, leaf, "states", material)
-    for leaf in layout.action:
-        _add(scene, scene.actions, leaf, "actions", material)
+    _add_leaves(scene, layout, material)
     if infos:
         title = "infos of env 0" if apart else "infos"
         entities = {key: f"/info/{escaped(key)}" for key in infos}
         scene.beside.append(LiveInfos(entities, {}, title))
     return scene
+
+
+def _add_leaves(scene: Scene, layout: StepLayout, material: _Material) -> None:
+    for leaf in layout.state:
+        _add(scene, scene.states, leaf, "states", material)
+    for leaf in layout.action:
+        _add(scene, scene.actions, leaf, "actions", material)
 
 
 def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _Material) -> None:

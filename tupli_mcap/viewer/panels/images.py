@@ -11,9 +11,8 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.frames import EncodedFrame
-from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import Place, flat_values, named
+from tupli_mcap.viewer.panels.panel import LeafPanel, Place, flat_values, named
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
@@ -25,13 +24,8 @@ _ATARI = (84, 84, 4)  # four frames, where nothing says what the channels are
 
 
 @dataclass(frozen=True)
-class Picture:
+class Picture(LeafPanel):
     """An image leaf: one picture a step. A stack shows all its frames side by side, the newest first."""
-
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
 
     def declare(self, place: Place) -> None:
         import rerun as rr
@@ -74,16 +68,8 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Grid:
+class Grid(LeafPanel):
     """A leaf of two or three dimensions: a tensor a step."""
-
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
-
-    def declare(self, place: Place) -> None:
-        """Nothing: all is sent with the values."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         values = self.leaf.get(getattr(block.columns, self.column))
@@ -101,21 +87,14 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class HeatMap:
+class HeatMap(LeafPanel):
     """Many dimensions of a leaf over the steps of an episode: one picture for each episode, at its first step.
 
     low, high: the range of each dimension, which its colours span.
     """
 
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
     low: Array
     high: Array
-
-    def declare(self, place: Place) -> None:
-        """Nothing: all is sent with the values."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         scaled = self._scaled(flat_values(self.leaf, self.column, block))

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import Place, flat_values, plot, send_lines
+from tupli_mcap.viewer.panels.panel import LeafPanel, Place, flat_values, plot, send_lines
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 _ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
@@ -19,16 +19,12 @@ _ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "inte
 
 
 @dataclass(frozen=True)
-class Series:
+class Series(LeafPanel):
     """Dimensions `dims` of a leaf as one entity of scalars, a line each.
 
-    column: the field of the steps that the leaf is in. stepped: the value is held, as an action is, rather than moved.
+    stepped: the value is held, as an action is, rather than moved.
     """
 
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
     dims: Sequence[int]
     names: Sequence[str]
     stepped: bool = False

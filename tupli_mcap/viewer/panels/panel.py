@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -89,6 +90,19 @@ class Panel(Protocol):
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         """The view on the entities below each root; `axis` is the time axis of plots."""
         ...
+
+
+@dataclass(frozen=True)
+class LeafPanel:
+    """What the panels of a leaf have in common. `column` is the field of the steps that the leaf is in."""
+
+    leaf: Leaf
+    column: str
+    entity: str
+    title: str
+
+    def declare(self, place: Place) -> None:
+        """Nothing: all is sent with the values."""
 
 
 def flat_values(leaf: Leaf, column: str, block: Block) -> Array:

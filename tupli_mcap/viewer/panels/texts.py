@@ -10,10 +10,9 @@ import numpy as np
 
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
-from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
-from tupli_mcap.viewer.panels.panel import PALETTE, Place, named, plot
+from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, Place, named, plot
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
 _LONGEST = 2000  # characters of a text that is shown
@@ -21,13 +20,9 @@ _NO_STATE = ""  # as the viewer reads it: a gap in the lane
 
 
 @dataclass(frozen=True)
-class Lanes:
+class Lanes(LeafPanel):
     """A Discrete leaf as a lane of states, each value with its label and colour."""
 
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
     labels: Sequence[str]  # of the values from `start` on
 
     def declare(self, place: Place) -> None:
@@ -69,16 +64,8 @@ class Lanes:
 
 
 @dataclass(frozen=True)
-class Words:
+class Words(LeafPanel):
     """A leaf of variable size: a text as it is, anything else as Python would print it."""
-
-    leaf: Leaf
-    column: str
-    entity: str
-    title: str
-
-    def declare(self, place: Place) -> None:
-        """Nothing: all is sent with the texts."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
