@@ -24,6 +24,7 @@ __all__ = [
     "StorageError",
     "TupliError",
     "UntrustedError",
+    "brief",
     "install_line",
     "memory_for",
     "missing_extra",
@@ -107,6 +108,12 @@ class SignatureError(TupliError):
 
 class MissingExtraError(TupliError, ImportError):
     """An optional dependency is not installed; the message names the extra to install."""
+
+
+def brief(err: BaseException | None) -> str:
+    """An exception in one line: `ValueError: what it says`."""
+    text = " ".join(str(err).split())[:300]
+    return f"{type(err).__name__}: {text}" if text else type(err).__name__
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -363,16 +363,11 @@ def _restore(tagged: dict[str, Any]) -> Any:
         return tagged
     restore = _RESTORE.get(key)
     if restore is None or len(tagged) != 1:
-        raise ValueError(f"expected one known tag in an object, found {_short(list(tagged))}")
+        raise ValueError(f"expected one known tag in an object, found {list(tagged)!r:.80}")
     try:
         return restore(tagged[key])
     except (TypeError, ValueError, OverflowError, binascii.Error, KeyError, AttributeError) as err:
-        raise ValueError(f"expected a value of {key!r}, found {_short(tagged[key])} ({err})") from err
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
+        raise ValueError(f"expected a value of {key!r}, found {tagged[key]!r:.80} ({err})") from err
 
 
 def _list(value: Any) -> list[Any]:

@@ -2,7 +2,7 @@
 
 from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust
-from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, note
+from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, note, resets_itself
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
 from tupli_mcap.environment._pickling import rebuild_ezpickled
@@ -24,5 +24,6 @@ __all__ = [
     "note",
     "reasons_for_distrust",
     "rebuild_ezpickled",
+    "resets_itself",
     "sha256",
 ]

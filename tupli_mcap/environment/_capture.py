@@ -22,7 +22,7 @@ from tupli_mcap.environment._changes import is_changed
 from tupli_mcap.environment._local_code import is_local
 from tupli_mcap.environment._pickling import InProcessCopy, dump
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import TupliError, brief
 
 # Python 3.11 and 3.12 keep attributes outside a dict until somebody asks for one, and reach them slower from then on.
 _HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
@@ -70,7 +70,7 @@ def capture(
             "" if by_reference else ", or try by_reference=True, which stores the names of its classes only"
         )
         raise TupliError(
-            f"the environment {noted.classes[-1]} cannot be pickled ({_brief(err)}): wrap it before rendering or "
+            f"the environment {noted.classes[-1]} cannot be pickled ({brief(err)}): wrap it before rendering or "
             f"opening files, give its class __getstate__ and __setstate__{hint}"
         ) from err
     return dataclasses.replace(noted, spec=None, pickle=data)
@@ -82,6 +82,11 @@ def fingerprint(env: gym.Env[Any, Any]) -> bytes | None:
         return dump(env, by_reference=True)
     except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
         return None
+
+
+def resets_itself(env: gym.Env[Any, Any]) -> bool:
+    """Whether the step after an end is a reset, since `gymnasium.wrappers.Autoreset` is among the wrappers."""
+    return any(isinstance(layer, gym.wrappers.Autoreset) for layer in _layers(env))
 
 
 class Snapshot:
@@ -125,7 +130,7 @@ class Snapshot:
         if self._copy is None:
             raise TupliError(
                 f"the environment {self._name} cannot be captured, since it cannot be pickled "
-                f"({_brief(self._failure)}): wrap it before rendering or opening files, or give its class "
+                f"({brief(self._failure)}): wrap it before rendering or opening files, or give its class "
                 "__getstate__ and __setstate__"
             ) from self._failure
         try:
@@ -133,7 +138,7 @@ class Snapshot:
                 return self._copy.restore()
         except Exception as err:
             raise TupliError(
-                f"the environment {self._name} cannot be captured: its pickle does not load ({_brief(err)})"
+                f"the environment {self._name} cannot be captured: its pickle does not load ({brief(err)})"
             ) from err
 
 
@@ -274,8 +279,3 @@ def _quiet() -> Iterator[None]:
     finally:
         random.setstate(random_state)
         np.random.set_state(numpy_state)
-
-
-def _brief(err: BaseException | None) -> str:
-    text = " ".join(str(err).split())
-    return f"{type(err).__name__}: {text[:200]}"

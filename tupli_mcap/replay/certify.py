@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, Literal
 
 import gymnasium as gym
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
@@ -26,7 +26,7 @@ from tupli_mcap.replay.certificate import (
     versions_of,
 )
 from tupli_mcap.replay.compare import Checker, Difference
-from tupli_mcap.replay.reapply import Replayer, brief
+from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.recorded_values import RecordedValues, recorded_values
 from tupli_mcap.replay.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
 

@@ -13,7 +13,8 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import TupliError
+from tupli_mcap.environment import resets_itself
+from tupli_mcap.errors import TupliError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
 from tupli_mcap.replay.starts import EpisodePlan, ResetCall
@@ -74,7 +75,7 @@ class Replayer:
         """The environment; built when first asked for."""
         if self._env is None:
             self._env = self._make()
-            self._resets_itself = _resets_itself(self._env)
+            self._resets_itself = resets_itself(self._env)
             self._used = False
         return self._env
 
@@ -144,17 +145,3 @@ def _plain(action: Any) -> Any:
     if type(action) is tuple:
         return tuple(_plain(item) for item in action)
     return action.item() if isinstance(action, np.generic) else action
-
-
-def brief(err: BaseException) -> str:
-    """An exception in one line."""
-    text = " ".join(str(err).split())
-    return f"{type(err).__name__}: {text[:200]}" if text else type(err).__name__
-
-
-def _resets_itself(env: gym.Env[Any, Any]) -> bool:
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.wrappers.Autoreset):
-            return True
-        env = env.env
-    return False

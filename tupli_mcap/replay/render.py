@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
-from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
+from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Episode, Recording, rewrite_recording
 from tupli_mcap.recording.edit.replacing import replacing
@@ -20,7 +20,7 @@ from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier
 from tupli_mcap.replay.movie import RenderedFrames, check_movie, write_movie
-from tupli_mcap.replay.reapply import Replayer, brief
+from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.starts import EpisodePlan
 from tupli_mcap.storage.sidecar import Notes
 

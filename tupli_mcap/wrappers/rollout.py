@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, brief
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.options import (
@@ -127,7 +127,7 @@ def load_policy(name: str) -> Policy:
         for part in function_name.split("."):
             value = getattr(value, part)
     except (Exception, SystemExit) as err:  # whatever the module does when it is imported
-        raise RecordingError(f"the policy {name!r} cannot be imported: {_reason(err)}") from err
+        raise RecordingError(f"the policy {name!r} cannot be imported: {brief(err)}") from err
     if not callable(value):
         raise RecordingError(f"the policy {name!r} must be a function, found {type(value).__name__}")
     policy: Policy = value
@@ -143,7 +143,7 @@ def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:
     try:
         return make() if num_envs == 1 else gym.vector.SyncVectorEnv([make] * num_envs)
     except (Exception, SystemExit) as err:  # an environment's constructor may raise anything
-        raise RecordingError(f"the environment {env_id!r} cannot be made: {_reason(err)}") from err
+        raise RecordingError(f"the environment {env_id!r} cannot be made: {brief(err)}") from err
 
 
 @contextlib.contextmanager
@@ -211,7 +211,7 @@ def _failures(done: int, path: Path) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as err:
         raise RecordingError(
-            f"the policy or the environment failed at step {done}: {_reason(err)}"
+            f"the policy or the environment failed at step {done}: {brief(err)}"
             + (f"; {path} holds the steps before it" if done else "")
         ) from err
 
@@ -233,8 +233,3 @@ def _every(interval: int, progress: Callable[[int], None] | None) -> Callable[[i
 def _episodes_in(path: Path) -> int:
     with Recording(path) as recording:
         return len(recording)
-
-
-def _reason(err: BaseException) -> str:
-    text = " ".join(str(err).split())[:300]
-    return f"{type(err).__name__}: {text}" if text else type(err).__name__

@@ -12,6 +12,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.environment import resets_itself
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
@@ -154,7 +155,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     def _recorder_of(self, writer: RecordingWriter) -> SingleRecorder:
         recorder = SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)
-        recorder.resets_itself = _resets_itself(self.env)
+        recorder.resets_itself = resets_itself(self.env)
         return recorder
 
     def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder:
@@ -309,11 +310,3 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     def _when_closed(self) -> None:
         if self._stepped:  # the episode was interrupted
             self._reset_callback()
-
-
-def _resets_itself(env: gym.Env[Any, Any]) -> bool:
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, gym.wrappers.Autoreset):
-            return True
-        env = env.env
-    return False
