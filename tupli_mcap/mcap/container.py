@@ -7,6 +7,7 @@ whole arrays.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import os
 import stat
@@ -15,6 +16,7 @@ import threading
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from importlib.metadata import version
 from typing import Any, NamedTuple, Protocol
 
 import lz4.frame
@@ -103,6 +105,12 @@ class Prepared(NamedTuple):
 
 
 Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and what was made of their data
+
+
+@functools.cache  # it is read from the disk
+def library() -> str:
+    """The name and the version of this program, as recordings give them."""
+    return f"tupli-mcap {version('tupli-mcap')}"
 
 
 class Container:

@@ -20,18 +20,29 @@ _QUALITY: Final = 90
 
 
 def check_format(name: str) -> FrameFormat:
-    """A format that can be written here.
+    """A format of frames that can be written here.
 
     Raises:
         RecordingError: it is neither "png" nor "jpeg".
         MissingExtraError: Pillow is not installed.
     """
-    for known in get_args(FrameFormat):
-        if name == known:
-            _pillow()
-            found: FrameFormat = known
-            return found
-    raise RecordingError(f"frame_format: expected 'png' or 'jpeg', found {name!r:.40}")
+    if name not in ("png", "jpeg"):
+        raise RecordingError(f"frame_format: expected 'png' or 'jpeg', found {name!r:.40}")
+    _pillow()
+    return "png" if name == "png" else "jpeg"
+
+
+def check_image_format(name: str) -> None:
+    """Whether it is a format of images of states that can be written here.
+
+    Raises:
+        RecordingError: it is neither "raw" nor "png".
+        MissingExtraError: Pillow is not installed.
+    """
+    if name not in ("raw", "png"):
+        raise RecordingError(f"image_format: expected 'raw' or 'png', found {name!r:.40}")
+    if name == "png":
+        _pillow()
 
 
 def _pillow() -> Any:
@@ -120,22 +131,6 @@ def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np
         raise
     except Exception as err:  # Pillow's decoders raise many kinds
         raise FormatError(f"expected a PNG, found {bytes(data[:16])!r}: {err}") from err
-
-
-def check_image_format(name: str) -> ImageFormat:
-    """A format of images of states that can be written here.
-
-    Raises:
-        RecordingError: it is neither "raw" nor "png".
-        MissingExtraError: Pillow is not installed.
-    """
-    for known in get_args(ImageFormat):
-        if name == known:
-            if known == "png":
-                _pillow()
-            found: ImageFormat = known
-            return found
-    raise RecordingError(f"image_format: expected 'raw' or 'png', found {name!r:.40}")
 
 
 def format_of(data: bytes | memoryview) -> FrameFormat | None:

@@ -12,8 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.journal.rows import even_rows
-from tupli_mcap.mcap.container import Container, Rows
-from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.mcap.container import Container, Rows, library
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.recording.contents import RECORDING_METADATA

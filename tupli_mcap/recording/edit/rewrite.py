@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels

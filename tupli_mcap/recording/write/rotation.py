@@ -23,7 +23,7 @@ from tupli_mcap.files import as_file_name
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
-from tupli_mcap.recording.write.writer import RecordingWriter, finish_recording
+from tupli_mcap.recording.write.writer import RecordingWriter, finish_in_place
 
 _NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
 _MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 million steps is left
@@ -99,7 +99,7 @@ class Rotation:
         files = [base, *later.values()]
         for left in files[-2:-1]:  # changes nothing about a finished one
             with contextlib.suppress(RecordingError, FormatError):  # it is read as it is
-                finish_recording(left, RecordOptions(mode="a"))
+                finish_in_place(left, RecordOptions(mode="a"))
         self._paths = [files[-1]]
 
     @property

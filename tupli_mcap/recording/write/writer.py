@@ -24,9 +24,8 @@ from tupli_mcap.journal.file import Area, Journal
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
-from tupli_mcap.mcap.container import Container, Rows
+from tupli_mcap.mcap.container import Container, Rows, library
 from tupli_mcap.mcap.lock import FileLock
-from tupli_mcap.mcap.writer_name import library
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
@@ -532,7 +531,7 @@ class RecordingWriter:
             remove_unnamed(self.journal_place)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-                finish_recording(self.path if is_there else self._place, options)
+                finish_in_place(self.path if is_there else self._place, options)
         except TupliError:
             self.leave_unfinished()
             raise
@@ -571,7 +570,7 @@ class RecordingWriter:
         self.on_close()
 
 
-def finish_recording(path: Path, options: RecordOptions) -> None:
+def finish_in_place(path: Path, options: RecordOptions) -> None:
     """Finishes a recording that its writer has left unfinished; a finished one stays as it is.
 
     Raises:

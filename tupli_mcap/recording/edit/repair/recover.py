@@ -31,7 +31,7 @@ from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.recording.write.writer import finish_in_place
 
 
 class DamagedPlace(NamedTuple):
@@ -228,7 +228,7 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
         )
     if not dry_run:
         if not report.finished:
-            RecordingWriter(path, RecordOptions(mode="a")).close()
+            finish_in_place(Path(path), RecordOptions(mode="a"))
         report.target = str(path)
     return report
 

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.writer_name import library
+from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
