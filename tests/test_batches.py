@@ -17,8 +17,7 @@ from test_variable import same
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, StepError
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder
-from tupli_mcap.messages.decoder import MessageDecoder
+from tupli_mcap.messages.decoder import LOG_TIME, BatchDecoder, MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, structure_check
 

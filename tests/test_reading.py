@@ -20,7 +20,7 @@ from hypothesis import given, settings, strategies as st
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import CHUNK_ROWS
-from tupli_mcap.mcap.crc import crc32
+from tupli_mcap.mcap.records import crc32
 from tupli_mcap.mcap.source import PathSource, open_source
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.columns.threads import do_all

@@ -434,7 +434,7 @@ class Dataset(RandomAccess):
             MissingExtraError: PyTorch is not installed.
             SamplingError: no episode has so many steps.
         """
-        from tupli_mcap.torch.loader import loader
+        from tupli_mcap.torch.mapped import loader
 
         if fields is not None:
             chosen["fields"] = fields

@@ -11,7 +11,7 @@ from tupli_mcap.dataset.convert import import_pandas
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.element_names import element_names
+from tupli_mcap.spaces.labels import element_names
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,10 +1,9 @@
 """The journal: what keeps each step safe before it is in the file. Both sides of each layout are here.
 
 file        the mapped file, its areas, and who it belongs to
-rows        rows of constant size: how many make a half, and what is filled in when they go to the file
 logs        records of variable size: append, and group by channel
 committed   what a reader takes out of a journal: `rows_of`, the running states
-derive      starts, ends and final states, which the recorder makes from rows when these go to the file
+derive      what the recorder makes from rows when these go to the file: steps and times; starts, ends, final states
 seals       which rows count after a power loss
 
 1. A recording is rows: each channel is append-only, its rows are numbered 0, 1, 2, … by `sequence`, across appends.

@@ -39,8 +39,7 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, with_crc
+from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, crc32, with_crc
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "tupli_mcap"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,12 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.crc import crc32
 from tupli_mcap.mcap.source import Source
+
+try:
+    from isal.isal_zlib import crc32 as _crc32
+except ImportError:
+    from zlib import crc32 as _crc32
 
 RECORD = struct.Struct("<BQ")  # what every record begins with: opcode, and the length of what follows
 # RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
@@ -267,3 +271,22 @@ def iter_records(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
             )
         yield start, end, channel, sequence, log_time
         start = end
+
+
+# End every use of ISA-L with a loop of NumPy. ISA-L leaves the upper halves of the vector registers dirty, which slows
+# down everything that follows in the thread on Intel processors, the environment included; NumPy's loops clear them.
+_ZEROS = np.zeros(256)  # long enough for a loop of vectors
+
+
+def crc32(data: Any, value: int = 0, /) -> int:
+    """The CRC-32 of `data`, behind bytes whose CRC-32 is `value`."""
+    found: int = _crc32(data, value)
+    np.add(_ZEROS, _ZEROS, out=_ZEROS)
+    return found
+
+
+def crc32_each(parts: Iterable[bytes]) -> list[int]:
+    """The CRC-32 of each part."""
+    found = list(map(_crc32, parts))
+    np.add(_ZEROS, _ZEROS, out=_ZEROS)
+    return found

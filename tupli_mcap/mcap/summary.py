@@ -15,8 +15,7 @@ from mcap.records import (
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import MAGIC, PROFILE
-from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.mcap.records import parse_record, records
+from tupli_mcap.mcap.records import crc32, parse_record, records
 from tupli_mcap.mcap.source import Source
 
 FOOTER_SIZE = 9 + 20

@@ -4,7 +4,7 @@ layout                 CDR offsets, ros2msg definitions and NumPy dtypes of a me
 topics                 what each channel is called
 step                   the layout of `/step`: where each leaf of state, action and reward lies
 encode_rows            the generated function that writes a step into a row, and commits it
-decoder, batches       messages of variable size back to values: one, many
+decoder                messages of variable size back to values: one, or many at once
 episodes               `/episode_start`, `/episode_end`, `/final_state`
 infos, frames          `/info`; `/camera` and `/frame`
 images/                leaves that are images: how they are compressed

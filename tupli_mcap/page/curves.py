@@ -15,8 +15,7 @@ from tupli_mcap.plots.measure import numbers_in, thinned
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.spaces.element_names import short_path
-from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.labels import Labels, short_path
 from tupli_mcap.spaces.leaves import Leaf
 
 __all__ = ["Curves", "Track", "curves_of", "values_at"]

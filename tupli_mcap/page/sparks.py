@@ -16,7 +16,7 @@ from tupli_mcap.plots.measure import thinned
 from tupli_mcap.plots.statistics import drawable_numbers
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
-from tupli_mcap.spaces.element_names import element_names
+from tupli_mcap.spaces.labels import element_names
 
 __all__ = ["Sparks", "sparks_of"]
 

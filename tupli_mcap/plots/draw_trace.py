@@ -13,7 +13,7 @@ from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured, Trace
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
-from tupli_mcap.spaces.element_names import short_path
+from tupli_mcap.spaces.labels import short_path
 
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel
 _SAME_SCALE = 8  # lines of one panel differ by this factor at most

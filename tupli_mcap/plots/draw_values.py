@@ -14,7 +14,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.plots import style
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, bin_edges, drawable_numbers
 from tupli_mcap.plots.style import COLUMNS, LEFT, SMALL, Cell, Page, cut, number_text
-from tupli_mcap.spaces.element_names import short_path
+from tupli_mcap.spaces.labels import short_path
 
 Leaves = Sequence[LeafValues]  # the same leaf of each group of recordings
 Dimension = tuple[Leaves, int]  # one of its elements

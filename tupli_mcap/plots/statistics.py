@@ -11,8 +11,7 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.recording.columns.statistics import ElementStatistics
-from tupli_mcap.spaces.element_names import element_names, short_path
-from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
 
 LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float

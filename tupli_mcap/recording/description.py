@@ -23,8 +23,7 @@ from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.made_of import made_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
-from tupli_mcap.spaces.element_names import element_names, short_path
-from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
 
 _MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each

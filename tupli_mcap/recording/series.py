@@ -14,7 +14,7 @@ from tupli_mcap.errors import TupliError
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.spaces.element_names import element_names
+from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.spaces.leaves import Leaf
 
 READ_BYTES = 4 << 20

@@ -1,4 +1,4 @@
-"""A map-style dataset: items by number, for any sampler."""
+"""A map-style dataset: items by number, for any sampler; and a DataLoader of it in one call."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from torch.utils.data import Dataset
+from torch import Generator
+from torch.utils.data import DataLoader, Dataset
 
 from tupli_mcap.dataset.items import Items
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
-from tupli_mcap.torch.tensors import Samples
+from tupli_mcap.torch.tensors import Samples, collate
 
 
 class MapDataset(Dataset[dict[str, Any]]):
@@ -52,3 +53,29 @@ class MapDataset(Dataset[dict[str, Any]]):
             SamplingError: it is another's.
         """
         check_state(state_dict, self._reader.items.identity, {})
+
+
+def loader(
+    items: Items[Any],
+    *,
+    batch_size: int,
+    shuffle: bool,
+    num_workers: int,
+    seed: int | None,
+    drop_last: bool,
+    remote: bool,
+) -> DataLoader[Any]:
+    """See `Dataset.loader`."""
+    generator = None if seed is None else Generator().manual_seed(seed)
+    return DataLoader(
+        MapDataset(items),
+        batch_size,
+        shuffle,
+        num_workers=num_workers,
+        collate_fn=collate,
+        generator=generator,
+        drop_last=drop_last,
+        persistent_workers=num_workers > 0,
+        # what fetches from a server runs in threads, which a fork does not have
+        multiprocessing_context="spawn" if remote and num_workers else None,
+    )

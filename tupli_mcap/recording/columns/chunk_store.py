@@ -23,8 +23,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import message_places, messages
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
-from tupli_mcap.mcap.crc import crc32
-from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK
+from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 from tupli_mcap.remote import RemoteSource

@@ -17,7 +17,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.batches import LOG_TIME, BatchDecoder, Decode
+from tupli_mcap.messages.decoder import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.journal.logs import group_records
-from tupli_mcap.journal.rows import even_rows
 from tupli_mcap.mcap.container import Container, Rows, library
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.journal.rows import even_rows
+from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.records import CHUNK_HEAD

@@ -16,7 +16,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, SpaceError
-from tupli_mcap.journal.rows import LAST_ROW
+from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.topics import INFO, Topics, parse

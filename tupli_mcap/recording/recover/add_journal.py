@@ -21,8 +21,8 @@ from tupli_mcap.journal.committed import (
     size_behind,
     torn_rows,
 )
+from tupli_mcap.journal.derive import RowDeriver, even_rows
 from tupli_mcap.journal.file import EVENT_AREAS, FRAMES_AREA, JournalContents, read_journal, recorded_journal
-from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.messages.episodes import EpisodeStart

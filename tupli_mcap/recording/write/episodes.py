@@ -17,8 +17,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
-from tupli_mcap.mcap.crc import crc32_each
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, crc32_each
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
     START_FIELDS,

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.files import as_file_name
-from tupli_mcap.journal.rows import LAST_ROW
+from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_in_place

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
-from tupli_mcap.journal.derive import StartedEpisode
+from tupli_mcap.journal.derive import LAST_ROW, StartedEpisode
 from tupli_mcap.journal.file import Area, Journal
 from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.journal.rows import LAST_ROW
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
 from tupli_mcap.mcap.container import Container, Rows, library
 from tupli_mcap.mcap.lock import FileLock

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
+from tupli_mcap.journal.derive import EpisodeDeriver, RowDeriver, StartedEpisode, even_rows
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import Sink
-from tupli_mcap.journal.rows import RowDeriver, even_rows
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, make_row_encoder

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from tupli_mcap.journal.derive import RowDeriver, rows_per_half
 from tupli_mcap.journal.file import FRAMES_AREA, Area, Journal, LogArea, RowArea
 from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.journal.rows import RowDeriver, rows_per_half
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import Channels
