@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import tempfile
@@ -9,7 +10,10 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent / "tests")]
+ROOT = HERE.parent
+sys.path[:0] = [str(HERE / "_ext"), str(ROOT / "tests")]
+
+import recordings  # noqa: E402
 
 project = "tupli-mcap"
 author = "the tupli-mcap developers"
@@ -55,16 +59,28 @@ _startup = _home / "ipython" / "profile_default" / "startup"
 _startup.mkdir(parents=True)
 (_startup / "00-cells.py").write_text((HERE / "_ext" / "cells.py").read_text(encoding="utf-8"))
 (_startup.parent / "ipython_kernel_config.py").write_text("c.IPKernelApp.log_level = 40\n")
+# d3rlpy pins another Gymnasium: its tutorial runs in an environment of its own.
+_kernel = _home / "jupyter" / "kernels" / "d3rlpy" / "kernel.json"
+_kernel.parent.mkdir(parents=True)
+_python = str(ROOT / ".venv-d3rlpy" / "bin" / "python")
+_start = [_python, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+_kernel.write_text(json.dumps({"argv": _start, "display_name": "d3rlpy", "language": "python"}))
 os.environ |= {
+    "JUPYTER_PATH": str(_home / "jupyter"),
     "IPYTHONDIR": str(_home / "ipython"),
     "TUPLI_MCAP_CONFIG_DIR": str(_home / "config"),
     "TUPLI_MCAP_CACHE_DIR": str(_home / "cache"),
     "TUPLI_MCAP_DATA_DIR": str(_home / "data"),
-    "PYTHONPATH": os.pathsep.join(filter(None, (str(HERE.parent / "tests"), os.environ.get("PYTHONPATH")))),
+    "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT / "tests"), os.environ.get("PYTHONPATH")))),
+    "TUPLI_MCAP_DOCS_RECORDINGS": str(_home / "recordings"),
+    "TUPLI_MCAP_DOCS_EXAMPLES": str(ROOT / "examples"),
     "COLUMNS": "96",
     "TZ": "UTC",
+    "XDG_RUNTIME_DIR": str(_home),  # SDL complains without
     "PYDEVD_DISABLE_FILE_VALIDATION": "1",
 }
+
+recordings.make(_home / "recordings")
 
 # --- the API ---
 

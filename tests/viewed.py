@@ -152,20 +152,21 @@ class Courier(gym.Env[Any, Any]):
         return picture
 
 
+def head_for_goal(state: Any, noise: np.random.Generator) -> Any:
+    """The action of a courier that heads for its goal and around pillars, a little unsteadily."""
+    way = state["goal"] - state["position"]
+    apart = state["position"] - Courier.PILLARS
+    distance = np.linalg.norm(apart, axis=1)
+    push = (apart / distance[:, None] * np.exp(-((distance - 0.08) / 0.05))[:, None]).sum(0)
+    thrust = way / max(float(np.linalg.norm(way)), 0.15) + push + noise.normal(0, 0.25, 2)
+    close = np.linalg.norm(way) < 0.06
+    gripper = (2 if state["carrying"] else 1) if close else 0
+    return {"thrust": np.clip(thrust, -1, 1).astype(np.float32), "gripper": gripper}
+
+
 def courier(path: Path, episodes: int = 3) -> Path:
-    """Heads for its goal and around pillars, a little unsteadily."""
+    """A courier's trips."""
     noise = np.random.default_rng(2)
-
-    def head_for_goal(state: Any) -> Any:
-        way = state["goal"] - state["position"]
-        apart = state["position"] - Courier.PILLARS
-        distance = np.linalg.norm(apart, axis=1)
-        push = (apart / distance[:, None] * np.exp(-((distance - 0.08) / 0.05))[:, None]).sum(0)
-        thrust = way / max(float(np.linalg.norm(way)), 0.15) + push + noise.normal(0, 0.25, 2)
-        close = np.linalg.norm(way) < 0.06
-        gripper = (2 if state["carrying"] else 1) if close else 0
-        return {"thrust": np.clip(thrust, -1, 1).astype(np.float32), "gripper": gripper}
-
     labels = {
         **{f"state[{name!r}]": ("x", "y") for name in ("position", "velocity", "goal")},
         "state['carrying']": ("empty", "loaded"),
@@ -173,7 +174,7 @@ def courier(path: Path, episodes: int = 3) -> Path:
         "action['gripper']": ("rest", "grasp", "release"),
     }
     with RecordEpisodes(gym.wrappers.TimeLimit(Courier(), 200), path, labels=labels) as env:
-        rollout(env, head_for_goal, episodes)
+        rollout(env, lambda state: head_for_goal(state, noise), episodes)
     return path
 
 

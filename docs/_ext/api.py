@@ -19,6 +19,14 @@ from sphinx.ext.autodoc.mock import mock
 
 import tupli_mcap
 
+MODULES = (
+    *(f"tupli_mcap.{name}" for name in tupli_mcap._MODULES),
+    "tupli_mcap.dataset.items",
+    "tupli_mcap.torch.rl",
+    "tupli_mcap.torch.d3rlpy",
+)
+"""The modules whose names are public."""
+
 _SECTION = re.compile(r"(Args|Attributes|Raises|Returns|Yields):$")
 _FIELDS = re.compile(r"[a-z]\w*(, [a-z]\w*)*: ")
 _CODE = re.compile(r"(`+[^`]+`+)")
@@ -52,7 +60,7 @@ def documented(module: str) -> str:
 def _homes() -> dict[str, str]:
     """Where each public object is really defined -> the name it is documented under."""
     found = {}
-    for module in ("tupli_mcap." + name for name in tupli_mcap._MODULES):
+    for module in MODULES:
         for name, value in public_names(module):
             home = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
             if all(home):
@@ -100,6 +108,18 @@ def _sections(lines: list[str]) -> Iterator[str]:
             code = code and line.startswith("    ")
         line = "Fields:" if line == "Attributes:" else line
         yield f"    {line}" if fields and line.strip() else line
+
+
+def code_in(docstring: str) -> str:
+    """The indented paragraphs of a docstring that are code."""
+    lines = list(_sections(inspect.cleandoc(docstring).split("\n")))
+    code = False
+    taken = []
+    for line in lines:
+        code = line == "::" or (code and (not line.strip() or line.startswith("    ")))
+        if code and line != "::":
+            taken.append(line)
+    return inspect.cleandoc("\n" + "\n".join(taken)) if taken else ""
 
 
 def _escaped(text: str) -> str:

@@ -5,6 +5,8 @@ IPython runs this file before a page's first cell. None of it is of the pages' o
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import warnings
 
@@ -17,6 +19,12 @@ def _run_shell(lines: list[str]) -> list[str]:
     return [f"_shell({line[2:]!r})\n" if line.startswith("$ ") else line + "\n" for line in text.splitlines()]
 
 
+def shell(command: str) -> None:
+    """As a cell `$ COMMAND`, for commands that the page has to make up; shown with what it writes."""
+    print(f"$ {command}")
+    _shell(command)
+
+
 def _shell(command: str) -> None:
     """Runs a command and prints what it writes; a page whose command fails is not built."""
     done = subprocess.run(
@@ -25,6 +33,16 @@ def _shell(command: str) -> None:
     print(done.stdout, end="")
     if done.returncode:
         raise RuntimeError(f"`{command}` ended with {done.returncode}")
+
+
+def make_recordings() -> None:
+    """The recordings that pages of how-tos work on: run.mcap, and three runs in runs/."""
+    shutil.copytree(os.environ["TUPLI_MCAP_DOCS_RECORDINGS"], ".", dirs_exist_ok=True)
+
+
+def copy_example(name: str) -> None:
+    """A script of examples/, to be run by a command."""
+    shutil.copy(f"{os.environ['TUPLI_MCAP_DOCS_EXAMPLES']}/{name}", ".")
 
 
 def show_viewer(
