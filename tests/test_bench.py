@@ -32,9 +32,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a quick run of some parts writes."""
     pytest.importorskip("h5py")
     output = tmp_path_factory.mktemp("bench")
-    (output / "front.md").write_text(f"before\n\n{report.BEGIN}\nold\n{report.END}\n\nafter\n")
     command = [sys.executable, "-m", "tools.bench", "--quick", "--output", str(output)]
-    command += ["--readme", str(output / "front.md")]
     command += [part for side in SIDES for part in ("--with", side)]
     command += [
         part for name in ("floats", "growth", "noise", "vector", "pictures") for part in ("--only", name)
@@ -86,12 +84,6 @@ class TestQuickRun:
         for name in ("floats", "growth"):
             assert f"({name}.svg)" in page
             assert ET.parse(quick / f"{name}.svg").getroot().tag.endswith("svg")
-
-    def test_the_block_replaces_the_old_one(self, quick: Path) -> None:
-        front = (quick / "front.md").read_text()
-        assert front.startswith("before\n\n" + report.BEGIN)
-        assert front.endswith(report.END + "\n\nafter\n")
-        assert "old" not in front
 
     def test_drawn_anew_it_is_the_same(self, quick: Path) -> None:
         before = {path.name: path.read_bytes() for path in quick.iterdir()}

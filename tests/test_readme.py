@@ -50,9 +50,12 @@ def missing(text: str) -> list[str]:
     return gone + [f"tupli-mcap {name}" for name in sorted(set(_COMMAND.findall(code)) - set(known))]
 
 
-def test_its_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_python_prints_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     run_python(README)
+    assert capsys.readouterr().out == "".join(text for _, text in blocks(README, "text"))
 
 
 def test_what_it_names_is_there() -> None:

@@ -1,6 +1,6 @@
 """Measure tupli-mcap side by side with its peers: `python -m tools.bench` (about 15 minutes).
 
-Writes docs/bench/ (README.md, plots, results.json) and the block between the markers in README.md. Peers live in
+Writes docs/bench/ (README.md, plots, results.json). Peers live in
 environments of their own (tools/setup-venv-peers, tools/setup-venv-d3rlpy); who is not installed is left out. What
 fails is said in the tables. All other files go to a temporary directory, which is removed.
 """
@@ -52,9 +52,6 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help="a fiftieth of the work: a look, not a result")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each comparison (default 5)")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "bench", help="default docs/bench")
-    parser.add_argument(
-        "--readme", type=Path, help="insert the block here, too (default README.md of a whole run)"
-    )
     parser.add_argument(
         "--render", action="store_true", help="write page and plots of OUTPUT/results.json anew"
     )
@@ -152,9 +149,6 @@ def main() -> int:
     kept.write_text(json.dumps(results, indent=1) + "\n")
     draw.write(results, options.output)
     (options.output / "README.md").write_text(report.page(results))
-    readme = options.readme or (ROOT / "README.md" if results["whole"] else None)
-    if readme is not None and report.insert(readme, report.block(results)):
-        log.say(f"wrote into {readme}")
     for target in results["targets"]:
         mark = {None: "?", True: "reached", False: "NOT REACHED"}[target["reached"]]
         print(f"{mark:12} {target['what']}: {report.measured(target)} ({target['words']}) {target['note']}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import statistics
-from pathlib import Path
 from typing import Any
 
 from tools.bench.contenders import OURS
@@ -12,7 +11,6 @@ from tools.bench.matrix import OPERATIONS
 from tools.bench.measure import ratio
 from tools.bench.workloads import NUM_ENVS, WORKLOADS
 
-BEGIN, END = "<!-- benchmark: begin -->", "<!-- benchmark: end -->"
 MINE = (OURS, f"{OURS}, saved columns")
 
 
@@ -212,30 +210,3 @@ def page(results: dict[str, Any]) -> str:
     if results["failures"]:
         parts.append("## What failed\n\n" + "\n".join(f"- {_short(line)}" for line in results["failures"]))
     return "\n\n".join(parts) + "\n"
-
-
-def block(results: dict[str, Any]) -> str:
-    """What goes into the README."""
-    shown = "floats" if "floats" in results["matrix"] else next(iter(results["matrix"]), None)
-    parts = [BEGIN]
-    if shown:
-        parts.append(
-            f"![{WORKLOADS[shown].title}](docs/bench/{shown}.svg)\n![By number of steps](docs/bench/growth.svg)"
-        )
-        parts.append(f"{WORKLOADS[shown].title}:\n\n{table(results['matrix'][shown])}")
-    about = results["machine"]
-    parts.append(
-        f"▼ less is better, ▲ more is better; ⚡ faster than tupli-mcap. {about['cpu']}, {about['cores']} cores, "
-        f"Python {about['python']}, {about['date']}. Other workloads, versions, what the figures "
-        "mean and what was promised: [docs/bench/README.md](docs/bench/README.md)."
-    )
-    return "\n\n".join([*parts, END])
-
-
-def insert(readme: Path, text: str) -> bool:
-    """Puts the block between its markers; False if there are none."""
-    page = readme.read_text()
-    if BEGIN not in page or END not in page:
-        return False
-    readme.write_text(page[: page.index(BEGIN)] + text + page[page.index(END) + len(END) :])
-    return True
