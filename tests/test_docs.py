@@ -158,6 +158,13 @@ def test_the_reference_of_http_holds_every_route() -> None:
             assert f"**`{method.upper()} {path}`**" in page
 
 
+def test_every_environment_variable_is_listed() -> None:
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tupli_mcap").rglob("*.py"))
+    page = (ROOT / "docs/reference/variables.md").read_text(encoding="utf-8")
+    variables = re.compile(r"TUPLI_MCAP_[A-Z_]+")
+    assert set(variables.findall(code)) == set(variables.findall(page))
+
+
 # --- that these tests can fail ---
 
 
