@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import buckets
 import gymnasium as gym
 import pytest
 from postgres import Cluster
@@ -17,15 +19,25 @@ from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    with buckets.bucket() as made:
+        yield made.url
+
+
+@pytest.fixture(params=["sqlite and a directory", "postgresql and s3"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
+    settings = Settings(tmp_path / "served")
     with contextlib.ExitStack() as stack:
-        database = ""
-        if request.param == "postgresql":
+        if "postgresql" in request.param:
             postgres: Cluster = request.getfixturevalue("postgres")
             database = stack.enter_context(postgres.database())
-        yield stack.enter_context(serving(Settings(tmp_path / "served", database=database)))
+            place = f"{request.getfixturevalue('bucket')}/{tmp_path.name}"
+            settings = replace(settings, database=database, blobs=place)
+        yield stack.enter_context(serving(settings))
 
 
 @pytest.fixture

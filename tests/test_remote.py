@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+import buckets
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -238,28 +239,15 @@ def test_commands_take_addresses(server: WebServer, large: Path, command: str) -
 
 @pytest.fixture
 def bucket(large: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A real S3 client's stand-in: moto's server."""
     import obstore
-    from moto.server import ThreadedMotoServer
     from obstore.store import S3Store
 
-    server = ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    for name, value in {
-        "AWS_ACCESS_KEY_ID": "me", "AWS_SECRET_ACCESS_KEY": "SECRET", "AWS_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_ALLOW_HTTP": "true",
-    }.items():  # fmt: skip
-        monkeypatch.setenv(name, value)
-    import boto3
-
-    boto3.client("s3").create_bucket(Bucket="lab")
-    store = S3Store("lab")
-    for name in ("runs/a.mcap", "runs/deep/b.mcap", "other.mcap", "runs/note.txt"):
-        obstore.put(store, name, large.read_bytes())
-    source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
-    yield "s3://lab"
-    server.stop()
+    with buckets.bucket() as made:
+        store = S3Store(made.name)
+        for name in ("runs/a.mcap", "runs/deep/b.mcap", "other.mcap", "runs/note.txt"):
+            obstore.put(store, name, large.read_bytes())
+        source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+        yield made.url
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

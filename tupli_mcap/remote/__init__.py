@@ -8,7 +8,8 @@ names:    URLs, and how they may be shown.
 """
 
 from tupli_mcap.remote.names import is_url, shown
+from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import matching
 from tupli_mcap.remote.source import RemoteSource, copied, open_url
 
-__all__ = ["RemoteSource", "copied", "is_url", "matching", "open_url", "shown"]
+__all__ = ["RemoteSource", "copied", "is_url", "matching", "open_store", "open_url", "shown"]

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.remote.names import is_web, shown
 
-__all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed"]
+__all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store"]
 
 _T = TypeVar("_T")
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
@@ -75,7 +75,7 @@ def listed(folder: str) -> Iterator[str]:
         for name in _asked(folder, lambda: system.find(path)):
             yield f"{scheme}://{name.lstrip('/') if not path.startswith('/') else name}"
         return
-    store, path = _store(folder)
+    store, path = open_store(folder)
     bucket = folder.removesuffix(path).rstrip("/")
 
     def names() -> list[str]:
@@ -96,13 +96,21 @@ def changed(url: str) -> RecordingError:
 # ---- obstore
 
 
-def _store(url: str) -> tuple[Any, str]:
-    """The store of a URL, and the path in it."""
+def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
+    """The store of a URL, as obstore has it, and the path in it; what is asked of it is given up after `within`.
+
+    Raises:
+        MissingExtraError: obstore is not installed.
+        RecordingError: the URL is none.
+    """
     try:
         from obstore.store import HTTPStore, from_url
     except ImportError as err:
         raise missing_extra(f"reading {shown(url)} needs obstore", "remote") from err
     options: Any = {"client_options": _CLIENT, "retry_config": _RETRIES}
+    if within is not None:
+        options["client_options"] = {**_CLIENT, "timeout": f"{within.total_seconds():.0f}s"}
+        options["retry_config"] = {**_RETRIES, "retry_timeout": within}
     parts = urlsplit(url)
     if is_web(url):
         return _asked(url, lambda: HTTPStore.from_url(url, **options)), ""
@@ -128,7 +136,7 @@ class _StoredObject:
 
     def __init__(self, url: str) -> None:
         self._url = url
-        self._store, self._path = _store(url)
+        self._store, self._path = open_store(url)
 
     def tail(self, length: int) -> End:
         from obstore.exceptions import NotSupportedError

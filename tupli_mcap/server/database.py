@@ -23,9 +23,9 @@ from sqlalchemy.exc import (
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server import migrations, tables
-from tupli_mcap.storage.texts import escape_text
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["Database", "UnavailableError", "audience", "audit", "pend", "settle"]
+__all__ = ["Database", "UnavailableError", "audience", "audit", "demand_pending", "pend", "pending", "settle"]
 
 _BUSY_MS = 30_000
 _WRITERS = 0x7475_706C  # the number of the lock that a writer holds on PostgreSQL
@@ -112,6 +112,19 @@ def pend(connection: Connection, name: str) -> None:
 def settle(connection: Connection, name: str) -> None:
     """Notes that a file has come, or is gone."""
     connection.execute(delete(tables.PENDING).where(tables.PENDING.c.path == escape_text(name)))
+
+
+def pending(connection: Connection, *, seconds: float) -> list[str]:
+    """The files that have been pending for so long."""
+    old = select(tables.PENDING.c.path).where(tables.PENDING.c.since <= time.time() - seconds)
+    return [unescape_text(path) for path in connection.execute(old).scalars()]
+
+
+def demand_pending(connection: Connection, name: str) -> None:
+    """Raises UnavailableError if a file is not pending any more: it took too long to come, and was deleted."""
+    there = select(tables.PENDING.c.path).where(tables.PENDING.c.path == escape_text(name))
+    if connection.execute(there).first() is None:
+        raise UnavailableError(f"{name} took too long to come; send it again")
 
 
 def _engine(url: str) -> Engine:

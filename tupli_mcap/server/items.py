@@ -25,9 +25,10 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.schema.times import time_ns
-from tupli_mcap.server.blobs import Blobs
+from tupli_mcap.server import quotas
 from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
+from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
@@ -43,10 +44,10 @@ _DELETE: Final = {"benchmark": Right.BENCHMARK_DELETE, "artifact": Right.ARTIFAC
 
 
 class Items:
-    """The benchmarks and artifacts that a caller may see; bytes of artifacts lie in `blobs`."""
+    """The benchmarks and artifacts that a caller may see."""
 
-    def __init__(self, blobs: Blobs) -> None:
-        self._blobs = blobs
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
 
     # --- benchmarks ---
 
@@ -68,7 +69,9 @@ class Items:
                 created_by=caller.name,
                 environment=name_in(document),
             )
-            own = self._add(connection, "benchmark", header, content=query.serialized, needs=needs)
+            size = len(query.serialized)
+            quotas.demand_room(connection, self._settings, caller, size)
+            own = self._add(connection, "benchmark", header, content=query.serialized, needs=needs, size=size)
             audit(connection, caller.name, "store_benchmark", uri)
         return _benchmark(own)
 
@@ -95,16 +98,20 @@ class Items:
     def store_artifact(
         self, connection: Connection, caller: Caller, data: bytes, metadata: ArtifactMetadata
     ) -> ArtifactMetadataItem:
-        """As `TupliStorage.store_artifact`."""
+        """As `TupliStorage.store_artifact`; the bytes are kept under `artifact_key` by now."""
         caller.demand(Right.ARTIFACT_CREATE, caller.name)
         uri = sha256(data)
         own = self._own(connection, caller, "artifact", uri)
         if own is None:
             item = ArtifactMetadataItem.create_new(**dict(metadata), id=uri, hash=uri, created_by=caller.name)
-            own = self._add(connection, "artifact", item)
-            self._blobs.write(artifact_key(uri), data)
+            own = self._add(connection, "artifact", item, size=len(data))
             audit(connection, caller.name, "store_artifact", uri)
         return _artifact(own)
+
+    def has_artifact(self, connection: Connection, caller: Caller, data: bytes) -> bool:
+        """Whether a caller, who may store artifacts, has stored these bytes already."""
+        caller.demand(Right.ARTIFACT_CREATE, caller.name)
+        return self._own(connection, caller, "artifact", sha256(data)) is not None
 
     def load_artifact(self, connection: Connection, caller: Caller, uri: str) -> ArtifactMetadataItem:
         """What is known of a readable artifact, whose bytes are under `artifact_key`."""
@@ -179,6 +186,7 @@ class Items:
         *,
         content: str | None = None,
         needs: Sequence[str] = (),
+        size: int,
     ) -> Row[Any]:
         header = plain(item)
         row = {
@@ -189,6 +197,7 @@ class Items:
             "header": json.dumps(header),
             "content": content,
             "needs": json.dumps(list(needs)),
+            "size": size,
         }
         connection.execute(insert(ITEM).values(**row))
         own = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == item.id, ITEM.c.created_by == item.created_by)

@@ -7,7 +7,6 @@ import hashlib
 import os
 import secrets
 import tempfile
-import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
 from tupli_mcap.recording import Recording, write_recording
 from tupli_mcap.schema import (
@@ -26,17 +26,17 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     EpisodeItem,
 )
-from tupli_mcap.server import episodes
-from tupli_mcap.server.blobs import DirectoryBlobs
-from tupli_mcap.server.database import Database, pend, settle
+from tupli_mcap.server import episodes, quotas
+from tupli_mcap.server.blobs import Blobs, BucketBlobs, DirectoryBlobs
+from tupli_mcap.server.database import Database, UnavailableError, demand_pending, pend, pending, settle
 from tupli_mcap.server.items import Items, artifact_key
-from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people import accounts, throttle
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
-from tupli_mcap.server.people.throttle import Throttle, TooManyError
+from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, PENDING, USER
-from tupli_mcap.server.uploads import Upload, Uploads
+from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
+from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 from tupli_mcap.storage.from_values import episode_data, episode_spaces
@@ -48,7 +48,6 @@ __all__ = ["Library"]
 
 _ADMIN = "admin"
 _PASSWORD_VARIABLE = "TUPLI_MCAP_ADMIN_PASSWORD"
-_PENDING_SECONDS = 600.0  # by then a file has come or gone, or the process that moved it has ended
 _MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
@@ -63,15 +62,15 @@ class Library:
         self.settings = settings
         settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.database = Database(settings.database or f"sqlite:///{settings.own / 'server.sqlite'}")
-        self.blobs = DirectoryBlobs(settings.directory)
-        self.items = Items(self.blobs)
+        self.blobs: Blobs = (
+            BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory)
+        )
+        self.items = Items(settings)
         self.tokens = Tokens(settings)
-        self.throttle = Throttle()
         self.uploads = Uploads(settings.own / "uploads")
         with self.database.writing() as connection:
             accounts.prepare(connection)
-        self.uploads.forget_old()
-        self.sweep(self._pending(seconds=_PENDING_SECONDS))
+        self.look_after()
 
     def first_password(self) -> str | None:
         """Makes the user `admin` where there is none; returns the password if nobody has chosen it."""
@@ -90,9 +89,10 @@ class Library:
         Files stay where they are. What changes there while the server runs is noticed when it starts again.
         """
         with self.database.reading() as connection:
+            coming = set(pending(connection, seconds=0))
             admin = accounts.caller_named(connection, _ADMIN)
             sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
-        if admin is None or not is_storage(self.settings.directory):
+        if admin is None or self.settings.blobs or not is_storage(self.settings.directory):
             return 0
         with FileStorage(self.settings.directory) as storage:
             for item in storage.list_artifacts():
@@ -105,13 +105,12 @@ class Library:
                 )
                 with self.database.writing() as connection:
                     self.items.store_benchmark(connection, admin, query)
-        pending = set(self._pending(seconds=0))
         new = [
             item.relative
             for item in sorted(scan(self.settings.directory))
             if not item.relative.startswith(f"{self.settings.own.name}/")
             and sizes.get(escape_text(item.relative)) != item.stamp.size
-            and item.relative not in pending
+            and item.relative not in coming
         ]
         return sum(self._adopt(admin, name) for name in new)
 
@@ -140,28 +139,59 @@ class Library:
         """
         # Failures of a user from an address: somebody elsewhere must not keep the user out.
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
-        wait = self.throttle.wait(most)
-        if wait > 0:
+        with self.database.reading() as connection:
+            wait = throttle.seconds_to_wait(connection, most)
+            right = not wait and accounts.verify_password(connection, username, password)
+        if wait:
             raise TooManyError(wait)
         with self.database.writing() as connection:
-            if accounts.verify_password(connection, username, password):
+            if right:
                 return self.tokens.pair(connection, username)
-        self.throttle.failed(most)
+            throttle.note_failure(connection, most)
         raise SignInError("Incorrect username or password")
 
-    def take_in(self, caller: Caller, upload: Upload) -> str:
-        """Stores a recording that was uploaded as a whole; returns its name.
+    def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
+        """A new upload, or the one of the same bytes that the caller has begun; or the name of the recording, if they
+        have stored it already.
 
         Raises:
-            StorageError: its bytes are not those that were announced, or it is no recording, or has no episodes.
+            FullError: they may not keep so much.
+            TooManyUploadsError: they have begun too many.
         """
-        self.uploads.verify(upload)
+        with self.database.writing() as connection:
+            known = episodes.stored_already(connection, caller, digest)
+            if known is not None:
+                return known
+            most = self.settings.max_uploads
+            found = self.uploads.begin(connection, caller, length, digest, sent_before=sent_before, most=most)
+            quotas.demand_room(connection, self.settings, caller, 0)  # the upload is counted by now
+        return found
+
+    def take_in(self, caller: Caller, incoming: Incoming) -> str:
+        """Stores a recording that was uploaded as a whole; returns its name. Where the server fails, the upload stays.
+
+        Raises:
+            ChecksumError: its bytes are not those that were announced.
+            StorageError: it is no recording, or has no episodes.
+        """
+        upload = incoming.upload
         try:
+            incoming.verify()
             with self.database.reading() as connection:
                 known = episodes.stored_already(connection, caller, upload.digest)
-            return known or self._keep(caller, upload.path, upload.digest, upload.sent_before)
-        finally:
-            self.uploads.forget(upload)
+            name = known or self._keep(caller, upload.path, upload.digest, upload.sent_before)
+        except UnavailableError:
+            raise
+        except TupliError:
+            self.forget_upload(upload)
+            raise
+        self.forget_upload(upload)
+        return name
+
+    def forget_upload(self, upload: Upload) -> None:
+        """Deletes an upload."""
+        with self.database.writing() as connection:
+            self.uploads.forget(connection, upload)
 
     def record(self, caller: Caller, episode: Episode) -> str:
         """Stores an episode that was built by hand as a recording; returns its name.
@@ -189,19 +219,22 @@ class Library:
             )
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
+            with self.database.reading() as connection:
+                quotas.demand_room(connection, self.settings, caller, path.stat().st_size)
             return self._keep(caller, path, digest)
 
     def _keep(self, caller: Caller, path: Path, digest: str, sent_before: int = 0) -> str:
-        """Moves a recording to where it stays, and lists its episodes; returns its name."""
+        """Puts a recording where it stays, and lists its episodes; returns its name."""
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
             place = episodes.new_name(recording.benchmark_id)
             with self.database.writing() as connection:
                 pend(connection, place)
-            self.blobs.take(place, path)
             try:
+                self.blobs.keep(place, path)
                 with self.database.writing() as connection:
+                    demand_pending(connection, place)
                     name, replaced = episodes.register(
                         connection, caller, recording, place, digest, sent_before=sent_before
                     )
@@ -248,8 +281,25 @@ class Library:
 
     def store_artifact(self, caller: Caller, data: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
         """As `TupliStorage.store_artifact`."""
+        key = artifact_key(sha256(data))
         with self.database.writing() as connection:
-            return self.items.store_artifact(connection, caller, data, metadata)
+            if self.items.has_artifact(connection, caller, data):
+                return self.items.store_artifact(connection, caller, data, metadata)
+            quotas.demand_room(connection, self.settings, caller, len(data))
+        try:
+            while True:
+                with self.database.writing() as connection:
+                    pend(connection, key)
+                self.blobs.write(key, data)
+                with self.database.writing() as connection:
+                    if (
+                        self.blobs.size(key) is not None
+                    ):  # else somebody has deleted the same artifact of theirs
+                        settle(connection, key)
+                        return self.items.store_artifact(connection, caller, data, metadata)
+        except BaseException:
+            self.sweep([key])
+            raise
 
     def delete_artifact(self, caller: Caller, uri: str, *, force: bool) -> None:
         """Deletes an artifact, and its bytes if nobody else has it."""
@@ -258,9 +308,10 @@ class Library:
         self.sweep([artifact_key(uri)])
 
     def sweep(self, names: Iterable[str]) -> None:
-        """Deletes files that are pending and that nothing in the database names, while nobody adds any."""
+        """Deletes files that are pending and that nothing in the database names, while nobody adds any. What cannot be
+        deleted now stays pending."""
         for name in names:
-            with self.database.writing() as connection:
+            with contextlib.suppress(UnavailableError), self.database.writing() as connection:
                 uri = name.removeprefix("artifacts/")
                 files = select(FILE.c.path).where(FILE.c.place == escape_text(name))
                 items = select(ITEM.c.number).where(ITEM.c.kind == "artifact", ITEM.c.id == uri)
@@ -268,18 +319,14 @@ class Library:
                     self.blobs.delete(name)
                 settle(connection, name)
 
-    def _pending(self, *, seconds: float) -> list[str]:
-        """The files that have been pending for so long."""
-        old = select(PENDING.c.path).where(PENDING.c.since <= time.time() - seconds)
+    def look_after(self) -> None:
+        """Deletes what nobody needs any more: files that nothing names, and uploads that nobody has gone on with. To be
+        called now and then."""
+        with self.database.writing() as connection:
+            self.uploads.forget_old(connection)
         with self.database.reading() as connection:
-            return [unescape_text(path) for path in connection.execute(old).scalars()]
-
-    def path_of(self, name: str) -> Path:
-        """The file of a recording, or of an artifact."""
-        path = Path(self.blobs.place(name))
-        if not path.is_file():
-            raise StorageError(f"the server has lost {name}; restore it from a backup")
-        return path
+            old = pending(connection, seconds=self.settings.pending_seconds)
+        self.sweep(old)
 
     def close(self) -> None:
         """Close the database."""

@@ -11,15 +11,21 @@ __all__ = ["Settings"]
 @dataclass(frozen=True)
 class Settings:
     """directory: what the server keeps, made if it is missing. database: a SQLAlchemy URL, by default SQLite in the
-    directory.
+    directory. blobs: the URL of a bucket for recordings and artifacts, by default the directory. presigned: whether
+    clients can reach the bucket, and are sent there. accel: where nginx, before this server, has the directory.
 
     open_signup: whether everybody may make a user. guests: whether what is published in `global` is shown without a
     sign-in. access_seconds, refresh_seconds, ticket_seconds: how long tokens are valid, and addresses of recordings.
-    max_upload, max_body: bytes of a recording, and of any other request. max_page: items of a page.
+    max_upload, max_body: bytes of a recording, and of any other request. max_page: items of a page. quota: bytes that
+    each user may keep, if that is limited. max_uploads: unfinished ones of a user. pending_seconds: by then, a file has
+    come or gone, or who moved it was killed.
     """
 
     directory: Path
     database: str = ""
+    blobs: str = ""
+    presigned: bool = False
+    accel: str = ""
     open_signup: bool = False
     guests: bool = False
     access_seconds: int = 30 * 60
@@ -28,6 +34,9 @@ class Settings:
     max_upload: int = 1 << 40
     max_body: int = 256 << 20
     max_page: int = 1000
+    max_uploads: int = 100
+    quota: int | None = None
+    pending_seconds: float = 24 * 3600
 
     @property
     def own(self) -> Path:

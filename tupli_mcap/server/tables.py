@@ -12,6 +12,7 @@ __all__ = [
     "API_TOKEN",
     "AUDIENCE",
     "AUDIT",
+    "FAILURE",
     "FILE",
     "GROUP",
     "ITEM",
@@ -21,6 +22,7 @@ __all__ = [
     "PRINCIPAL",
     "REFRESH_TOKEN",
     "ROLE",
+    "UPLOAD",
     "USER",
 ]
 
@@ -41,6 +43,7 @@ USER: Final = Table(
     Column("password", TEXT, nullable=False),  # its hash
     Column("epoch", NUMBER, nullable=False),  # tokens of an earlier one are void
     Column("created_at", NUMBER, nullable=False),  # seconds since 1970, as all times here
+    Column("quota", NUMBER),  # bytes; NULL where that of the settings holds
 )
 
 GROUP: Final = Table(
@@ -101,6 +104,7 @@ ITEM: Final = Table(
     Column("header", TEXT, nullable=False),  # JSON: what is listed of it, but who made it and who sees it
     Column("content", TEXT),  # a benchmark's environment as text
     Column("needs", TEXT, nullable=False),  # JSON: ids of the artifacts that a benchmark needs
+    Column("size", NUMBER, nullable=False, server_default="0"),  # bytes of its content
     UniqueConstraint("kind", "id", "created_by"),
     Index("ix_item_id", "id"),
 )
@@ -133,6 +137,27 @@ PENDING: Final = Table(
     METADATA,
     Column("path", TEXT, primary_key=True),
     Column("since", NUMBER, nullable=False),
+)
+
+# Recordings of which some bytes may have come, in a file that is named by the id.
+UPLOAD: Final = Table(
+    "upload",
+    METADATA,
+    Column("id", TEXT, primary_key=True),
+    Column("user", TEXT, nullable=False, index=True),
+    Column("length", NUMBER, nullable=False),
+    Column("digest", TEXT, nullable=False),
+    Column("sent_before", NUMBER, nullable=False),
+    Column("since", NUMBER, nullable=False),
+)
+
+# Sign-ins of the last minute that failed.
+FAILURE: Final = Table(
+    "failure",
+    METADATA,
+    Column("number", NUMBER, primary_key=True),
+    Column("key", TEXT, nullable=False, index=True),
+    Column("time", NUMBER, nullable=False, index=True),
 )
 
 AUDIT: Final = Table(

@@ -1,27 +1,40 @@
-"""Uploads of recordings that may be broken off and gone on with: files that grow, each of one user."""
+"""Uploads of recordings that may be broken off and gone on with: rows of a table, each with a file that grows.
+
+Every function that takes a connection works in a transaction of its caller's. Any process of the server may go on with
+an upload; who does holds a lock on its file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
-import json
 import os
-import re
 import secrets
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, Final, NamedTuple
+
+from sqlalchemy import Connection, Row, delete, func, insert, select
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
-from tupli_mcap.storage.atomic import write_bytes
+from tupli_mcap.server.tables import UPLOAD
+from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["BusyError", "ChecksumError", "GoneError", "Upload", "Uploads"]
+__all__ = [
+    "BusyError",
+    "ChecksumError",
+    "GoneError",
+    "Incoming",
+    "TooLargeError",
+    "TooManyUploadsError",
+    "Upload",
+    "Uploads",
+]
 
-_ID = re.compile("[0-9a-f]{32}")
-_KEPT_SECONDS = 7 * 24 * 3600
+_KEPT_SECONDS: Final = 7 * 24 * 3600
 
 
 class BusyError(StorageError):
@@ -36,13 +49,20 @@ class ChecksumError(StorageError):
     """The bytes that have come are not those that were announced."""
 
 
+class TooLargeError(StorageError):
+    """What is sent is larger than it may be."""
+
+
+class TooManyUploadsError(StorageError):
+    """A user has begun too many uploads."""
+
+
 class Upload(NamedTuple):
     """id: what it goes by. path: the file that holds what has come. length, digest: its bytes and their SHA-256 in the
     end. sent_before: episodes with lower numbers were sent before, in parts."""
 
     id: str
     path: Path
-    user: str
     length: int
     digest: str
     sent_before: int = 0
@@ -53,84 +73,110 @@ class Upload(NamedTuple):
         return self.path.stat().st_size if self.path.exists() else 0
 
 
-class Uploads:
-    """Uploads below a directory, from any thread."""
+class Incoming:
+    """The file of an upload while one request writes to it."""
 
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
-        self._busy: set[str] = set()
-        self._turn = threading.Lock()
+    def __init__(self, upload: Upload, file: IO[bytes]) -> None:
+        self.upload = upload
+        self.offset = os.fstat(file.fileno()).st_size
+        self._file = file
+        self._hash = hashlib.sha256() if self.offset == 0 else None
 
-    def begin(self, caller: Caller, length: int, digest: str, sent_before: int = 0) -> Upload:
-        """A new upload, or the one of the same bytes that this user has begun."""
-        for path in self._directory.glob("*.json"):
-            known = self._read(path.stem)
-            if known is not None and (known.user, known.length, known.digest) == (
-                caller.name,
-                length,
-                digest,
-            ):
-                return known
-        upload = secrets.token_hex(16)
-        told = {"user": caller.name, "length": length, "digest": digest, "sent_before": sent_before}
-        self._directory.mkdir(parents=True, exist_ok=True)
-        (self._directory / upload).touch()
-        write_bytes(self._directory / f"{upload}.json", json.dumps(told).encode())
-        return Upload(upload, self._directory / upload, caller.name, length, digest, sent_before)
+    def write(self, data: bytes | bytearray) -> None:
+        """Appends bytes."""
+        left = memoryview(data)
+        with os_errors("cannot write", self.upload.path):
+            while left:
+                left = left[self._file.write(left) :]
+        self.offset += len(data)
+        if self._hash is not None:
+            self._hash.update(data)
 
-    def find(self, caller: Caller, upload: str) -> Upload:
-        """An upload of this user. GoneError if there is none."""
-        found = self._read(upload) if _ID.fullmatch(upload) else None
-        if found is None or found.user != caller.name:
-            raise GoneError("there is no such upload; begin a new one")
-        return found
-
-    @contextlib.contextmanager
-    def alone(self, upload: Upload) -> Iterator[None]:
-        """Keeps others from writing to an upload. BusyError while somebody does."""
-        with self._turn:
-            if upload.id in self._busy:
-                raise BusyError("this upload is being written by another request; try again later")
-            self._busy.add(upload.id)
-        try:
-            yield
-        finally:
-            with self._turn:
-                self._busy.discard(upload.id)
-
-    def verify(self, upload: Upload) -> None:
+    def verify(self) -> None:
         """Checks the bytes of an upload that is whole, and makes them durable.
 
         Raises:
-            ChecksumError: they are not those that were announced; the upload is forgotten.
+            ChecksumError: they are not those that were announced.
         """
-        with upload.path.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-            os.fsync(file.fileno())
-        if found != upload.digest:
-            self.forget(upload)
+        with os_errors("cannot write", self.upload.path):
+            os.fsync(self._file.fileno())
+            found = self._hash or self._read()
+        if found.hexdigest() != self.upload.digest:
             raise ChecksumError(
-                f"expected bytes with the SHA-256 {upload.digest}, found {found}; send them again"
+                f"expected bytes with the SHA-256 {self.upload.digest}, found {found.hexdigest()}; send them again"
             )
 
-    def forget(self, upload: Upload) -> None:
-        """Deletes an upload; nothing happens if it is gone."""
-        upload.path.unlink(missing_ok=True)
-        (self._directory / f"{upload.id}.json").unlink(missing_ok=True)
+    def _read(self) -> Any:
+        with self.upload.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256")
 
-    def forget_old(self) -> None:
-        """Deletes the uploads that nobody has gone on with for a week."""
-        for path in self._directory.glob("*.json"):
-            upload = self._read(path.stem)
-            if upload is not None and upload.path.stat().st_mtime < time.time() - _KEPT_SECONDS:
-                self.forget(upload)
 
-    def _read(self, upload: str) -> Upload | None:
-        path = self._directory / upload
-        try:
-            told = json.loads((self._directory / f"{upload}.json").read_bytes())
-        except (OSError, ValueError):
-            return None
-        if not path.exists():
-            return None
-        return Upload(upload, path, told["user"], told["length"], told["digest"], told.get("sent_before", 0))
+class Uploads:
+    """The uploads of a server, whose files are in a directory."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        directory.mkdir(parents=True, exist_ok=True)
+
+    def begin(
+        self, connection: Connection, caller: Caller, length: int, digest: str, *, sent_before: int, most: int
+    ) -> Upload:
+        """A new upload, or the one of the same bytes that this user has begun.
+
+        Raises:
+            TooManyUploadsError: they have begun `most` others.
+        """
+        own = select(UPLOAD).where(UPLOAD.c.user == caller.name)
+        same = own.where(UPLOAD.c.digest == digest, UPLOAD.c.length == length)
+        known = connection.execute(same).first()
+        if known is not None:
+            return self._upload(known)
+        count = connection.execute(select(func.count()).select_from(own.subquery())).scalar_one()
+        if count >= most:
+            raise TooManyUploadsError(
+                f"expected at most {most} unfinished uploads of {caller.name}, found {count}; finish or delete some"
+            )
+        number = secrets.token_hex(16)
+        told = {"id": number, "user": caller.name, "since": int(time.time())}
+        row = {**told, "length": length, "digest": digest, "sent_before": sent_before}
+        connection.execute(insert(UPLOAD).values(**row))
+        return Upload(number, self._directory / number, length, digest, sent_before)
+
+    def find(self, connection: Connection, caller: Caller, upload: str) -> Upload:
+        """An upload of this user. GoneError if there is none."""
+        query = select(UPLOAD).where(UPLOAD.c.id == upload, UPLOAD.c.user == caller.name)
+        found = connection.execute(query).first()
+        if found is None:
+            raise GoneError("there is no such upload; begin a new one")
+        return self._upload(found)
+
+    @contextlib.contextmanager
+    def writing(self, upload: Upload) -> Iterator[Incoming]:
+        """Opens the file of an upload, for one request at a time. BusyError while another one writes to it."""
+        with os_errors("cannot write", upload.path), upload.path.open("ab", buffering=0) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BusyError("this upload is being written by another request; try again later") from None
+            yield Incoming(upload, file)
+
+    def forget(self, connection: Connection, upload: Upload) -> None:
+        """Deletes an upload; nothing happens if it is gone. Its file may stay until `forget_old`."""
+        connection.execute(delete(UPLOAD).where(UPLOAD.c.id == upload.id))
+        with contextlib.suppress(OSError):
+            upload.path.unlink()
+
+    def forget_old(self, connection: Connection) -> None:
+        """Deletes the uploads that nobody has gone on with for a week, and files that are of none."""
+        old = time.time() - _KEPT_SECONDS
+        known = {row.id: self._upload(row) for row in connection.execute(select(UPLOAD))}
+        for row in connection.execute(select(UPLOAD.c.id).where(UPLOAD.c.since < old)).all():
+            upload = known[row.id]
+            if not upload.path.exists() or upload.path.stat().st_mtime < old:
+                self.forget(connection, known.pop(row.id))
+        for path in self._directory.iterdir():
+            if path.name not in known:
+                path.unlink(missing_ok=True)
+
+    def _upload(self, row: Row[Any]) -> Upload:
+        return Upload(row.id, self._directory / row.id, row.length, row.digest, row.sent_before)

@@ -16,17 +16,20 @@ from tupli_mcap.errors import (
     FormatError,
     MissingExtraError,
     NotFoundError,
+    RecordingError,
     SpaceError,
     StorageError,
     TupliError,
 )
 from tupli_mcap.schema import BaseFilter
+from tupli_mcap.server.blobs import LostError
 from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError
+from tupli_mcap.server.quotas import FullError
+from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
 
 __all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
 
@@ -39,7 +42,12 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     GoneError: 410,
     BusyError: 423,
     ChecksumError: 460,  # as tus has it
+    TooLargeError: 413,
+    TooManyUploadsError: 429,
     UnavailableError: 503,
+    RecordingError: 503,  # a file that is kept cannot be opened
+    FullError: 507,
+    LostError: 500,
     FilterError: 400,
     SpaceError: 400,
     FormatError: 400,

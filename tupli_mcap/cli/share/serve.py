@@ -29,6 +29,17 @@ def serve(
             help="Such as postgresql+psycopg://…; SQLite in DIR by default.",
         ),
     ] = "",
+    blobs: Annotated[
+        str,
+        typer.Option(
+            envvar="TUPLI_MCAP_BLOBS",
+            metavar="URL",
+            help="A bucket for recordings and artifacts, such as s3://lab/server; DIR by default.",
+        ),
+    ] = "",
+    presigned: Annotated[
+        bool, typer.Option("--presigned", help="Send clients to the bucket, which they must reach.")
+    ] = False,
 ) -> None:
     """Share benchmarks and recordings with others over HTTP.
 
@@ -46,5 +57,12 @@ def serve(
             say(f"user admin, password {password} (shown this once; `tupli-mcap password` changes it)")
         say(f"serving {directory} at {address} (Ctrl-C ends it)")
 
-    settings = Settings(directory.absolute(), database=database, open_signup=open_signup, guests=guests)
+    settings = Settings(
+        directory.absolute(),
+        database=database,
+        blobs=blobs,
+        presigned=presigned,
+        open_signup=open_signup,
+        guests=guests,
+    )
     run(settings, host, port, tell)

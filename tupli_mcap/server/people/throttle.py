@@ -1,18 +1,20 @@
-"""Who tries passwords may not try many."""
+"""Who tries passwords may not try many. Every function works in a transaction of its caller's."""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections import deque
 from collections.abc import Mapping
 from typing import Final
 
+from sqlalchemy import Connection, delete, func, insert, select
+
 from tupli_mcap.errors import TupliError
+from tupli_mcap.server.tables import FAILURE
+from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["Throttle", "TooManyError"]
+__all__ = ["TooManyError", "note_failure", "seconds_to_wait"]
 
-_SECONDS: Final = 60.0
+_SECONDS: Final = 60
 
 
 class TooManyError(TupliError):
@@ -23,28 +25,18 @@ class TooManyError(TupliError):
         self.seconds = seconds
 
 
-class Throttle:
-    """Counts failures of the last minute by key. Usable from any thread."""
+def seconds_to_wait(connection: Connection, most: Mapping[str, int]) -> int:
+    """Seconds until another try, where each key may have so many failures in a minute; 0 if it may be made now."""
+    now = int(time.time())
+    counted = select(FAILURE.c.key, func.count(), func.min(FAILURE.c.time)).group_by(FAILURE.c.key)
+    recent = counted.where(FAILURE.c.time > now - _SECONDS, FAILURE.c.key.in_(map(escape_text, most)))
+    full = {escape_text(key): allowed for key, allowed in most.items()}
+    first = [since for key, count, since in connection.execute(recent) if count >= full[key]]
+    return max((since + _SECONDS - now for since in first), default=0)
 
-    def __init__(self) -> None:
-        self._failures: dict[str, deque[float]] = {}
-        self._turn = threading.Lock()
 
-    def wait(self, most: Mapping[str, int]) -> float:
-        """Seconds until another try, where each key may have so many failures; 0 if it may be made now."""
-        now = time.monotonic()
-        with self._turn:
-            for key in list(self._failures):
-                times = self._failures[key]
-                while times and times[0] < now - _SECONDS:
-                    times.popleft()
-                if not times:
-                    del self._failures[key]
-            full = [self._failures[key] for key in most if len(self._failures.get(key, ())) >= most[key]]
-            return max((times[0] + _SECONDS - now for times in full), default=0.0)
-
-    def failed(self, most: Mapping[str, int]) -> None:
-        """Notes a failure of each key."""
-        with self._turn:
-            for key in most:
-                self._failures.setdefault(key, deque()).append(time.monotonic())
+def note_failure(connection: Connection, most: Mapping[str, int]) -> None:
+    """Notes a failure of each key."""
+    now = int(time.time())
+    connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
+    connection.execute(insert(FAILURE), [{"key": escape_text(key), "time": now} for key in most])

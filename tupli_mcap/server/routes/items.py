@@ -6,7 +6,6 @@ import base64
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Header, Request, Response
-from fastapi.responses import FileResponse
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
@@ -14,6 +13,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery, FilterEQ
 from tupli_mcap.server.items import artifact_key
+from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.wire import Found, Listing, answer, listed
 from tupli_mcap.storage.benchmark_json import restored
@@ -103,15 +103,11 @@ def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Bod
 
 
 @router.get("/artifacts/{uri}")
-def load_artifact(library: Served, caller: Reader, uri: str, request: Request) -> Response:
+def load_artifact(library: Served, caller: Reader, request: Request, uri: str) -> Response:
     """The bytes of an artifact; their SHA-256 is the `ETag`, and 304 the answer to an `If-None-Match` with it."""
     with library.database.reading() as connection:
         item = library.items.load_artifact(connection, caller, uri)
-    headers = {"ETag": f'"{item.id}"'}
-    if request.headers.get("If-None-Match") == headers["ETag"]:
-        return Response(status_code=304, headers=headers)
-    path = library.path_of(artifact_key(item.id))
-    return FileResponse(path, media_type="application/octet-stream", headers=headers)
+    return body_of(library, request, artifact_key(item.id), digest=item.id)
 
 
 @router.get("/artifacts/{uri}/users")

@@ -10,8 +10,7 @@ import json
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Depends, File, Form, Response
-from fastapi.responses import FileResponse
+from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel, ValidationError
 
@@ -34,6 +33,7 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
 from tupli_mcap.server.wire import answer
 from tupli_mcap.storage.texts import first_defect
@@ -325,13 +325,12 @@ def store_artifact(
 
 
 @router.get("/artifacts/download")
-def load_artifact(library: Served, caller: Reader, artifact_id: str) -> FileResponse:
+def load_artifact(library: Served, caller: Reader, request: Request, artifact_id: str) -> Response:
     """The bytes of an artifact; what is known of it is JSON in `X-Metadata`."""
     with _hidden(caller, "Artifact does not exist"), library.database.reading() as connection:
         item = library.items.load_artifact(connection, caller, artifact_id)
     told = json.dumps(item.model_dump(), default=str)  # in ASCII
-    path = library.path_of(artifact_key(item.id))
-    return FileResponse(path, media_type="application/octet-stream", headers={"X-Metadata": told})
+    return body_of(library, request, artifact_key(item.id), digest=item.id, headers={"X-Metadata": told})
 
 
 @router.post("/artifacts/list", response_model=list[ArtifactMetadataItem])

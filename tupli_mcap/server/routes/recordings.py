@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
 import re
@@ -10,17 +11,18 @@ from typing import Annotated
 from urllib.parse import quote
 
 from fastapi import APIRouter, Body, Header, HTTPException, Request, Response
-from fastapi.responses import FileResponse
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server import episodes
-from tupli_mcap.server.people.access import Right
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.people.access import Caller, Right
+from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.selection import EpisodeQuery, select_episodes
-from tupli_mcap.server.uploads import Upload
+from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
 from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["router"]
@@ -28,6 +30,7 @@ __all__ = ["router"]
 router = APIRouter(prefix="/v1", tags=["recordings"])
 _TUS = {"Tus-Resumable": "1.0.0"}
 _MEDIA = "application/octet-stream"
+_PIECE = 1 << 20  # bytes that are written at once
 
 
 class Named(BaseModel):
@@ -64,18 +67,14 @@ def begin_upload(
     """Begins an upload, or goes on with the one of the same bytes; says where if they are stored already."""
     caller.demand(Right.EPISODE_CREATE, caller.name)
     if upload_length > library.settings.max_upload:
-        raise HTTPException(
-            413, f"expected at most {library.settings.max_upload} bytes, found {upload_length}"
-        )
+        raise TooLargeError(f"expected at most {library.settings.max_upload} bytes, found {upload_length}")
     told = _metadata(upload_metadata)
     digest = told.get("sha256", "")
     if not is_hash(digest):
         raise StorageError("expected Upload-Metadata with `sha256`: 64 lower-case hex digits, in base64")
-    with library.database.reading() as connection:
-        known = episodes.stored_already(connection, caller, digest)
-    if known is not None:
-        return Response(status_code=200, headers={**_TUS, "Recording": known})
-    upload = library.uploads.begin(caller, upload_length, digest, _number(told.get("sent_before", "0")))
+    upload = library.begin_upload(caller, upload_length, digest, _number(told.get("sent_before", "0")))
+    if isinstance(upload, str):
+        return Response(status_code=200, headers={**_TUS, "Recording": upload})
     headers = {**_TUS, "Location": f"/v1/uploads/{upload.id}", "Upload-Offset": str(upload.offset)}
     return Response(status_code=201, headers=headers)
 
@@ -83,7 +82,7 @@ def begin_upload(
 @router.head("/uploads/{upload_id}")
 def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     """How much of an upload has come."""
-    upload = library.uploads.find(caller, upload_id)
+    upload = _find(library, caller, upload_id)
     told = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length)}
     return Response(headers={**_TUS, **told, "Cache-Control": "no-store"})
 
@@ -97,35 +96,50 @@ async def go_on_with_upload(
     upload_offset: Annotated[int, Header(ge=0)],
 ) -> Response:
     """Adds bytes to an upload. With the last ones it is stored, and `Recording` is its name."""
-    upload = library.uploads.find(caller, upload_id)
-    with library.uploads.alone(upload):
-        if upload.offset != upload_offset:
+    upload = await run_in_threadpool(_find, library, caller, upload_id)
+    with library.uploads.writing(upload) as incoming:
+        if incoming.offset != upload_offset:
             raise HTTPException(
-                409, f"expected bytes from {upload.offset} on", {"Upload-Offset": str(upload.offset)}
+                409, f"expected bytes from {incoming.offset} on", {"Upload-Offset": str(incoming.offset)}
             )
-        await _append(upload, request.stream())
-        told = {**_TUS, "Upload-Offset": str(upload.offset)}
-        if upload.offset == upload.length:
-            told["Upload-Offset"] = str(upload.length)
-            told["Recording"] = await run_in_threadpool(library.take_in, caller, upload)
+        await _append(incoming, request.stream())
+        told = {**_TUS, "Upload-Offset": str(incoming.offset)}
+        if incoming.offset == upload.length:
+            told["Recording"] = await run_in_threadpool(library.take_in, caller, incoming)
     return Response(status_code=204, headers=told)
 
 
 @router.delete("/uploads/{upload_id}", status_code=204)
 def end_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     """Forgets an upload."""
-    library.uploads.forget(library.uploads.find(caller, upload_id))
+    library.forget_upload(_find(library, caller, upload_id))
     return Response(status_code=204, headers=_TUS)
 
 
-async def _append(upload: Upload, pieces: AsyncIterator[bytes]) -> None:
-    room = upload.length - upload.offset
-    with upload.path.open("ab") as file:
+def _find(library: Library, caller: Caller, upload_id: str) -> Upload:
+    with library.database.reading() as connection:
+        return library.uploads.find(connection, caller, upload_id)
+
+
+async def _append(incoming: Incoming, pieces: AsyncIterator[bytes]) -> None:
+    """Writes what comes, while more is coming. What has come before a client went away is kept."""
+    room = incoming.upload.length - incoming.offset
+    coming, written = bytearray(), None
+    try:
         async for piece in pieces:
             room -= len(piece)
             if room < 0:
-                raise HTTPException(413, f"expected {upload.length} bytes in all, found more")
-            file.write(piece)
+                raise TooLargeError(f"expected {incoming.upload.length} bytes in all, found more")
+            coming += piece
+            if len(coming) >= _PIECE:
+                if written is not None:
+                    await written
+                written = asyncio.ensure_future(run_in_threadpool(incoming.write, coming))
+                coming = bytearray()
+    finally:
+        if written is not None:
+            await written
+        await run_in_threadpool(incoming.write, coming)
 
 
 def _metadata(text: str) -> dict[str, str]:
@@ -173,10 +187,4 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
     if not found.whole:
         return Response() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]
-    tag = f'"{found.digest}"'
-    wanted = request.headers.get("If-Match")
-    if wanted is not None and wanted.strip() != "*" and tag not in [t.strip() for t in wanted.split(",")]:
-        raise HTTPException(412, "the recording has changed; open it again")
-    return FileResponse(
-        library.path_of(found.place), media_type=_MEDIA, filename=file_name, headers={"ETag": tag}
-    )
+    return body_of(library, request, found.place, digest=found.digest, file_name=file_name)

@@ -239,7 +239,8 @@ class Session:
             try:
                 client = self.client
                 request = client.build_request(method, path, headers=headers, **options)
-                response = client.send(request, stream=stream, follow_redirects=stream)
+                # To a bucket, without the token; nothing that is sent goes elsewhere.
+                response = client.send(request, stream=stream, follow_redirects=method == "GET")
                 if attempt and method == "DELETE" and response.status_code == 404:
                     return httpx.Response(204)  # it was deleted, and the answer was lost
                 if attempt == last or response.status_code not in _LATER:

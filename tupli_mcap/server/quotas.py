@@ -1,0 +1,58 @@
+"""How much a user keeps, and may keep. Every function works in a transaction of its caller's."""
+
+from __future__ import annotations
+
+from sqlalchemy import Connection, func, select, update
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.tables import FILE, ITEM, UPLOAD, USER
+
+__all__ = ["FullError", "demand_room", "quota_of", "set_quota", "used_by"]
+
+
+class FullError(StorageError):
+    """A user keeps as much as they may."""
+
+
+def used_by(connection: Connection, user: str) -> int:
+    """The bytes of what a user has stored, and of the uploads that are not finished, as long as they will be."""
+    sums = (
+        select(func.coalesce(func.sum(size), 0)).where(owner == user)
+        for size, owner in (
+            (FILE.c.size, FILE.c.created_by),
+            (ITEM.c.size, ITEM.c.created_by),
+            (UPLOAD.c.length, UPLOAD.c.user),
+        )
+    )
+    return sum(int(connection.execute(each).scalar_one()) for each in sums)
+
+
+def quota_of(connection: Connection, settings: Settings, user: str) -> int | None:
+    """How many bytes a user may keep; None if nothing limits them."""
+    own: int | None = connection.execute(select(USER.c.quota).where(USER.c.name == user)).scalar()
+    return settings.quota if own is None else own
+
+
+def set_quota(connection: Connection, user: str, size: int | None) -> None:
+    """Gives a user a quota of their own; None is that of everybody.
+
+    Raises:
+        NotFoundError: there is no such user.
+    """
+    if not connection.execute(update(USER).where(USER.c.name == user).values(quota=size)).rowcount:
+        raise NotFoundError("User does not exist")
+
+
+def demand_room(connection: Connection, settings: Settings, caller: Caller, size: int) -> None:
+    """Raises FullError if a caller may not keep so many bytes more."""
+    allowed = quota_of(connection, settings, caller.name)
+    if allowed is None:
+        return
+    used = used_by(connection, caller.name)
+    if used + size > allowed:
+        raise FullError(
+            f"{caller.name} may keep {allowed} bytes, uses {used}, and these are {size} more; delete what you do not "
+            "need, or ask who runs the server for more"
+        )

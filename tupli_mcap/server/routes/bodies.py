@@ -1,0 +1,116 @@
+"""Bodies of answers: what is kept under a name, whole or a range of it, from wherever it can be had soonest.
+
+1. From a directory: the file, or where nginx stands before this server, its name for nginx (`X-Accel-Redirect`).
+2. From a bucket: where clients reach it, an address that is good for a while (307); else, piece by piece through here.
+
+A name never changes its content, so a version is pinned by whatever the place that sends it takes for its `ETag`. Here
+that is the SHA-256.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator
+from typing import Final
+from urllib.parse import quote
+
+from fastapi import HTTPException, Request, Response
+from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
+from tupli_mcap.server.library import Library
+
+__all__ = ["body_of"]
+
+_MEDIA: Final = "application/octet-stream"
+_SIGNED_SECONDS: Final = 3600
+_RANGE: Final = re.compile(r"bytes=(\d{0,19})-(\d{0,19})")
+
+
+def body_of(
+    library: Library,
+    request: Request,
+    name: str,
+    *,
+    digest: str,
+    file_name: str = "",
+    headers: dict[str, str] | None = None,
+) -> Response:
+    """The answer to a GET or HEAD for what is kept under a name, and has this SHA-256.
+
+    headers: more of them; the answer then comes through here.
+
+    Raises:
+        HTTPException: another version was asked for (412), or a range that is not there (416).
+        LostError: it is not there.
+        UnavailableError: the bucket does not answer.
+    """
+    blobs, settings = library.blobs, library.settings
+    tag = f'"{digest}"'
+    if request.headers.get("If-None-Match") == tag:
+        return Response(status_code=304, headers={"ETag": tag})
+    is_bucket = isinstance(blobs, BucketBlobs)
+    if isinstance(blobs, BucketBlobs) and settings.presigned and request.method == "GET" and not headers:
+        return RedirectResponse(blobs.signed(name, _SIGNED_SECONDS), 307, {"Cache-Control": "no-store"})
+    if not is_bucket and settings.accel and not headers:
+        told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **_disposition(file_name)}
+        return Response(headers=told, media_type=_MEDIA)
+    size = blobs.size(name)
+    if size is None:
+        raise LostError(f"the server has lost {name}; restore it from a backup")
+    _check_version(request, tag)
+    headers = {**(headers or {}), "ETag": tag, **_disposition(file_name)}
+    if not is_bucket:
+        return _File(blobs.place(name), headers=headers, media_type=_MEDIA)
+    return _from_bucket(blobs, request, name, size, tag, headers)
+
+
+def _from_bucket(
+    blobs: Blobs, request: Request, name: str, size: int, tag: str, headers: dict[str, str]
+) -> Response:
+    part = _range(request, tag, size)
+    start, stop = part or (0, size)
+    headers |= {"Content-Length": str(stop - start), "Accept-Ranges": "bytes"}
+    if part:
+        headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
+    status = 206 if part else 200
+    if request.method == "HEAD":
+        return Response(status_code=status, headers=headers, media_type=_MEDIA)
+    first = blobs.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
+    pieces = _pieces(blobs, name, first, start, stop)
+    return StreamingResponse(pieces, status, headers, media_type=_MEDIA)
+
+
+class _File(FileResponse):
+    chunk_size = 1 << 20
+
+
+async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) -> AsyncIterator[bytes]:
+    yield first
+    for begin in range(start + PIECE, stop, PIECE):
+        yield await run_in_threadpool(blobs.piece, name, begin, min(begin + PIECE, stop))
+
+
+def _disposition(file_name: str) -> dict[str, str]:
+    told = f"attachment; filename*=utf-8''{quote(file_name)}"
+    return {"Content-Disposition": told} if file_name else {}
+
+
+def _check_version(request: Request, tag: str) -> None:
+    wanted = request.headers.get("If-Match")
+    if wanted is not None and wanted.strip() != "*" and tag not in map(str.strip, wanted.split(",")):
+        raise HTTPException(412, "this has changed; open it again")
+
+
+def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
+    """The one range of bytes that is asked for; None if all of them are."""
+    found = _RANGE.fullmatch(request.headers.get("Range", "").strip())
+    if found is None or not any(found.groups()) or request.headers.get("If-Range", tag) != tag:
+        return None
+    first, last = found.groups()
+    start = int(first) if first else max(0, size - int(last))
+    stop = min(int(last) + 1, size) if first and last else size
+    if start >= size or start >= stop:
+        raise HTTPException(416, f"expected a range of {size} bytes", {"Content-Range": f"bytes */{size}"})
+    return start, stop
