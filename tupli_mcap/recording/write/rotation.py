@@ -124,13 +124,19 @@ class Rotation:
         while True:
             path, mode = self._paths[0], self._options.mode
             is_new = not os.path.lexists(path)
-            if is_new:
-                _make_folder(path)
+            made = _make_folders(path) if is_new else []
             try:
-                return self._open(path, "x" if self._folder is not None or (mode == "a" and is_new) else mode)
+                writer = self._open(
+                    path, "x" if self._folder is not None or (mode == "a" and is_new) else mode
+                )
             except RecordingError:
+                if not os.path.lexists(path.parent):  # another process has made it, and left it again
+                    continue
                 if self._folder is None or not os.path.lexists(path):
                     raise
+            else:
+                writer.own_folders = made
+                return writer
             self._paths = [self._new_in(self._folder)]  # another process has made a file of this name
 
     def _open(self, path: Path, mode: Mode) -> RecordingWriter:
@@ -181,14 +187,17 @@ def _is_folder(path: str | os.PathLike[str]) -> bool:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
 
 
-def _make_folder(path: Path) -> None:
-    """Makes the directories that a file is to be in."""
+def _make_folders(path: Path) -> list[Path]:
+    """Makes the directories that a file is to be in; returns those that were not there, the innermost one first."""
+    parents = Path(os.path.realpath(path)).parents
     try:
+        missing = list(itertools.takewhile(lambda folder: not folder.exists(), parents))
         path.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        pass  # opening the file says what is in the way
+        return []  # opening the file says what is in the way
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
+    return missing
 
 
 def series(path: Path) -> tuple[Path, dict[int, Path]]:

@@ -73,6 +73,7 @@ class RecordingWriter:
         self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
         self.closed = False
         self.failed = ""  # why nothing more can be recorded, where that is known
+        self.own_folders: Sequence[Path] = ()  # made for this file, the innermost one first
         self._told_deleted = False
         self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
         self.layout: StepLayout | None = None
@@ -553,6 +554,8 @@ class RecordingWriter:
             remove_unnamed(self.journal_place)
             if self._is_cut:
                 self.lock.unlink()
+            for folder in self.own_folders:
+                folder.rmdir()  # unless somebody else has put something into it
             if self._old_journal is not None:
                 remove_of_killed(self._old_journal, self.uuid)
         self.closed = True
