@@ -37,7 +37,8 @@ def public_names(module: str) -> Iterator[tuple[str, Any]]:
     """The names that a module documents, as users write them: those of the top level without their module."""
     with mock(["d3rlpy"]):  # which pins another Gymnasium
         door = importlib.import_module(module)
-    for name in door.__all__:
+    own = [name for name, value in vars(door).items() if getattr(value, "__module__", "") == module]
+    for name in getattr(door, "__all__", None) or [name for name in own if not name.startswith("_")]:
         value = getattr(door, name)
         short = getattr(tupli_mcap, name, None) is value if name in tupli_mcap.__all__ else False
         yield f"tupli_mcap.{name}" if short else f"{module}.{name}", value
