@@ -6,52 +6,67 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
-from tupli_mcap.dataset.dataset import Dataset
+import numpy as np
+from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
 from tupli_mcap.page.shelf import Shelf
-from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
+from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.recording.edit.stream import stream_excerpts
+from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["MOST_COMPARED", "film_file", "recording_file", "replay_file"]
+__all__ = ["MOST_COMPARED", "film_file", "recording_of", "replay_file", "streamed"]
 
 MOST_COMPARED = 8
 
 
-class _Source:
-    """A dataset's source that opens what a shelf shows."""
-
-    def __init__(self, shelf: Shelf) -> None:
-        self._shelf = shelf
-
-    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
-        return []
-
-    def episodes(
-        self,
-        benchmark_filter: BaseFilter | None,
-        episode_filter: BaseFilter | None,
-        seen: dict[str, Recording] | None = None,
-    ) -> list[EpisodeHeader]:
-        return []
-
-    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        return ""
-
-    def open(self, recording: str) -> Recording:
-        return self._shelf.open(recording)
-
-
-def recording_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
-    """A recording of exactly these episodes, in a directory of its own that the caller removes.
+def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingResponse:
+    """An answer that is a recording of exactly these episodes, made while it is sent.
 
     Raises:
-        RecordingError: they cannot be one recording.
-        SpaceError: they have different spaces.
+        SpaceError, RecordingError: they cannot be one recording.
     """
-    with _folder() as folder:
-        return Dataset(_Source(shelf), headers).save(folder / "episodes.mcap")
+    excerpts = []
+    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
+        recording = shelf.open(name)
+        numbers = [header.episode for header in group]
+        excerpts.append(Excerpt(recording, recording.index[np.isin(recording.index["episode"], numbers)]))
+    return streamed(contextlib.nullcontext(excerpts))
+
+
+def streamed(opening: AbstractContextManager[Sequence[Excerpt]], **headers: str) -> StreamingResponse:
+    """An answer that is a recording of these episodes, made while it is sent; see `stream_excerpts`.
+
+    Raises:
+        SpaceError, RecordingError: they cannot be merged. What goes wrong later ends the connection.
+    """
+    pieces = stream_excerpts(opening)
+    first = next(pieces)
+    return _Streamed(_after(first, pieces), media_type="application/octet-stream", headers=headers)
+
+
+def _after(first: bytes, pieces: Generator[bytes]) -> Generator[bytes]:
+    yield first
+    yield from pieces
+
+
+class _Streamed(StreamingResponse):
+    """An answer whose pieces are closed when it ends, also where its client goes away."""
+
+    def __init__(self, pieces: Generator[bytes], **more: Any) -> None:
+        super().__init__(pieces, **more)
+        self._pieces = pieces
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._pieces.close()
 
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:

@@ -156,7 +156,9 @@ class Dataset:
 
 def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
     """All of a shelf, the last recorded first."""
-    found = _grouped(_tallies(shelf, connection), {header.id: header for header in shelf.benchmarks()})
+    found = _grouped(
+        _tallies(shelf, connection), {header.id: header for header in shelf.benchmarks(connection)}
+    )
     return sorted(found, key=lambda dataset: (-dataset.last, dataset.name))
 
 
@@ -166,7 +168,7 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
     Raises:
         NotFoundError: there is none that may be read.
     """
-    benchmarks = {header.id: header for header in shelf.benchmarks() if header.id == key}
+    benchmarks = {h.id: h for h in shelf.benchmarks(connection, FilterEQ(key="id", value=key))}
     found = _grouped(_tallies(shelf, connection, of_dataset(key)), benchmarks)
     if not found:
         raise NotFoundError(f"there is no dataset {key[:80]!r} here")

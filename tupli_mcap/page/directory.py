@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
@@ -15,17 +14,18 @@ from sqlalchemy import ColumnElement, Connection, true
 
 from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BenchmarkHeader
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.entries import entry_of
 from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
 
-__all__ = ["DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
+__all__ = ["CACHE_BYTES", "DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
 
 T = TypeVar("T")
 _MOST_OPEN = 16
-_CACHE_BYTES = 64 << 20  # of each
+CACHE_BYTES = 64 << 20
+"""What each recording that is open keeps of its steps."""
 
 
 def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
@@ -45,21 +45,20 @@ class OpenedRecordings:
     """Keeps a few recordings open, from any thread: a picture of an episode takes a moment, opening its file longer."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[str, object], Recording] = OrderedDict()
+        self._kept: OrderedDict[Hashable, Recording] = OrderedDict()
         self._turn = threading.Lock()
 
-    def get(self, place: str | os.PathLike[str], version: object) -> Recording:
-        """The recording at a place. `version` tells it from what was there before; None: it changes all the time.
+    def get(self, key: Hashable, opening: Callable[[], Recording]) -> Recording:
+        """The recording of a key, which stands for one version of it; None: it changes all the time.
 
         It is closed when nobody holds it any more.
         """
-        key = os.fspath(place), version
         with self._turn:
-            if version is not None and key in self._kept:
+            if key is not None and key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        opened = Recording(place, cache_bytes=_CACHE_BYTES)
-        if version is not None and opened.complete:
+        opened = opening()
+        if key is not None and opened.complete:
             with self._turn:
                 self._kept[key] = opened
                 if len(self._kept) > _MOST_OPEN:
@@ -74,6 +73,7 @@ class _OpenToAll:
     """
 
     user = ""
+    places: Sequence[tuple[str, str]] = ()
 
     def __init__(self) -> None:
         self.ticket = secrets.token_urlsafe(16)
@@ -103,13 +103,15 @@ class DirectoryShelf(_OpenToAll):
         return self._storage.ask(question)
 
     def open(self, recording: str) -> Recording:
-        return self._opened.get(self.path_of(recording), _stamp(self._storage.root, recording))
+        return _opened(self._opened, self._storage.root, recording, self.path_of(recording))
 
     def path_of(self, recording: str) -> Path:
         return self._storage.recording_path(recording)
 
-    def benchmarks(self) -> Sequence[BenchmarkHeader]:
-        return self._storage.list_benchmarks()
+    def benchmarks(
+        self, connection: Connection, filter: BaseFilter | None = None
+    ) -> Sequence[BenchmarkHeader]:
+        return self._storage.list_benchmarks(filter)
 
 
 class FileShelf(_OpenToAll):
@@ -152,15 +154,23 @@ class FileShelf(_OpenToAll):
         self._known = None if entry.live else entry.stamp
 
     def open(self, recording: str) -> Recording:
-        return self._opened.get(self.path_of(recording), _stamp(self._path.parent, recording))
+        return _opened(self._opened, self._path.parent, recording, self.path_of(recording))
 
     def path_of(self, recording: str) -> Path:
         if recording != self._path.name:
             raise NotFoundError(f"there is no recording {recording[:200]!r} here")
         return self._path
 
-    def benchmarks(self) -> Sequence[BenchmarkHeader]:
+    def benchmarks(
+        self, connection: Connection, filter: BaseFilter | None = None
+    ) -> Sequence[BenchmarkHeader]:
         return []
+
+
+def _opened(kept: OpenedRecordings, root: Path, relative: str, path: Path) -> Recording:
+    stamp = _stamp(root, relative)
+    key = None if stamp is None else (relative, stamp)
+    return kept.get(key, lambda: Recording(path, cache_bytes=CACHE_BYTES))
 
 
 def _stamp(root: Path, relative: str) -> RecordingStamp | None:

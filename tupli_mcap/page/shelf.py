@@ -9,7 +9,7 @@ from sqlalchemy import ColumnElement, Connection, and_
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterIN
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.catalog.tables import EPISODE
 
@@ -24,13 +24,15 @@ class Shelf(Protocol):
     Attributes:
         title: what to call all of it.
         opened_by: what `tupli_mcap.open` is given to open it.
-        user: who reads; empty where nobody signs in.
+        user: who reads; empty where nobody is signed in.
+        places: other pages that the reader may go to: address and title.
         skipped: files that cannot be shown, and why, as of the last question.
     """
 
     title: str
     opened_by: str
     user: str
+    places: Sequence[tuple[str, str]]
 
     @property
     def skipped(self) -> Mapping[str, str]: ...
@@ -55,8 +57,10 @@ class Shelf(Protocol):
         """Where a viewer of another host may read a recording for a while: a path of this server; None for nowhere."""
         ...
 
-    def benchmarks(self) -> Sequence[BenchmarkHeader]:
-        """The benchmarks that may be read."""
+    def benchmarks(
+        self, connection: Connection, filter: BaseFilter | None = None
+    ) -> Sequence[BenchmarkHeader]:
+        """The benchmarks that may be read and that a filter is true of; within a question."""
         ...
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -19,7 +20,7 @@ from tupli_mcap import files, jsonvalue
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
-from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_file
+from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import of_dataset
 from tupli_mcap.page.routes.episode import Seen, look
@@ -88,7 +89,7 @@ def sparks(shelf: Shown, uris: Ids) -> Response:
 
 
 @router.get("/download")
-def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> FileResponse:
+def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Response:
     """One recording of exactly the chosen episodes, or else of all that a filter is true of."""
 
     def ask(connection: Connection) -> list[EpisodeHeader]:
@@ -103,7 +104,11 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Fi
         raise NotFoundError("there is no such episode; choose others")
     name = str(headers[0].run.get("name", "")) or Path(headers[0].recording).stem
     what = f"episode-{headers[0].episode}" if len(headers) == 1 else f"{len(headers)}-episodes"
-    return sent(recording_file(shelf, headers), f"{files.as_file_name(name)}-{what}.mcap")
+    answer = recording_of(shelf, headers)
+    answer.headers["Content-Disposition"] = (
+        f'attachment; filename="{quote(files.as_file_name(name))}-{what}.mcap"'
+    )
+    return answer
 
 
 @router.get("/episode/{uri}/film.mp4")
