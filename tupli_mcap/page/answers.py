@@ -9,6 +9,7 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Depends, Request, Response
 from fastapi.exceptions import RequestValidationError
+from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
@@ -20,7 +21,7 @@ from tupli_mcap.page import texts
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
-__all__ = ["POLICY", "PageRoute", "Shown", "address", "error_page", "page"]
+__all__ = ["POLICY", "PageRoute", "Shown", "SignInNeededError", "address", "error_page", "page"]
 
 POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
@@ -43,6 +44,10 @@ def _shelf(request: Request) -> Shelf:
 
 Shown = Annotated[Shelf, Depends(_shelf)]
 """The shelf, as who asks may see it."""
+
+
+class SignInNeededError(TupliError):
+    """Nobody is signed in, and who reads this has to be."""
 
 
 class PageRoute(APIRoute):
@@ -125,17 +130,38 @@ def _templates() -> Environment:
 
 
 def error_page(request: Request, err: Exception) -> Response:
-    """What is said of an error."""
-    if isinstance(err, HTTPException):
-        status, text = err.status_code, str(err.detail)
-    elif isinstance(err, RequestValidationError):
-        first = err.errors()[0]
-        status, text = 400, f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"
-    else:
-        kinds = ((NotFoundError, 404), (FilterError, 400), (MissingExtraError, 501))
-        status, text = next((code for kind, code in kinds if isinstance(err, kind)), 500), str(err)
+    """What is said of an error; who is not signed in and has to be, goes to the page for that."""
+    as_json = request.query_params.get("format") == "json"
+    if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
+        here = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+        return _with_headers(RedirectResponse(address("sign-in", next=here), 303))
+    status, text = _told(request, err)
     title = _TITLES.get(status, "This did not work")
     return _with_headers(page(request, "error.html", {"error": text}, status=status, title=title))
 
 
-_TITLES: Final = {400: "This cannot be shown", 404: "Not here", 501: "Something is not installed"}
+def _told(request: Request, err: Exception) -> tuple[int, str]:
+    """The status of an error, and what is said of it. An application may have words of its own for errors of ours."""
+    if isinstance(err, HTTPException):
+        return err.status_code, str(err.detail)
+    if isinstance(err, RequestValidationError):
+        first = err.errors()[0]
+        return 400, f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"
+    if isinstance(err, SignInNeededError):
+        return 401, str(err)
+    told: Callable[[Exception], tuple[int, str]] | None = getattr(request.app.state, "told", None)
+    return _status(err) if told is None else told(err)
+
+
+def _status(err: Exception) -> tuple[int, str]:
+    kinds = ((NotFoundError, 404), (FilterError, 400), (MissingExtraError, 501))
+    return next((code for kind, code in kinds if isinstance(err, kind)), 500), str(err)
+
+
+_TITLES: Final = {
+    400: "This cannot be shown",
+    401: "Not signed in",
+    403: "Not allowed",
+    404: "Not here",
+    501: "Something is not installed",
+}

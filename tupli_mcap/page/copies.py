@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fastapi.responses import StreamingResponse
+from fastapi.responses import FileResponse, StreamingResponse
+from starlette.background import BackgroundTask
 from starlette.types import Receive, Scope, Send
 
 from tupli_mcap.page.shelf import Shelf
@@ -20,9 +21,10 @@ from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["MOST_COMPARED", "film_file", "recording_of", "replay_file", "streamed"]
+__all__ = ["MOST_COMPARED", "film_file", "recording_of", "replay_file", "sent", "streamed"]
 
 MOST_COMPARED = 8
+_MEDIA = "application/octet-stream"
 
 
 def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingResponse:
@@ -47,7 +49,7 @@ def streamed(opening: AbstractContextManager[Sequence[Excerpt]], **headers: str)
     """
     pieces = stream_excerpts(opening)
     first = next(pieces)
-    return _Streamed(_after(first, pieces), media_type="application/octet-stream", headers=headers)
+    return _Streamed(_after(first, pieces), media_type=_MEDIA, headers=headers)
 
 
 def _after(first: bytes, pieces: Generator[bytes]) -> Generator[bytes]:
@@ -106,6 +108,12 @@ def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
     with _folder() as folder:
         film([recording.episodes[position]], folder / "episode.mp4")
         return folder / "episode.mp4"
+
+
+def sent(path: Path, name: str, media: str = _MEDIA) -> FileResponse:
+    """A file in a temporary directory of its own, which is removed when it was sent."""
+    gone = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
+    return FileResponse(path, media_type=media, filename=name, background=gone)
 
 
 @contextlib.contextmanager

@@ -73,7 +73,7 @@ def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> S
         recordings = _evenly(dataset.recordings, _RECORDINGS)
         share = _EPISODES / sum(item.episodes for item in recordings)
         rows = []
-        for ids in _batches(_ids(connection, recordings, share)):
+        for ids in _batches(_ids(shelf, connection, recordings, share)):
             rows += connection.execute(query.where(seen_episodes(shelf, EPISODE.c.id.in_(ids)))).all()
     rows.sort(key=lambda row: row[1])
     returns, steps, success, seeds = (np.array([row[i] for row in rows], np.float64) for i in range(2, 6))
@@ -146,7 +146,7 @@ def sample_numbers(
     """A few episodes of a few recordings of a dataset, by number."""
     found = []
     for item in _evenly(dataset.recordings, _OPENED):
-        ids = _ids(connection, [item], min(1.0, each / max(1, item.episodes)))
+        ids = _ids(shelf, connection, [item], min(1.0, each / max(1, item.episodes)))
         chosen = seen_episodes(shelf, EPISODE.c.id.in_(list(ids)))
         joined = EPISODE.join(RECORDING, of_one_recording())
         numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(chosen)).scalars()
@@ -161,21 +161,29 @@ def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
     return [ordered[i] for i in chosen.tolist()]
 
 
-def _ids(connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
-    """Row ids of about that share of the episodes of some recordings; some of them may not be there."""
-    names = {escape_text(item.recording): item.episodes for item in recordings}
-    for paths in _batches(names):
+def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
+    """Row ids of about that share of the episodes of some recordings, at even distances in each."""
+    counts = {escape_text(item.recording): item.episodes for item in recordings}
+    for paths in _batches(counts):
         found = connection.execute(
             select(RECORDING.c.id, RECORDING.c.path).where(RECORDING.c.path.in_(paths))
         )
         for recording_id, path in found.all():
-            ends = select(func.min(EPISODE.c.id), func.max(EPISODE.c.id))
-            low, high = connection.execute(ends.where(episodes_of(recording_id, EPISODE.c.id))).one()
-            if low is not None:
-                count = max(1, round(names[path] * share))
-                yield from np.unique(
-                    np.linspace(0, high - low, count).round().astype(np.int64) + low
-                ).tolist()
+            own = seen_episodes(shelf, episodes_of(recording_id, EPISODE.c.id))
+            low, high = connection.execute(
+                select(func.min(EPISODE.c.id), func.max(EPISODE.c.id)).where(own)
+            ).one()
+            if low is None:
+                continue
+            there: Any = range(low, high + 1)
+            if len(there) != counts[path]:  # some are deleted, or may not be read
+                there = (
+                    connection.execute(select(EPISODE.c.id).where(own).order_by(EPISODE.c.id)).scalars().all()
+                )
+            count = max(1, round(len(there) * share))
+            yield from (
+                there[i] for i in np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))
+            )
 
 
 def _batches(items: Any) -> Iterator[list[Any]]:

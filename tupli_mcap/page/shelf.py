@@ -32,7 +32,9 @@ class Shelf(Protocol):
     title: str
     opened_by: str
     user: str
-    places: Sequence[tuple[str, str]]
+
+    @property
+    def places(self) -> Sequence[tuple[str, str]]: ...
 
     @property
     def skipped(self) -> Mapping[str, str]: ...

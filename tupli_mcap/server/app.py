@@ -9,9 +9,13 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 
 import tupli_mcap
+from tupli_mcap.page.directory import OpenedRecordings
+from tupli_mcap.page.routes import PAGES
+from tupli_mcap.server import pages
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.pages.session import shelf_of
 from tupli_mcap.server.routes import accounts, episodes, items, pytupli, query, recordings, viewers
-from tupli_mcap.server.wire import Error, tell_errors
+from tupli_mcap.server.wire import Error, tell_errors, told
 
 __all__ = ["create_app"]
 
@@ -38,11 +42,9 @@ def create_app(library: Library) -> FastAPI:
     for routes in (accounts, items, episodes, query, recordings, viewers, pytupli):
         app.include_router(routes.router, responses=_REFUSALS)  # type: ignore[arg-type]
     tell_errors(app)
-
-    @app.get("/")
-    def root() -> dict[str, str]:
-        """What this is."""
-        return {"name": "tupli-mcap", "version": tupli_mcap.__version__}
+    app.state.shelf_of, app.state.kept, app.state.told = shelf_of, OpenedRecordings(), told
+    for router in (*pages.PAGES, *PAGES):
+        app.include_router(router)
 
     @app.get("/health")
     def health() -> dict[str, str]:

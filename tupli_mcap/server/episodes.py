@@ -57,9 +57,10 @@ def find_episodes(
     limit: int | None = None,
     offset: int = 0,
     after: After | None = None,
+    only: ColumnElement[bool] | None = None,
 ) -> Iterator[EpisodeHeader]:
     """The readable episodes that a filter is true of, see `queries.find_episodes`."""
-    seen = _seen(caller)
+    seen = _seen(caller) if only is None else and_(_seen(caller), only)
     return queries.find_episodes(connection, filter, limit=limit, offset=offset, after=after, only=seen)
 
 
@@ -229,13 +230,22 @@ def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str)
 # --- changing ---
 
 
-def publish(connection: Connection, caller: Caller, filter: BaseFilter | None, group: str) -> int:
+def publish(
+    connection: Connection,
+    caller: Caller,
+    filter: BaseFilter | None,
+    group: str,
+    *,
+    only: ColumnElement[bool] | None = None,
+) -> int:
     """Lets a group see the caller's own episodes that a filter is true of: all, or none; done twice, nothing changes.
+
+    only: see `find_episodes`.
 
     Returns:
         How many they are.
     """
-    found = _own_first(connection, caller, filter)
+    found = _own_first(connection, caller, filter, only)
     for header in found:
         if header.created_by != caller.name:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
@@ -247,13 +257,22 @@ def publish(connection: Connection, caller: Caller, filter: BaseFilter | None, g
     return len(found)
 
 
-def unpublish(connection: Connection, caller: Caller, filter: BaseFilter | None, group: str) -> int:
+def unpublish(
+    connection: Connection,
+    caller: Caller,
+    filter: BaseFilter | None,
+    group: str,
+    *,
+    only: ColumnElement[bool] | None = None,
+) -> int:
     """Takes episodes away from a group: the owner may, and who has the right to delete there.
+
+    only: see `find_episodes`.
 
     Returns:
         How many they are.
     """
-    found = _own_first(connection, caller, filter)
+    found = _own_first(connection, caller, filter, only)
     for header in found:
         if header.created_by != caller.name:
             caller.demand(Right.EPISODE_DELETE, group)
@@ -297,10 +316,12 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
     return sum(map(len, doomed.values())), empty
 
 
-def _own_first(connection: Connection, caller: Caller, filter: BaseFilter | None) -> list[EpisodeHeader]:
+def _own_first(
+    connection: Connection, caller: Caller, filter: BaseFilter | None, only: ColumnElement[bool] | None
+) -> list[EpisodeHeader]:
     """The readable episodes that a filter is true of; of one that several people have stored, the caller's own."""
     found: dict[str, EpisodeHeader] = {}
-    for header in find_episodes(connection, caller, filter):
+    for header in find_episodes(connection, caller, filter, only=only):
         if header.id not in found or header.created_by == caller.name:
             found[header.id] = header
     return list(found.values())

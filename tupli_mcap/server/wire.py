@@ -31,7 +31,7 @@ from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.quotas import FullError
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
 
-__all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors"]
+__all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors", "told"]
 
 _STATUS: Final[dict[type[TupliError], int]] = {
     SignInError: 401,
@@ -103,15 +103,20 @@ def _as_json(value: Any) -> Any:
     return [_as_json(item) for item in value] if isinstance(value, list) else value
 
 
+def told(err: TupliError) -> tuple[int, str]:
+    """The status of an error, and what is said of it."""
+    status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
+    return status, _FAILED.get(status, str(err))
+
+
 def tell_errors(app: FastAPI) -> None:
     """Makes answers of the errors of this package."""
 
     @app.exception_handler(TupliError)
     def _tell(request: Request, err: TupliError) -> JSONResponse:
-        status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
+        status, text = told(err)
         headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
         if isinstance(err, TooManyError):
             headers["Retry-After"] = str(math.ceil(err.seconds))
         kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
-        text = _FAILED.get(status, str(err))
         return JSONResponse({"detail": text, "error": kind}, status, headers)

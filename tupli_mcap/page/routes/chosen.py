@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -14,13 +13,12 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 from markupsafe import Markup
 from sqlalchemy import Connection
-from starlette.background import BackgroundTask
 
 from tupli_mcap import files, jsonvalue
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
-from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of
+from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import of_dataset
 from tupli_mcap.page.routes.episode import Seen, look
@@ -29,11 +27,10 @@ from tupli_mcap.page.sparks import sparks_of
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import find_episodes
 
-__all__ = ["router", "sent"]
+__all__ = ["router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
-_MEDIA: Final = "application/octet-stream"
 
 
 class Compared(NamedTuple):
@@ -116,9 +113,3 @@ def film(shelf: Shown, uri: str) -> FileResponse:
     """The pictures of an episode."""
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")
-
-
-def sent(path: Path, name: str, media: str = _MEDIA) -> FileResponse:
-    """A file in a temporary directory of its own, which is removed when it was sent."""
-    gone = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
-    return FileResponse(path, media_type=media, filename=name, background=gone)

@@ -9,8 +9,7 @@ from fastapi.responses import FileResponse
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.answers import POLICY, PageRoute, Shown, address, page
-from tupli_mcap.page.copies import replay_file
-from tupli_mcap.page.routes.chosen import sent
+from tupli_mcap.page.copies import replay_file, sent
 from tupli_mcap.page.shelf import find_some
 from tupli_mcap.page.viewer_files import NAMES, viewer_file, viewer_version
 

@@ -2,6 +2,7 @@
 
 import { player } from "./player.js";
 import { table } from "./table.js";
+import { upload } from "./upload.js";
 
 for (const time of document.querySelectorAll("time[datetime]")) {
   const moment = new Date(time.dateTime);
@@ -13,6 +14,12 @@ for (const time of document.querySelectorAll("time[datetime]")) {
 
 for (const section of document.querySelectorAll(".player")) player(section);
 for (const form of document.querySelectorAll("form.chosen")) table(form);
+for (const form of document.querySelectorAll("form.drop")) upload(form);
+
+document.addEventListener("submit", (event) => {
+  const question = event.submitter?.dataset.sure;
+  if (question && !confirm(question)) event.preventDefault();
+});
 
 document.addEventListener("click", (event) => {
   const button = event.target.closest("[data-copy]");

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import hmac
 import secrets
 import time
 from pathlib import Path
@@ -80,17 +81,23 @@ class Tokens:
         Raises:
             SignInError: it is none, was used, or has expired.
         """
-        table = REFRESH_TOKEN
-        query = (
-            select(table.c.user, USER.c.epoch)
-            .join(USER, USER.c.name == table.c.user)
-            .where(table.c.digest == _digest(refresh), table.c.used.is_(False))
-            .where(table.c.expires > int(time.time()))
-        )
-        found = connection.execute(query).first()
+        found = _of_refresh_token(connection, refresh)
         if found is None:
             raise SignInError("Could not validate credentials")
         return self._access(found.user, found.epoch)
+
+    def of_session(self, connection: Connection, refresh: str) -> Caller | None:
+        """Who a browser is signed in as, by the refresh token in its cookie, which stays as it is; None for nobody."""
+        found = _of_refresh_token(connection, refresh)
+        return None if found is None else caller_named(connection, found.user)
+
+    def form_code(self, refresh: str) -> str:
+        """What a form of a signed-in browser has to carry: a page of somebody else cannot know it."""
+        return hmac.new(self._secret, f"form {_digest(refresh)}".encode(), hashlib.sha256).hexdigest()
+
+    def is_form_code(self, refresh: str, code: str) -> bool:
+        """Whether a form carries what it has to."""
+        return hmac.compare_digest(self.form_code(refresh).encode(), code.encode())
 
     def _access(self, user: str, epoch: int) -> str:
         return self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch)
@@ -138,7 +145,7 @@ class Tokens:
         table = API_TOKEN
         columns = (table.c.id, table.c.name, table.c.scope, table.c.created_at, table.c.expires)
         rows = connection.execute(select(*columns).where(table.c.user == caller.name))
-        return [dict(row._mapping) for row in rows]
+        return [{str(key): value for key, value in row._mapping.items()} for row in rows]
 
     def delete_api_token(self, connection: Connection, caller: Caller, number: str) -> None:
         """Revokes one of the caller's tokens.
@@ -176,6 +183,18 @@ class Tokens:
         if told["typ"] != kind:
             raise SignInError(f"expected an {kind} token, found another kind")
         return told
+
+
+def _of_refresh_token(connection: Connection, refresh: str) -> Any:
+    """The user and epoch of a refresh token; None if it is not valid."""
+    table = REFRESH_TOKEN
+    query = (
+        select(table.c.user, USER.c.epoch)
+        .join(USER, USER.c.name == table.c.user)
+        .where(table.c.digest == _digest(refresh), table.c.used.is_(False))
+        .where(table.c.expires > int(time.time()))
+    )
+    return connection.execute(query).first()
 
 
 def _of_api_token(connection: Connection, token: str) -> Caller:

@@ -1,0 +1,371 @@
+"""The page of a server: signing in, what each may see, and forms that nobody else can send."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import pytest
+from pages import carts, robot
+from serving import PASSWORD, serving
+
+import tupli_mcap
+from tupli_mcap.page.routes import PAGES
+from tupli_mcap.server.pages import PAGES as OF_SERVERS
+from tupli_mcap.server.settings import Settings
+
+COOKIE = "tupli_mcap_session"
+CODE = re.compile(r'name="code" value="([0-9a-f]{64})"')
+OPEN_TO_ALL = {"/", "/sign-in", "/static/{name}", "/viewer/{number}/{name}"}
+"""Addresses that say nothing of what is kept."""
+OF_DATA = {
+    "/dataset/{key:path}", "/cover/{key:path}", "/episode/{uri}", "/episode/{uri}/step/{step}",
+    "/episode/{uri}/picture/{camera}/{place}", "/episode/{uri}/film.mp4", "/compare", "/sparks", "/download", "/viewer",
+    "/replay.rrd", "/share", "/group",
+}  # fmt: skip
+"""Addresses of something that is not there for who may not read it."""
+
+
+class Api:
+    """The programming interface, as somebody uses it."""
+
+    def __init__(self, url: str, name: str) -> None:
+        told = {"username": name, "password": PASSWORD if name == "admin" else f"{name}'s password"}
+        token = httpx.post(f"{url}/v1/tokens", json=told).json()["access_token"]
+        self._url, self._headers = url, {"Authorization": f"Bearer {token}"}
+
+    def post(self, address: str, **told: Any) -> Any:
+        answer = httpx.post(self._url + address, json=told, headers=self._headers)
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def send(self, path: Path) -> None:
+        data = path.read_bytes()
+        digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
+        headers = {**self._headers, "Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}"}
+        place = self._url + httpx.post(f"{self._url}/v1/uploads", headers=headers).headers["Location"]
+        sent = httpx.patch(place, headers={**self._headers, "Upload-Offset": "0"}, content=data)
+        assert sent.status_code == 204, sent.text
+
+    def publish(self, *ids: str, published: bool = True) -> None:
+        wanted = {"type": "IN", "key": "id", "value": list(ids)}
+        self.post("/v1/episodes/publish", filter=wanted, group="global", published=published)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    root = tmp_path_factory.mktemp("server")
+    with serving(Settings(root / "kept")) as url:
+        for name in ("ann", "bob"):
+            Api(url, "admin").post("/v1/users", username=name, password=f"{name}'s password")
+        (root / "ann").mkdir()
+        carts(root / "ann", seeds=1, episodes=6)
+        robot(root / "ann" / "robot.mcap", text="a secret task")
+        for path in sorted((root / "ann").glob("*.mcap")):
+            Api(url, "ann").send(path)
+        yield url
+
+
+@contextlib.contextmanager
+def browser(url: str, name: str = "", password: str = "") -> Iterator[httpx.Client]:
+    """A browser, in which somebody is signed in."""
+    with httpx.Client(base_url=url, headers={"Accept": "text/html"}, timeout=60) as client:
+        if name:
+            told = {"username": name, "password": password or f"{name}'s password", "next": "/episodes"}
+            answer = client.post("/sign-in", data=told)
+            assert (answer.status_code, answer.headers["location"]) == (303, "/episodes")
+        yield client
+
+
+def code(client: httpx.Client, address: str = "/account") -> str:
+    found = CODE.search(client.get(address).text)
+    assert found
+    return found[1]
+
+
+def episodes_of(client: httpx.Client, **params: Any) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = client.get("/episodes", params={**params, "format": "json"}).json()[
+        "episodes"
+    ]
+    return found
+
+
+class TestSigningIn:
+    def test_who_is_not_signed_in_is_sent_there_and_back(self, server: str) -> None:
+        with browser(server) as guest:
+            answer = guest.get("/episodes?sort=-return")
+            assert answer.status_code == 303
+            place = urlsplit(answer.headers["location"])
+            assert (place.path, parse_qs(place.query)) == ("/sign-in", {"next": ["/episodes?sort=-return"]})
+            assert guest.get("/episodes?format=json").status_code == 401
+            assert guest.get("/", headers={"Accept": "*/*"}).json()["name"] == "tupli-mcap"
+
+    def test_the_cookie(self, server: str) -> None:
+        with browser(server) as client:
+            answer = client.post("/sign-in", data={"username": "ann", "password": "ann's password"})
+            cookie = answer.headers["set-cookie"]
+            assert "HttpOnly" in cookie and "SameSite=lax" in cookie and "Path=/" in cookie
+            assert client.get("/account").status_code == 200
+
+    @pytest.mark.parametrize(
+        "address",
+        ["https://evil.example/", "//evil.example", "/\\evil.example", "javascript:alert(1)", "/\r\nX: y"],
+    )
+    def test_it_never_leads_elsewhere(self, server: str, address: str) -> None:
+        with browser(server) as client:
+            told = {"username": "ann", "password": "ann's password", "next": address}
+            assert client.post("/sign-in", data=told).headers["location"] == "/"
+            assert client.get("/sign-in", params={"next": address}).headers["location"] == "/"
+
+    def test_wrong_passwords(self, server: str) -> None:
+        with browser(server) as client:
+            wrong = {
+                client.post("/sign-in", data={"username": u, "password": "x"}).text for u in ("ann", "nobody")
+            }
+            assert len({text.replace("nobody", "ann") for text in wrong}) == 1
+            assert "Incorrect username or password" in wrong.pop()
+            assert COOKIE not in client.cookies
+
+    def test_signing_out_ends_it_everywhere(self, server: str) -> None:
+        with browser(server, "ann") as client:
+            session = client.cookies[COOKIE]
+            assert client.post("/sign-out", data={"code": code(client)}).status_code == 303
+            assert client.get("/account").status_code == 303
+        with httpx.Client(base_url=server, cookies={COOKIE: session}) as thief:
+            assert thief.get("/account").status_code == 303
+
+    def test_a_new_password_ends_the_others(self, server: str) -> None:
+        with browser(server, "bob") as here, browser(server, "bob") as there:
+            told = {"code": code(here), "old": "wrong", "new": "n"}
+            assert here.post("/account/password", data=told).status_code == 401
+            told["old"], told["new"] = "bob's password", "another"
+            assert here.post("/account/password", data=told).status_code == 303
+            assert here.get("/account").status_code == 200
+            assert there.get("/account").status_code == 303
+            told = {"code": code(here), "old": "another", "new": "bob's password"}
+            assert here.post("/account/password", data=told).status_code == 303
+
+    def test_the_programming_interface_takes_no_cookie(self, server: str) -> None:
+        with browser(server, "ann") as client:
+            assert client.get("/v1/me").status_code == 401
+            assert client.post("/v1/episodes/delete", json={"filter": None}).status_code == 401
+
+    def test_only_an_open_server_takes_everybody(self, server: str, tmp_path: Path) -> None:
+        told = {"username": "eve", "password": "e", "new": "1"}
+        with browser(server) as client:
+            assert client.post("/sign-in", data=told).status_code == 403
+        with serving(Settings(tmp_path, open_signup=True)) as url, browser(url) as client:
+            assert "I am new here" in client.get("/sign-in").text
+            assert client.post("/sign-in", data=told).status_code == 303
+            assert client.get("/account").status_code == 200
+
+
+def forms() -> list[str]:
+    return sorted(route.path for router in OF_SERVERS for route in router.routes if "POST" in route.methods)  # type: ignore[attr-defined]
+
+
+class TestForms:
+    @pytest.mark.parametrize("address", [path for path in forms() if path != "/sign-in"])
+    def test_they_need_their_code(self, server: str, address: str) -> None:
+        """Every form of every page, so that none is forgotten."""
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            own = code(ann)
+            for told in ({}, {"code": ""}, {"code": "0" * 64}, {"code": code(bob)}):
+                assert ann.post(address, data=told).status_code == 403
+            for headers in (
+                {"Origin": "https://evil.example"},
+                {"Sec-Fetch-Site": "cross-site"},
+                {"Origin": "null"},
+            ):
+                assert ann.post(address, data={"code": own}, headers=headers).status_code == 403
+        with browser(server) as guest:
+            assert guest.post(address, data={"code": own}).status_code == 401
+
+    def test_signing_in_from_elsewhere(self, server: str) -> None:
+        with browser(server) as client:
+            told = {"username": "ann", "password": "ann's password"}
+            for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "cross-site"}):
+                assert client.post("/sign-in", data=told, headers=headers).status_code == 403
+            own = {"Origin": server, "Sec-Fetch-Site": "same-origin"}
+            assert client.post("/sign-in", data=told, headers=own).status_code == 303
+
+
+def readable_addresses(client: httpx.Client) -> dict[str, str]:
+    """An address of every page, made for what a user owns: by its route."""
+    robots = episodes_of(client, filter='recording != "x" and not run.environment == "CartPole-v1"')
+    carts = episodes_of(client, filter='run.environment == "CartPole-v1"')
+    uri, two = robots[0]["id"], f"episode={carts[0]['id']}&episode={carts[1]['id']}"
+    return {
+        "/": "/",
+        "/episodes": "/episodes",
+        "/dataset/{key:path}": "/dataset/-",
+        "/cover/{key:path}": "/cover/-",
+        "/episode/{uri}": f"/episode/{uri}",
+        "/episode/{uri}/step/{step}": f"/episode/{uri}/step/1",
+        "/episode/{uri}/picture/{camera}/{place}": f"/episode/{uri}/picture/0/1",
+        "/episode/{uri}/film.mp4": f"/episode/{uri}/film.mp4",
+        "/compare": f"/compare?{two}",
+        "/sparks": f"/sparks?{two}",
+        "/download": f"/download?{two}",
+        "/viewer": f"/viewer?episode={uri}",
+        "/replay.rrd": f"/replay.rrd?episode={uri}",
+        "/share": "/share?dataset=-",
+        "/sign-in": "/sign-in",
+        "/account": "/account",
+        "/users": "/users",
+        "/groups": "/groups",
+        "/group": "/group?name=theirs",
+        "/upload": "/upload",
+        "/static/{name}": "/static/page.css",
+        "/viewer/{number}/{name}": "/viewer/0/x",
+    }
+
+
+class TestWhoSeesWhat:
+    def test_every_page_for_its_owner_for_others_and_for_guests(self, server: str) -> None:
+        pages = {
+            route.path: route
+            for router in (*PAGES, *OF_SERVERS)
+            for route in router.routes
+            if "GET" in route.methods
+        }  # type: ignore[attr-defined]
+        with browser(server, "ann") as ann, browser(server, "bob") as bob, browser(server) as guest:
+            ann.post("/groups", data={"code": code(ann), "name": "theirs"})
+            addresses = readable_addresses(ann)
+            assert set(addresses) == set(pages), "a page that this test does not know"
+            ids = [e["id"] for e in episodes_of(ann)]
+            for route, address in addresses.items():
+                own, other, nobody = (client.get(address) for client in (ann, bob, guest))
+                unasked = [uri for uri in ids if uri not in address]
+                secrets = re.compile("|".join(["a secret task", "CartPole", *unasked]))
+                if route not in ("/viewer/{number}/{name}", "/sign-in"):
+                    assert own.status_code == 200, address
+                assert not secrets.search(other.text), address
+                about_data = "episode" in route or route in (
+                    "/compare",
+                    "/sparks",
+                    "/download",
+                    "/viewer",
+                    "/replay.rrd",
+                )
+                if (about_data and route != "/episodes") or "key" in route or route == "/share":
+                    assert other.status_code == 404, address
+                if route not in OPEN_TO_ALL:
+                    assert nobody.status_code == 303, address
+                    assert nobody.headers["location"].startswith("/sign-in?")
+                assert not secrets.search(nobody.text), address
+
+    def test_published_episodes_alone(self, server: str) -> None:
+        """Two of six are published: pages and files of the recording are of these two."""
+        api = Api(server, "ann")
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            carts = [e["id"] for e in episodes_of(ann, dataset="CartPole-v1")]
+            api.publish(*carts[1:3])
+            try:
+                seen = episodes_of(bob)
+                assert [e["id"] for e in seen] == carts[1:3]
+                (dataset,) = bob.get("/?format=json").json()["datasets"]
+                assert (dataset["episodes"], dataset["steps"]) == (2, sum(e["n_tuples"] for e in seen))
+                (whole,) = [
+                    d for d in ann.get("/?format=json").json()["datasets"] if d["key"] == "CartPole-v1"
+                ]
+                assert whole["episodes"] == 6
+                text = bob.get("/dataset/CartPole-v1").text
+                assert f"in {sum(e['n_tuples'] for e in seen):,} steps of 2 episodes" in text
+                assert bob.get(f"/episode/{carts[0]}").status_code == 404
+                assert bob.get(f"/episode/{carts[1]}?step=1").status_code == 200
+                got = bob.get("/download", params={"dataset": "CartPole-v1"}).content
+                assert got.startswith(b"\x89MCAP")
+                replay = bob.get("/replay.rrd", params={"episode": carts[1]}).content
+                assert b"6 terminal" not in replay
+                assert "foxglove" not in bob.get(f"/episode/{carts[1]}").text
+                link = re.search(
+                    'href="(https://app.foxglove.dev/[^"]*)"', ann.get(f"/episode/{carts[1]}").text
+                )
+                assert link
+                url = parse_qs(urlsplit(link[1].replace("&amp;", "&")).query)["ds.url"][0]
+                with tupli_mcap.Recording(url) as recording:
+                    assert len(recording) == 6
+            finally:
+                api.publish(*carts[1:3], published=False)
+
+
+class TestPeople:
+    def test_publishing_as_a_whole(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            told = {"code": code(ann), "dataset": "-", "group": "global"}
+            assert ann.post("/share", data=told).status_code == 303
+            assert len(episodes_of(bob)) == 2
+            assert ">global<" in ann.get("/share?dataset=-").text
+            assert bob.post("/share", data={**told, "code": code(bob)}).status_code == 403
+            assert ann.post("/share", data={**told, "published": "false"}).status_code == 303
+            assert episodes_of(bob) == []
+            assert ann.post("/share", data={**told, "group": "nobody's"}).status_code == 404
+
+    def test_groups(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            own = code(ann)
+            assert ann.post("/groups", data={"code": own, "name": "arms & <legs>"}).status_code == 303
+            assert ann.post("/groups", data={"code": own, "name": "bob"}).status_code == 409
+            assert bob.get("/group", params={"name": "arms & <legs>"}).status_code == 404
+            told = {"code": own, "name": "arms & <legs>", "user": "bob", "role": "member"}
+            assert ann.post("/group/members", data=told).status_code == 303
+            assert "bob" in bob.get("/group", params={"name": "arms & <legs>"}).text
+            assert (
+                bob.post("/group/members", data={**told, "code": code(bob), "user": "ann"}).status_code == 403
+            )
+            ann.post("/share", data={"code": own, "dataset": "-", "group": "arms & <legs>"})
+            assert len(episodes_of(bob)) == 2
+            assert ann.post("/group/members/delete", data=told).status_code == 303
+            assert episodes_of(bob) == []
+            assert ann.post("/group/delete", data=told).status_code == 303
+
+    def test_users(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "admin", PASSWORD) as admin:
+            told = {"username": "carl", "password": "c"}
+            assert ann.post("/users", data={**told, "code": code(ann)}).status_code == 403
+            assert admin.post("/users", data={**told, "code": code(admin)}).status_code == 303
+            assert admin.post("/users", data={**told, "code": code(admin)}).status_code == 409
+            assert "carl" in ann.get("/users").text
+            assert ann.post("/users/delete", data={**told, "code": code(ann)}).status_code == 403
+            assert admin.post("/users/delete", data={**told, "code": code(admin)}).status_code == 303
+
+    def test_tokens_of_machines(self, server: str) -> None:
+        with browser(server, "ann") as ann:
+            made = ann.post("/account/tokens", data={"code": code(ann), "name": "node 7", "scope": "read"})
+            token = re.search("<pre>(tmcap_[^<]*)</pre>", made.text)
+            assert token
+            machine = {"Authorization": f"Bearer {token[1]}"}
+            assert httpx.get(f"{server}/v1/me", headers=machine).json()["username"] == "ann"
+            assert token[1] not in ann.get("/account").text
+            number = ann.get("/account?format=json").json()["tokens"][0]["id"]
+            assert (
+                ann.post("/account/tokens/delete", data={"code": code(ann), "token": number}).status_code
+                == 303
+            )
+            assert httpx.get(f"{server}/v1/me", headers=machine).status_code == 401
+
+    def test_pages_with_codes_are_not_kept(self, server: str) -> None:
+        with browser(server, "ann") as ann:
+            assert ann.get("/account").headers["cache-control"] == "no-store"
+
+
+class TestGuests:
+    def test_they_see_what_is_published_to_all(self, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        with serving(Settings(tmp_path / "kept", guests=True)) as url, browser(url) as guest:
+            admin = Api(url, "admin")
+            admin.send(tmp_path / "ppo0.mcap")
+            assert guest.get("/?format=json").json()["datasets"] == []
+            admin.post("/v1/episodes/publish", filter=None, group="global")
+            assert len(episodes_of(guest)) == 2
+            text = guest.get("/dataset/CartPole-v1").text
+            assert "Sign in" in text and "Share" not in text
+            assert guest.get("/account").status_code == 303

@@ -1,0 +1,129 @@
+// Sends recordings that are dropped on the page (tus): what is there already is not sent, and what was broken off goes on.
+
+const PIECE = 16 << 20;
+const TRIES = 5;
+
+export function upload(form) {
+  const list = document.querySelector(".uploads");
+  let turn = Promise.resolve();
+  const take = (files) => {
+    for (const file of files) {
+      const row = rowOf(list, file);
+      turn = turn.then(() => send(form, file, row)).catch((error) => row.fail(error));
+    }
+  };
+  for (const name of ["dragover", "dragleave", "drop"]) {
+    form.addEventListener(name, (event) => {
+      event.preventDefault();
+      form.classList.toggle("over", name === "dragover");
+      if (name === "drop") take(event.dataTransfer.files);
+    });
+  }
+  const field = form.querySelector("input[type=file]");
+  field.addEventListener("change", () => {
+    take(field.files);
+    field.value = "";
+  });
+}
+
+function rowOf(list, file) {
+  const item = list.appendChild(document.createElement("li"));
+  const name = item.appendChild(document.createElement("bdi"));
+  const state = item.appendChild(document.createElement("span"));
+  const bar = item.appendChild(document.createElement("progress"));
+  name.textContent = file.name;
+  state.textContent = "waiting";
+  bar.max = Math.max(1, file.size);
+  bar.value = 0;
+  bar.setAttribute("aria-label", `How much of ${file.name} has been sent`);
+  const mega = (bytes) => (bytes / 1e6).toFixed(1);
+  return {
+    show(what, bytes) {
+      state.textContent = `${what} ${mega(bytes)} of ${mega(file.size)} MB`;
+      bar.value = bytes;
+    },
+    done(what, link) {
+      bar.value = bar.max;
+      state.textContent = what;
+      if (!link) return;
+      const anchor = document.createElement("a");
+      anchor.href = link;
+      anchor.textContent = what;
+      state.replaceChildren(anchor);
+    },
+    fail(error) {
+      bar.remove();
+      state.className = "failed";
+      state.textContent = error.message;
+    },
+  };
+}
+
+async function send(form, file, row) {
+  if (file.size > Number(form.dataset.most)) throw new Error("larger than this server takes");
+  if (!file.size) throw new Error("empty");
+  const digest = await digestOf(file, (read) => row.show("checking", read));
+  const told = { "Upload-Length": String(file.size), "Upload-Metadata": `sha256 ${btoa(digest)}`, "Tus-Resumable": "1.0.0" };
+  const begun = await ask(form, "POST", "/v1/uploads", told);
+  let recording = begun.headers.get("Recording");
+  if (recording !== null) return row.done("is here already", linkTo(recording));
+  const place = begun.headers.get("Location");
+  let offset = Number(begun.headers.get("Upload-Offset"));
+  for (let tries = 0; recording === null; ) {
+    row.show("sent", offset);
+    const headers = { "Upload-Offset": String(offset), "Content-Type": "application/offset+octet-stream", "Tus-Resumable": "1.0.0" };
+    try {
+      const answer = await ask(form, "PATCH", place, headers, file.slice(offset, offset + PIECE));
+      offset = Number(answer.headers.get("Upload-Offset"));
+      recording = answer.headers.get("Recording");
+      tries = 0;
+    } catch (error) {
+      if (error.status < 500 && error.status !== 409 && error.status !== 423) throw error;
+      if (++tries > TRIES) throw error;
+      await new Promise((later) => setTimeout(later, 1000 * tries));
+      offset = Number((await ask(form, "HEAD", place, { "Tus-Resumable": "1.0.0" })).headers.get("Upload-Offset"));
+    }
+  }
+  row.done("is here", linkTo(recording));
+}
+
+function linkTo(recording) {
+  return `/episodes?${new URLSearchParams({ filter: `recording == ${JSON.stringify(recording)}` })}`;
+}
+
+function digestOf(file, tell) {
+  return new Promise((resolve, reject) => {
+    const worker = new Worker("/static/sha256.js", { type: "module" });
+    worker.onerror = () => reject(new Error("cannot be read"));
+    worker.onmessage = ({ data }) => {
+      if (data.hex === undefined) return tell(data.read);
+      worker.terminate();
+      resolve(data.hex);
+    };
+    worker.postMessage(file);
+  });
+}
+
+// A request to the programming interface, with an access token that this page got for it and gets anew when it is out of date.
+let token = null;
+async function ask(form, method, address, headers, body) {
+  for (let again = false; ; again = true) {
+    token ??= await access(form);
+    const answer = await fetch(address, { method, body, headers: { ...headers, Authorization: `Bearer ${token}` } }).catch(() => {
+      throw Object.assign(new Error("the server cannot be reached"), { status: 599 });
+    });
+    if (answer.ok) return answer;
+    if (answer.status === 401 && !again) {
+      token = null;
+      continue;
+    }
+    const told = await answer.json().catch(() => ({}));
+    throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { status: answer.status });
+  }
+}
+
+async function access(form) {
+  const answer = await fetch("/account/access", { method: "POST", body: new URLSearchParams({ code: form.dataset.code }) });
+  if (!answer.ok) throw new Error("you are not signed in any more; reload this page");
+  return (await answer.json()).access_token;
+}

@@ -1,0 +1,93 @@
+"""One's own account: the password, and tokens of machines."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request, Response
+from fastapi.responses import JSONResponse
+
+from tupli_mcap.page.answers import PageRoute
+from tupli_mcap.server.database import audit
+from tupli_mcap.server.pages.forms import form_page, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit, begin
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.tokens import SignInError
+
+__all__ = ["router"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_Text = Annotated[str, Form()]
+_Days = Annotated[int, Form(ge=1, le=3650)]
+
+
+@router.get("/account")
+def show(request: Request, visit: Member) -> Response:
+    """Who one is, one's tokens, and the forms to change them."""
+    return _page(request, visit)
+
+
+@router.post("/account/password")
+def change_password(request: Request, visit: Code, old: _Text = "", new: _Text = "") -> Response:
+    """Gives oneself another password; every other sign-in ends."""
+    library, name = visit.library, visit.caller.name
+
+    def change() -> None:
+        with library.database.writing() as connection:
+            if not accounts.verify_password(connection, name, old):
+                raise SignInError("the old password is not right")
+            accounts.change_password(connection, name, new)
+            audit(connection, name, "change_password", name)
+
+    response = tried(change, lambda wrong, status: _page(request, visit, wrong, status), "/account")
+    if response.status_code == 303:
+        with library.database.writing() as connection:
+            pair = library.tokens.pair(connection, name)
+        begin(request, response, pair["refresh_token"], library.settings.refresh_seconds)
+    return response
+
+
+@router.post("/account/tokens")
+def create_token(
+    request: Request,
+    visit: Code,
+    name: _Text = "",
+    scope: _Text = "read",
+    days: _Days = 90,
+) -> Response:
+    """Makes a token for a machine, and shows it this once."""
+    library, made = visit.library, dict[str, Any]()
+    with library.database.writing() as connection:
+        audit(connection, visit.caller.name, "create_api_token", name)
+        made = library.tokens.create_api_token(connection, visit.caller, name, scope, days)
+    return _page(request, visit, made=made)
+
+
+@router.post("/account/tokens/delete")
+def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
+    """Revokes a token for a machine."""
+
+    def change() -> None:
+        with visit.library.database.writing() as connection:
+            visit.library.tokens.delete_api_token(connection, visit.caller, token)
+            audit(connection, visit.caller.name, "delete_api_token", token)
+
+    return tried(change, lambda wrong, status: _page(request, visit, wrong, status), "/account")
+
+
+@router.post("/account/access")
+def access(visit: Code) -> Response:
+    """An access token for the scripts of our own pages, which send what is uploaded with it."""
+    with visit.library.database.reading() as connection:
+        token = visit.library.tokens.access_for(connection, visit.session)
+    return JSONResponse({"access_token": token}, headers={"Cache-Control": "no-store"})
+
+
+def _page(
+    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, made: dict[str, Any] | None = None
+) -> Response:
+    with visit.library.database.reading() as connection:
+        tokens = visit.library.tokens.list_api_tokens(connection, visit.caller)
+        memberships = accounts.memberships_of(connection, visit.caller.name)
+    facts = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
+    return form_page(request, visit, "account.html", facts, wrong=wrong, status=status, made=made)

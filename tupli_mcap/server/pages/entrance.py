@@ -1,0 +1,110 @@
+"""The first page, and signing in and out."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+import tupli_mcap
+from tupli_mcap.errors import TupliError
+from tupli_mcap.page.answers import PageRoute, page
+from tupli_mcap.page.routes import lists
+from tupli_mcap.server.database import audit
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.pages import session
+from tupli_mcap.server.pages.forms import done
+from tupli_mcap.server.pages.session import Code, Visitor
+from tupli_mcap.server.people.access import DeniedError
+from tupli_mcap.server.people.accounts import create_user
+from tupli_mcap.server.wire import told
+
+__all__ = ["router"]
+
+router = APIRouter(route_class=PageRoute)
+_Next = Annotated[str, Form(alias="next")]
+
+
+@router.get("/", response_model=None)
+def root(request: Request, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1) -> Response:
+    """What this is; for browsers, and with `?format=json`, the datasets."""
+    browser = "text/html" in request.headers.get("accept", "") or "format" in request.query_params
+    if not browser:
+        return JSONResponse({"name": "tupli-mcap", "version": tupli_mcap.__version__})
+    return lists.datasets(request, session.shelf_of(request), q, number)
+
+
+@router.get("/sign-in", include_in_schema=False)
+def show_sign_in(request: Request, visit: Visitor, next: str = "/") -> Response:
+    """The form for name and password."""
+    if visit.is_signed_in:
+        return done(_local(next))
+    return _sign_in_page(request, visit.library, next)
+
+
+@router.post("/sign-in", include_in_schema=False)
+def sign_in(
+    request: Request,
+    visit: Visitor,
+    username: Annotated[str, Form()] = "",
+    password: Annotated[str, Form()] = "",
+    following: _Next = "/",
+    new: Annotated[bool, Form()] = False,
+) -> Response:
+    """Signs in, or first makes the user where the server is open to sign-ups."""
+    library = visit.library
+    try:
+        if not session.is_own_origin(request):
+            raise DeniedError("this form is not of this server; open its page and sign in there")
+        if new:
+            _sign_up(library, username, password)
+        address = request.client.host if request.client else ""
+        pair = library.sign_in(username, password, address)
+    except TupliError as err:
+        status, text = told(err)
+        return _sign_in_page(request, library, following, text, status, new=new)
+    response = done(_local(following))
+    session.begin(request, response, pair["refresh_token"], library.settings.refresh_seconds)
+    return response
+
+
+@router.post("/sign-out", include_in_schema=False)
+def sign_out(visit: Code) -> Response:
+    """Ends the sign-in."""
+    with visit.library.database.writing() as connection:
+        visit.library.tokens.end(connection, visit.session)
+    response = done("/sign-in")
+    session.end(response)
+    return response
+
+
+def _sign_up(library: Library, username: str, password: str) -> None:
+    if not library.settings.open_signup:
+        raise DeniedError("only an administrator makes users here")
+    with library.database.writing() as connection:
+        create_user(connection, username, password)
+        audit(connection, username, "create_user", username)
+
+
+def _sign_in_page(
+    request: Request,
+    library: Library,
+    following: str,
+    wrong: str = "",
+    status: int = 200,
+    *,
+    new: bool = False,
+) -> Response:
+    response = page(
+        request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),
+        open_signup=library.settings.open_signup, new=new,
+    )  # fmt: skip
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+def _local(address: str) -> str:
+    """An address of this server: a path, never another host."""
+    is_path = address.startswith("/") and not address.startswith(("//", "/\\")) and address.isprintable()
+    return address if is_path else "/"

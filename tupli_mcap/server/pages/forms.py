@@ -1,0 +1,53 @@
+"""What the pages with forms have in common: they are shown again with what went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from fastapi import Request, Response
+from fastapi.responses import RedirectResponse
+
+from tupli_mcap.errors import TupliError
+from tupli_mcap.page.answers import page
+from tupli_mcap.server.pages.session import Visit, shelf_of
+from tupli_mcap.server.wire import told
+
+__all__ = ["done", "form_page", "tried"]
+
+
+def form_page(
+    request: Request,
+    visit: Visit,
+    template: str,
+    facts: Mapping[str, Any],
+    *,
+    wrong: str = "",
+    status: int = 200,
+    **more: Any,
+) -> Response:
+    """A page with forms for somebody who is signed in. wrong: why the last one was refused."""
+    shown: dict[str, Any] = {
+        "shelf": shelf_of(request),
+        "code": visit.code,
+        "wrong": wrong,
+        "me": visit.caller,
+    }
+    response = page(request, template, facts, status=status, **shown, **more)
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+def tried(change: Callable[[], None], again: Callable[[str, int], Response], address: str) -> Response:
+    """Makes a change and goes on to an address; shows the page `again` where it is refused."""
+    try:
+        change()
+    except TupliError as err:
+        status, text = told(err)
+        return again(text, status)
+    return done(address)
+
+
+def done(address: str) -> Response:
+    """Goes on to another page, which the browser asks for anew."""
+    return RedirectResponse(address, 303)

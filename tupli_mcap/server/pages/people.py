@@ -1,0 +1,142 @@
+"""Users, groups, and who is in them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Form, Request, Response
+
+from tupli_mcap.page.answers import PageRoute, address
+from tupli_mcap.server.database import audit
+from tupli_mcap.server.pages.forms import form_page, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import GLOBAL, Right
+
+__all__ = ["router"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_Text = Annotated[str, Form()]
+
+
+@router.get("/users")
+def show_users(request: Request, visit: Member) -> Response:
+    """All users."""
+    return _users(request, visit)
+
+
+@router.post("/users")
+def create_user(request: Request, visit: Code, username: _Text = "", password: _Text = "") -> Response:
+    """Makes a user."""
+
+    def change() -> None:
+        visit.caller.demand(Right.USER_CREATE)
+        with visit.library.database.writing() as connection:
+            accounts.create_user(connection, username, password)
+            audit(connection, visit.caller.name, "create_user", username)
+
+    return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")
+
+
+@router.post("/users/delete")
+def delete_user(request: Request, visit: Code, username: _Text = "") -> Response:
+    """Deletes a user; the name stays taken, and what they made stays."""
+
+    def change() -> None:
+        visit.caller.demand(Right.USER_DELETE, username)
+        with visit.library.database.writing() as connection:
+            accounts.delete_user(connection, username)
+            audit(connection, visit.caller.name, "delete_user", username)
+
+    return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")
+
+
+def _users(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
+    visit.caller.demand(Right.USER_READ)
+    with visit.library.database.reading() as connection:
+        users = {name: accounts.memberships_of(connection, name) for name in accounts.list_users(connection)}
+    may = {"create": visit.caller.may(Right.USER_CREATE), "delete": visit.caller.may(Right.USER_DELETE)}
+    return form_page(request, visit, "users.html", {"users": users}, wrong=wrong, status=status, may=may)
+
+
+@router.get("/groups")
+def show_groups(request: Request, visit: Member) -> Response:
+    """The groups that one may know of."""
+    return _groups(request, visit)
+
+
+@router.post("/groups")
+def create_group(request: Request, visit: Code, name: _Text = "", description: _Text = "") -> Response:
+    """Makes a group that one leads."""
+
+    def change() -> None:
+        with visit.library.database.writing() as connection:
+            accounts.create_group(connection, visit.caller, name, description or None)
+
+    return tried(
+        change, lambda wrong, status: _groups(request, visit, wrong, status), address("group", name=name)
+    )
+
+
+def _groups(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
+    with visit.library.database.reading() as connection:
+        groups = accounts.list_groups(connection, visit.caller)
+        own = accounts.memberships_of(connection, visit.caller.name)
+    return form_page(request, visit, "groups.html", {"groups": groups}, wrong=wrong, status=status, own=own)
+
+
+@router.get("/group")
+def show_group(request: Request, visit: Member, name: str) -> Response:
+    """A group and its members."""
+    return _group(request, visit, name)
+
+
+@router.post("/group/members")
+def add_member(
+    request: Request, visit: Code, name: _Text = "", user: _Text = "", role: _Text = "member"
+) -> Response:
+    """Gives a user a role in a group."""
+
+    def change() -> None:
+        with visit.library.database.writing() as connection:
+            accounts.add_member(connection, visit.caller, name, user, [role])
+
+    return tried(
+        change, lambda wrong, status: _group(request, visit, name, wrong, status), address("group", name=name)
+    )
+
+
+@router.post("/group/members/delete")
+def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text = "") -> Response:
+    """Takes a user out of a group."""
+
+    def change() -> None:
+        with visit.library.database.writing() as connection:
+            accounts.remove_member(connection, visit.caller, name, user)
+
+    return tried(
+        change, lambda wrong, status: _group(request, visit, name, wrong, status), address("group", name=name)
+    )
+
+
+@router.post("/group/delete")
+def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
+    """Deletes a group; its name stays taken."""
+
+    def change() -> None:
+        with visit.library.database.writing() as connection:
+            accounts.delete_group(connection, visit.caller, name)
+
+    return tried(change, lambda wrong, status: _group(request, visit, name, wrong, status), "/groups")
+
+
+def _group(request: Request, visit: Visit, name: str, wrong: str = "", status: int = 200) -> Response:
+    with visit.library.database.reading() as connection:
+        group = accounts.members_of(connection, visit.caller, name)
+        roles = [role["role"] for role in accounts.list_roles(connection)]
+    caller = visit.caller
+    may = {
+        "update": caller.may(Right.GROUP_UPDATE, name),
+        "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
+    }
+    return form_page(request, visit, "group.html", group, wrong=wrong, status=status, may=may, roles=roles)

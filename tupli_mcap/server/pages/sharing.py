@@ -1,0 +1,128 @@
+"""Who sees a dataset, and sending recordings."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Form, Request, Response
+from sqlalchemy import Connection, func, select
+
+from tupli_mcap.errors import FormatError, NotFoundError
+from tupli_mcap.page.answers import PageRoute, address
+from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
+from tupli_mcap.schema import FilterEQ
+from tupli_mcap.server import episodes
+from tupli_mcap.server.pages.forms import form_page, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.access import DeniedError, Right, readable
+from tupli_mcap.storage.benchmark_json import unpack
+from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
+from tupli_mcap.storage.texts import unescape_text
+
+__all__ = ["router"]
+
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_Text = Annotated[str, Form()]
+
+
+@router.get("/share")
+def show(request: Request, visit: Member, dataset: str) -> Response:
+    """Who sees a dataset, and the form to change it."""
+    return _page(request, visit, dataset)
+
+
+@router.post("/share")
+def change(
+    request: Request,
+    visit: Code,
+    dataset: _Text = "",
+    group: _Text = "",
+    published: Annotated[bool, Form()] = True,
+) -> Response:
+    """Lets a group see one's own part of a dataset, or no more: the benchmark, its artifacts, one's episodes."""
+
+    def work() -> None:
+        with visit.library.database.writing() as connection:
+            _set(
+                connection,
+                visit,
+                find_dataset(shelf_of(request), connection, dataset),
+                group,
+                published=published,
+            )
+
+    return tried(
+        work,
+        lambda wrong, status: _page(request, visit, dataset, wrong, status),
+        address("share", dataset=dataset),
+    )
+
+
+def _set(connection: Connection, visit: Visit, dataset: Dataset, group: str, *, published: bool) -> None:
+    library, caller = visit.library, visit.caller
+    if group not in _groups(connection, visit):
+        raise NotFoundError(f"you are in no group {group[:80]!r}")
+    turn = library.items.publish if published else library.items.unpublish
+    if dataset.benchmark is not None and dataset.benchmark.created_by == caller.name:
+        turn(connection, caller, "benchmark", dataset.benchmark_id, group)
+        found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
+        with contextlib.suppress(FormatError):  # one of somebody else's making names no artifacts
+            for artifact in unpack(found.serialized).artifacts if published else ():
+                turn(connection, caller, "artifact", artifact, group)
+    elif not dataset.recordings:
+        raise DeniedError("only its owner may publish it")
+    change = episodes.publish if published else episodes.unpublish
+    own = FilterEQ(key="created_by", value=caller.name)
+    changed = change(connection, caller, own, group, only=of_dataset(dataset.key))
+    if not changed and dataset.benchmark is None:
+        raise DeniedError("none of these episodes is yours; only their owner may publish them")
+
+
+def _page(request: Request, visit: Visit, key: str, wrong: str = "", status: int = 200) -> Response:
+    shelf = shelf_of(request)
+
+    def ask(connection: Connection) -> tuple[Dataset, list[dict[str, Any]], list[str]]:
+        found = find_dataset(shelf, connection, key)
+        return found, _audiences(connection, visit, key), _groups(connection, visit)
+
+    dataset, audiences, groups = shelf.ask(ask)
+    facts = {
+        "dataset": dataset.key,
+        "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
+        "episodes": audiences,
+    }
+    return form_page(
+        request, visit, "share.html", facts, wrong=wrong, status=status, dataset=dataset, groups=groups
+    )
+
+
+def _groups(connection: Connection, visit: Visit) -> list[str]:
+    """The groups that somebody may publish in, `global` first."""
+    name = visit.caller.name
+    groups = accounts.memberships_of(connection, name)
+    return [group for group in groups if group != name and visit.caller.may(Right.EPISODE_CREATE, group)]
+
+
+def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str, Any]]:
+    """How many readable episodes of a dataset are whose, and seen by whom."""
+    seen = readable(visit.caller, Right.EPISODE_READ, TALLY.c.created_by, TALLY.c.published_in)
+    query = (
+        select(TALLY.c.created_by, TALLY.c.published_in, func.sum(TALLY.c.episodes))
+        .join(RECORDING, RECORDING.c.id == TALLY.c.recording_id)
+        .where(of_dataset(key), seen)
+        .group_by(TALLY.c.created_by, TALLY.c.published_in)
+    )
+    return [
+        {"owner": unescape_text(owner), "published_in": json.loads(groups), "episodes": int(count)}
+        for owner, groups, count in connection.execute(query)
+    ]
+
+
+@router.get("/upload")
+def show_upload(request: Request, visit: Member) -> Response:
+    """The page that recordings are dropped on."""
+    visit.caller.demand(Right.EPISODE_CREATE, visit.caller.name)
+    return form_page(request, visit, "upload.html", {"most_bytes": visit.library.settings.max_upload})

@@ -1,0 +1,111 @@
+"""What a server keeps, as one caller sees it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeVar
+from urllib.parse import quote
+
+from sqlalchemy import ColumnElement, Connection, select
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.page.datasets import of_recording
+from tupli_mcap.page.directory import CACHE_BYTES, OpenedRecordings
+from tupli_mcap.page.shelf import seen_episodes
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.edit.stream import stream_excerpts
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.people.access import Caller, Right, readable
+from tupli_mcap.server.selection import Selected, opened
+from tupli_mcap.server.tables import FILE
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
+from tupli_mcap.storage.texts import escape_text, unescape_text
+
+__all__ = ["LibraryShelf"]
+
+T = TypeVar("T")
+
+
+class LibraryShelf:
+    """A shelf of what a caller may read; see `page.shelf.Shelf`.
+
+    kept: recordings that are open, for all callers: the key of each says which episodes are in it.
+    """
+
+    def __init__(self, library: Library, caller: Caller, address: str, kept: OpenedRecordings) -> None:
+        self._library = library
+        self._caller = caller
+        self._kept = kept
+        self.title = library.settings.directory.name or "tupli-mcap"
+        self.opened_by = address
+        self.user = "" if caller.is_guest else caller.name
+        self.skipped: Mapping[str, str] = {}
+
+    @property
+    def places(self) -> Sequence[tuple[str, str]]:
+        if not self.user:
+            return [("/sign-in", "Sign in")]
+        users = [("/users", "Users")] if self._caller.may(Right.USER_READ) else []
+        return [("/upload", "Upload"), ("/groups", "Groups"), *users, ("/account", self.user)]
+
+    def ask(self, question: Callable[[Connection], T]) -> T:
+        with self._library.database.reading() as connection:
+            return question(connection)
+
+    def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
+        return readable(self._caller, Right.EPISODE_READ, created_by, published_in)
+
+    def open(self, recording: str) -> Recording:
+        """The recording; where some of its episodes may not be read, one of the others."""
+        place, numbers = self._readable(recording)
+        if numbers is None:
+            return self._kept.get((place, None), lambda: self._opened(place, recording))
+        return self._kept.get((place, numbers), lambda: self._cut(Selected(recording, place, numbers)))
+
+    def _readable(self, recording: str) -> tuple[str, tuple[int, ...] | None]:
+        """Where a recording lies, and which of its episodes may be read; None for all.
+
+        Raises:
+            NotFoundError: there is none, or none of them.
+        """
+        file = select(FILE.c.place, FILE.c.episodes).where(FILE.c.path == escape_text(recording))
+        numbers = (
+            select(EPISODE.c.episode)
+            .join(RECORDING, of_one_recording())
+            .where(seen_episodes(self, of_recording(recording)))
+            .order_by(EPISODE.c.episode)
+        )
+        with self._library.database.reading() as connection:
+            found = connection.execute(file).first()
+            seen = tuple(connection.execute(numbers).scalars())
+        if found is None or not seen:
+            raise NotFoundError(f"there is no recording {recording[:200]!r}")
+        return unescape_text(found.place), None if len(seen) == found.episodes else seen
+
+    def _opened(self, place: str, name: str) -> Recording:
+        recording = Recording(self._library.blobs.place(place), cache_bytes=CACHE_BYTES)
+        recording.name = name  # what errors say: where files lie is nobody else's business
+        return recording
+
+    def _cut(self, selected: Selected) -> Recording:
+        """A recording of some episodes, in a file whose name is gone when it is open."""
+        with tempfile.NamedTemporaryFile(prefix="tupli-mcap-", suffix=".mcap") as file:
+            for piece in stream_excerpts(opened(self._library.blobs, [selected])):
+                file.write(piece)
+            file.flush()
+            recording = Recording(file.name, cache_bytes=CACHE_BYTES)
+        recording.name = selected.name
+        return recording
+
+    def address_of(self, recording: str) -> str | None:
+        if self._readable(recording)[1] is not None:
+            return None  # what is made while it is sent cannot be read in pieces
+        ticket = self._library.tokens.ticket(self._caller.name, recording)
+        return f"/v1/files/{quote(recording)}?ticket={ticket}"
+
+    def benchmarks(
+        self, connection: Connection, filter: BaseFilter | None = None
+    ) -> Sequence[BenchmarkHeader]:
+        return self._library.items.list_benchmarks(connection, self._caller, filter)
