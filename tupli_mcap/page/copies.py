@@ -80,8 +80,10 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
     """
     from tupli_mcap.dataset.which import Chosen
     from tupli_mcap.viewer.plan import plans_of
+    from tupli_mcap.viewer.sdk import rerun_sdk
     from tupli_mcap.viewer.targets import to_file
 
+    rerun_sdk()
     chosen = []
     for name, group in itertools.groupby(headers, key=lambda header: header.recording):
         recording = shelf.open(name)
