@@ -18,12 +18,24 @@ class Fault(NamedTuple):
     """What happens to a connection.
 
     kind: "pass"; "refuse": it is closed at once; "reset": after so many bytes, in both directions counted together;
-        "stall": nothing is passed on after them; "5xx": the first request is answered 503; "flip": a bit of the byte of
-        that number is turned over on its way to the client, "flip up": to the server.
+        "stall": nothing is passed on after them; "5xx": the first request is answered 503; "flip": a bit of a file is
+        turned over on its way to the client, after so many bytes of files, "flip up": to the server. (Who sends JSON
+        over a connection that turns bits over needs TLS.)
     """
 
     kind: str = "pass"
     after: int = 0
+
+
+class _Passed:
+    """What has passed of a connection: how many bytes, how many of files, and whether a file is on its way."""
+
+    total = of_files = 0
+    is_file = False
+
+
+_FILES = (b"PATCH ", b"GET /v1/files/", b"GET /v1/artifacts/")
+_REQUESTS = (b"GET ", b"POST ", b"PUT ", b"PATCH ", b"DELETE ", b"HEAD ")
 
 
 class Between:
@@ -39,7 +51,7 @@ class Between:
         self.port = self._listener.getsockname()[1]
         self.url = f"http://127.0.0.1:{self.port}"
         self._open: set[socket.socket] = set()
-        self._closed = threading.Event()
+        self._stalled = threading.Event()
         threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
 
     def go_away(self) -> None:
@@ -59,8 +71,19 @@ class Between:
         for each in list(self._open):
             _reset(each)
 
+    def release(self) -> None:
+        """Ends the connections that are stalled."""
+        self._stalled.set()
+        self._stalled = threading.Event()
+
+    @property
+    def listens(self) -> bool:
+        """Whether connections are accepted."""
+        return self._listener.fileno() >= 0
+
     def close(self) -> None:
-        self._closed.set()
+        """Ends everything."""
+        self.release()
         self.go_away()
 
     def _accept(self, listener: socket.socket) -> None:
@@ -93,7 +116,7 @@ class Between:
             _reset(client)
             return
         self._open |= {client, server}
-        passed = [0]
+        passed = _Passed()
         threads = [
             threading.Thread(target=self._pass, args=(client, server, fault, passed, True), daemon=True),
             threading.Thread(target=self._pass, args=(server, client, fault, passed, False), daemon=True),
@@ -107,32 +130,39 @@ class Between:
             each.close()
 
     def _pass(
-        self, source: socket.socket, goal: socket.socket, fault: Fault, passed: list[int], up: bool
+        self, source: socket.socket, goal: socket.socket, fault: Fault, passed: _Passed, up: bool
     ) -> None:
-        flips, own = fault.kind == ("flip up" if up else "flip"), 0
+        flips = fault.kind == ("flip up" if up else "flip")
         with contextlib.suppress(OSError):
             while data := source.recv(1 << 16):
-                if fault.kind in ("reset", "stall") and passed[0] + len(data) > fault.after:
-                    goal.sendall(data[: max(0, fault.after - passed[0])])
+                if fault.kind in ("reset", "stall") and passed.total + len(data) > fault.after:
+                    goal.sendall(data[: max(0, fault.after - passed.total)])
                     if fault.kind == "stall":
-                        self._closed.wait()
+                        self._stalled.wait()
                     _reset(source)
-                    break
-                if flips and own <= fault.after < own + len(data):
-                    at = fault.after - own
-                    data = data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
-                own += len(data)
-                passed[0] += len(data)
+                    _reset(goal)
+                    return
+                is_head = up and data.startswith(_REQUESTS)
+                if is_head:
+                    passed.is_file = data.startswith(_FILES)
+                if flips and passed.is_file and not is_head:
+                    data, flips = self._flipped(data, fault.after - passed.of_files)
+                    passed.of_files += len(data)
+                passed.total += len(data)
                 goal.sendall(data)
                 if up:
                     self.up += len(data)
                 else:
                     self.down += len(data)
-        for each, how in ((goal, socket.SHUT_WR),):
-            with contextlib.suppress(OSError):
-                each.shutdown(how)
-        if fault.kind == "reset" and passed[0] >= fault.after:
-            _reset(goal)
+        with contextlib.suppress(OSError):
+            goal.shutdown(socket.SHUT_WR)
+
+    @staticmethod
+    def _flipped(data: bytes, at: int) -> tuple[bytes, bool]:
+        """The bytes with one bit turned over, if it is among them; and whether it is still to come."""
+        if not 0 <= at < len(data):
+            return data, True
+        return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :], False
 
 
 def _reset(connection: socket.socket) -> None:

@@ -61,10 +61,10 @@ def conform(value: Any, space: gym.Space[Any]) -> Any:
     dtype = space.feature_space.dtype if isinstance(space, spaces.Sequence) else space.dtype
     try:
         given = np.asarray(value)
-        array = given.astype(dtype)
+        array = given if given.dtype == dtype else given.astype(dtype)
     except (TypeError, ValueError, OverflowError) as err:
         raise SpaceError(f"expected a value of {space}, found {value!r:.80}") from err
-    if given.dtype.kind not in _KINDS or not _same_numbers(given, array):
+    if given.dtype.kind not in _KINDS or not (array is given or _same_numbers(given, array)):
         raise SpaceError(f"expected a value of {space}, found {value!r:.80}")
     return dtype.type(array) if isinstance(space, spaces.Discrete) else array  # type: ignore[union-attr]
 

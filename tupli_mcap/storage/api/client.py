@@ -63,7 +63,7 @@ class TupliAPIClient(People, TupliStorage):
 
     def __init__(self, url: str | None = None) -> None:
         self._session = Session(url)
-        self._benchmarks: set[str] = set()  # that are known to be there
+        self._benchmarks: dict[str, Benchmark] = {}  # that are there, as far as is known
         if self._session.known_user is not None:
             outbox_of(self._session)
 
@@ -129,12 +129,12 @@ class TupliAPIClient(People, TupliStorage):
         plain(benchmark_query.metadata)
         told = {**dict(benchmark_query), "metadata": benchmark_query.metadata.model_dump()}
         stored = as_told(BenchmarkHeader, self._session.ask("POST", "/v1/benchmarks", told, repeat=True))
-        self._benchmarks.add(stored.id)
+        self._benchmarks[stored.id] = Benchmark(**{**dict(stored), "serialized": benchmark_query.serialized})
         return stored
 
     def load_benchmark(self, uri: str) -> Benchmark:
         found = as_told(Benchmark, self._session.ask("GET", f"/v1/benchmarks/{_hash(uri, 'benchmark')}"))
-        self._benchmarks.add(found.id)
+        self._benchmarks[found.id] = found
         return found
 
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
@@ -142,7 +142,7 @@ class TupliAPIClient(People, TupliStorage):
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
         self.flush()
-        self._benchmarks.discard(uri)
+        self._benchmarks.pop(uri, None)
         return self._count("DELETE", f"/v1/benchmarks/{_hash(uri, 'benchmark')}", episodes=episodes)
 
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
@@ -213,7 +213,7 @@ class TupliAPIClient(People, TupliStorage):
 
     def _record(self, benchmark_id: str, episodes: Sequence[Episode]) -> str:
         """Stores episodes of one benchmark as a recording; returns its name."""
-        benchmark = self.load_benchmark(benchmark_id)
+        benchmark = self._benchmarks.get(benchmark_id) or self.load_benchmark(benchmark_id)
         spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
         with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
             path = Path(folder) / "episodes.mcap"
@@ -291,7 +291,6 @@ class TupliAPIClient(People, TupliStorage):
         known = _hash(benchmark_id, "benchmark") in self._benchmarks
         if not known and not self.list_benchmarks(FilterEQ(key="id", value=benchmark_id)):
             raise _unknown("benchmark", benchmark_id)
-        self._benchmarks.add(benchmark_id)
         return self._outbox.new_path(benchmark_id, name)
 
     def ingest(self, path: Path) -> None:
