@@ -37,7 +37,9 @@ def kept(path: Path) -> Iterator[None]:
 
 def state_of(path: Path) -> str:
     """`recording` while somebody writes to it, else `finished` or `unfinished`."""
-    with contextlib.suppress(RecordingError, FormatError):  # the latter where it is gone on with at this moment
+    with contextlib.suppress(
+        RecordingError, FormatError
+    ):  # the latter where it is gone on with at this moment
         source = PathSource(path)
         try:
             if has_summary(source):
