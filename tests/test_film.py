@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from pathlib import Path
 from typing import Any
 
@@ -74,18 +76,34 @@ def shown(path: Path) -> list[int]:
 @pytest.mark.parametrize("shape", [(20, 30, 3), (20, 30, 1)])
 def test_of_an_image_in_the_states(kind: str, shape: tuple[int, ...], tmp_path: Path) -> None:
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera(shape)))[1]
-    assert episode.video(tmp_path / f"film{kind}") == 5
+    assert episode.video(tmp_path / f"film{kind}").pictures == 5
     np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90], atol=6)
 
 
 def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
     recording = Recording(record(tmp_path / "r.mcap", Camera(), frames=True))
     episodes = list(recording.episodes)
-    assert film(episodes, tmp_path / "a.gif") == 12
+    assert film(episodes, tmp_path / "a.gif").pictures == 12
     np.testing.assert_allclose(shown(tmp_path / "a.gif"), [0, 10, 20, 30, 40, 50] * 2, atol=3)
-    assert film(episodes[:1], tmp_path / "b.gif", camera="state['wrist']", fps=5) == 5
+    assert film(episodes[:1], tmp_path / "b.gif", camera="state['wrist']", fps=5).pictures == 5
     with pytest.raises(RecordingError, match="it has render, state"):
         film(episodes, tmp_path / "c.gif", camera="front")
+
+
+@pytest.mark.parametrize("target", [None, "film.mp4", "film.gif"])
+def test_a_notebook_shows_it(target: str | None, tmp_path: Path) -> None:
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[0]
+    made = episode.video(None if target is None else tmp_path / target)
+    page = made._repr_html_()
+    kind, content = re.search(r'src="data:([a-z]+/[a-z0-9]+);base64,([^"]+)"', page).groups()  # type: ignore[union-attr]
+    assert kind == ("image/gif" if target == "film.gif" else "video/mp4")
+    assert page.startswith("<img" if target == "film.gif" else "<video")
+    copy = tmp_path / f"copy{made.kind}"
+    copy.write_bytes(base64.b64decode(content))
+    assert len(shown(copy)) == made.pictures == 5
+    assert made.path == (None if target is None else tmp_path / target)
+    assert made.path is None or made.path.read_bytes() == copy.read_bytes()
+    assert len(repr(made)) < 200
 
 
 def test_of_a_stack_its_newest_frame(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def render(
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         if output.suffix.lower() != ".mcap" and not rerun and all(map(has_pictures, chosen)):
-            count = film(chosen, output, overwrite=force)
+            count = film(chosen, output, overwrite=force).pictures
             if as_json:
                 print_json({"path": output, "frames": count, "recorded": True, "ok": True})
             else:

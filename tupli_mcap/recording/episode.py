@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
+    from tupli_mcap.replay import Film
 
 
 class _Step(NamedTuple):
@@ -260,15 +261,15 @@ class Episode(GymnasiumNames):
 
     def video(
         self,
-        target: str | os.PathLike[str],
+        target: str | os.PathLike[str] | None = None,
         *,
         camera: str | None = None,
         fps: float | None = None,
         overwrite: bool = False,
-    ) -> int:
-        """Writes the recorded pictures (frames, or an image of the states) as ".mp4" or ".gif"; nothing is executed.
+    ) -> Film:
+        """A film of the recorded pictures (frames, or an image of the states), which a notebook shows. Nothing is executed.
 
-        See `tupli_mcap.replay.film` for the arguments and errors; it returns how many pictures there are.
+        `episode.video("best.mp4")` writes it, too. See `tupli_mcap.replay.film` for the arguments and errors.
         """
         from tupli_mcap.replay import film
 

@@ -8,13 +8,14 @@
 
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped
 from tupli_mcap.replay.certify import certify
-from tupli_mcap.replay.recorded_film import film, has_pictures
+from tupli_mcap.replay.recorded_film import Film, film, has_pictures
 from tupli_mcap.replay.render import RenderedEpisode, RenderReport, render
 
 __all__ = [
     "Certificate",
     "Counts",
     "Divergence",
+    "Film",
     "RenderReport",
     "RenderedEpisode",
     "Skipped",

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import os
+import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,29 +29,57 @@ def has_pictures(episode: Episode) -> bool:
     return bool(len(episode.frames) or episode.recording.layout.images)
 
 
+@dataclass(frozen=True)
+class Film:
+    """A film, which a notebook shows.
+
+    pictures: how many it has. kind: ".mp4" or ".gif". path: of the file, None where it is in memory only. data: the
+    file's bytes.
+    """
+
+    pictures: int
+    kind: str
+    path: Path | None
+    data: bytes = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        content = base64.b64encode(self.data).decode()
+        if self.kind == ".gif":
+            return f'<img style="max-width:100%" src="data:image/gif;base64,{content}">'
+        source = f'<source type="video/mp4" src="data:video/mp4;base64,{content}">'
+        return f'<video style="max-width:100%" controls loop muted autoplay>{source}</video>'
+
+
 def film(
     episodes: Sequence[Episode],
-    target: str | os.PathLike[str],
+    target: str | os.PathLike[str] | None = None,
     *,
     camera: str | None = None,
     fps: float | None = None,
     overwrite: bool = False,
-) -> int:
-    """Writes recorded pictures of episodes, one episode after another, as ".mp4" (extra `video`) or ".gif" (`frames`).
+) -> Film:
+    """Makes a film of recorded pictures of episodes, one episode after another.
 
     Args:
+        target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
         camera: whose frames; or the path of an image in the states, such as `state['wrist']`. By default the camera
             "render", or else the first one, or else the first image. Of a stack, the newest frame.
         fps: pictures a second; by default what the recording says of its steps, or 30.
-
-    Returns:
-        How many pictures.
 
     Raises:
         RecordingError: there is no such picture, or the target exists (and not `overwrite`), or cannot be written.
         MissingExtraError: PyAV or Pillow is not installed.
     """
-    goal = Path(target)
+    with tempfile.TemporaryDirectory() as folder:
+        goal = Path(folder) / "film.mp4" if target is None else Path(target)
+        count = _write(episodes, goal, camera, fps, overwrite=overwrite)
+        return Film(count, goal.suffix.lower(), None if target is None else goal, goal.read_bytes())
+
+
+def _write(
+    episodes: Sequence[Episode], goal: Path, camera: str | None, fps: float | None, *, overwrite: bool
+) -> int:
+    """Returns how many pictures there are."""
     kind = goal.suffix.lower()
     if kind not in _KINDS:
         raise RecordingError(f"{goal}: expected a name that ends in {' or '.join(_KINDS)}")
