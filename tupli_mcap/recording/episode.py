@@ -267,7 +267,7 @@ class Episode(GymnasiumNames):
         fps: float | None = None,
         overwrite: bool = False,
     ) -> Film:
-        """A film of the recorded pictures (frames, or an image of the states), which a notebook shows. Nothing is executed.
+        """A film of recorded pictures (frames, or an image of the states), which a notebook shows; nothing is executed.
 
         `episode.video("best.mp4")` writes it, too. See `tupli_mcap.replay.film` for the arguments and errors.
         """
