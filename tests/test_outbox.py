@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium as gym
@@ -18,6 +19,7 @@ from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import F
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.api.outbox import Outbox
 
 
 @pytest.fixture
@@ -131,11 +133,15 @@ def test_another_url_loses_nothing_and_is_quiet(
 RECORDS = """
 import os, sys
 import gymnasium as gym
+import tupli_mcap.recording.write.writer
 from tupli_mcap import TupliEnvWrapper
 from tupli_mcap.storage import TupliAPIClient
 
 client = TupliAPIClient(sys.argv[1])
-env = TupliEnvWrapper(gym.make("CartPole-v1"), client, chunk_size=3000 if "chunks" in sys.argv else 1 << 18)
+if "boot" in sys.argv:
+    tupli_mcap.recording.write.writer.boot_id = lambda: "one boot"
+chunk_size = 3000 if "chunks" in sys.argv else 1 << 18
+env = TupliEnvWrapper(gym.make("CartPole-v1"), client, chunk_size=chunk_size)
 env.store(name="cart")
 for seed in range(30 if "chunks" in sys.argv else 3):
     env.reset(seed=seed)
@@ -209,3 +215,32 @@ def test_damaged_recordings_are_saved_as_far_as_they_can_be(proxy: Between, admi
     assert admin.count_episodes() >= 22  # which had been sent
     assert waiting(admin) == 0
     assert [path.name for path in (admin._outbox.directory / "damaged").rglob("*.mcap")] == [left.path.name]
+
+
+def test_what_was_recorded_before_the_machine_was_started_anew_is_sent(
+    admin: TupliAPIClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill(records(admin.url, "chunks", "boot"))
+    monkeypatch.setattr("tupli_mcap.journal.file.boot_id", lambda: "another boot")
+    admin._outbox.flush(everything=True)
+    assert waiting(admin) == 0
+    assert [header.end for header in admin.list_episodes()] == ["terminal"] * 30 + ["interrupted"]
+
+
+def test_of_two_processes_one_sends_and_the_other_waits_for_that(
+    proxy: Between, admin: TupliAPIClient
+) -> None:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), admin, max_bytes=1)
+    env.store(name="cart")
+    proxy.go_away()
+    roll(env, 6)
+    env.close()
+    proxy.come_back()
+    senders = [admin._outbox, *(Outbox(admin._session.another()) for _ in range(2))]
+    before = proxy.up
+    with ThreadPoolExecutor(3) as pool:
+        for done in [pool.submit(sender.flush, everything=True) for sender in senders]:
+            done.result()
+    assert waiting(admin) == 0
+    assert sorted(header.seed or 0 for header in admin.list_episodes()) == list(range(6))
+    assert proxy.up - before < 6 * 15_000  # each was sent once

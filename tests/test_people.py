@@ -1,0 +1,76 @@
+"""Users, groups, roles and tokens on the command line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from serving import PASSWORD, serving
+from typer.testing import CliRunner
+
+from tupli_mcap.cli import app
+from tupli_mcap.server.settings import Settings
+
+
+@pytest.fixture(autouse=True)
+def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setenv("TUPLI_MCAP_PASSWORD", PASSWORD)
+    with serving(Settings(tmp_path / "served")) as url:
+        monkeypatch.setenv("TUPLI_MCAP_URL", url)
+        yield url
+
+
+def run(line: str, code: int = 0) -> str:
+    done = CliRunner().invoke(app, line.split(), catch_exceptions=False)
+    assert done.exit_code == code, done.output
+    return done.stdout if code == 0 else done.stderr
+
+
+def test_a_group_of_two(url: str) -> None:
+    run("login admin")
+    for name in ("ann", "bob"):
+        run(f"signup {name}")
+    run("login ann")
+    assert run("create-group robots --description arms") == f"made the group robots at {url}\n"
+    assert run("add-members robots bob --role contributor --role member").splitlines() == [
+        "group        robots",
+        "description  arms",
+        "ann          contributor, group_admin",
+        "bob          contributor, member",
+    ]
+    assert "Insufficient permissions" in run("add-members robots bob --role admin", code=1)
+    assert re.search(r"^robots +arms$", run("list-groups"), re.MULTILINE)
+    assert re.search(r"^bob +global, robots$", run("list-users"), re.MULTILINE)
+    assert "bob" not in run("remove-members robots bob")
+    assert run("delete-group robots") == f"deleted the group robots at {url}\n"
+    assert "Group not found" in run("read-group robots", code=1)
+    assert run("delete-user ann") == f"deleted the user ann at {url}\n"
+    assert run("whoami", code=1).endswith(f"sign in: tupli-mcap login USER --url {url}\n")
+
+
+def test_a_role_and_what_it_cannot_be(url: str) -> None:
+    run("login admin")
+    assert run("create-role looker episode_read benchmark_read") == f"made the role looker at {url}\n"
+    assert re.search(r"^looker +episode_read, benchmark_read", run("list-roles"), re.MULTILINE)
+    run("delete-role looker")
+    assert "looker" not in run("list-roles")
+    assert "expected rights among benchmark_create" in run("create-role x flying", code=2)
+
+
+def test_a_token_for_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    run("login admin")
+    token = run("create-token ci --days 3").strip()
+    (_, listed) = run("list-tokens").splitlines()
+    assert re.fullmatch(r"[0-9a-f]{16}  ci +read .*", listed)
+    assert token not in listed
+    run("logout")
+    monkeypatch.setenv("TUPLI_MCAP_TOKEN", token)
+    assert "admin" in run("whoami")
+    assert "may only read" in run("create-group lab", code=1)
+    monkeypatch.delenv("TUPLI_MCAP_TOKEN")
+    run("login admin")
+    run(f"delete-token {listed.split()[0]}")
+    monkeypatch.setenv("TUPLI_MCAP_TOKEN", token)
+    assert "not valid" in run("whoami", code=1)
