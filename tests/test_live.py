@@ -444,6 +444,29 @@ def test_the_mean_return_leaves_nan_out(returns: list[float], told: str, tmp_pat
     assert told in last_card(tmp_path / "r.rrd")
 
 
+class Lucky(gym.Wrapper[Any, Any, Any, Any]):
+    """Every third episode succeeds, as the info of its last step says; each has one step."""
+
+    episodes = 0
+
+    def step(self, action: Any) -> Any:
+        state, reward, _, _, info = self.env.step(action)
+        self.episodes += 1
+        return state, reward, True, False, {**info, "is_success": self.episodes % 3 == 0}
+
+
+def test_the_share_of_successes_is_told(tmp_path: Path) -> None:
+    port = free_port()
+    with (
+        receiver(port, tmp_path / "r.rrd"),
+        RecordEpisodes(Lucky(gym.make("CartPole-v1")), tmp_path / "r.mcap", live=url(port)) as recorder,
+    ):
+        for _ in range(12):
+            recorder.reset(seed=1)
+            recorder.step(0)
+    assert "success 33% of the last 12 that say it" in last_card(tmp_path / "r.rrd")
+
+
 def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
     path, port = tmp_path / "r.mcap", free_port()
     inner = gym.vector.SyncVectorEnv([lambda: Sampler(MIXED, MIXED)] * 2)

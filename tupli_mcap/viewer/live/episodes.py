@@ -10,14 +10,18 @@ The recorder derives most starts and ends only at a flush. Here they are made ea
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
+from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recover.evidence import Evidence
 from tupli_mcap.recording.recover.step_runs import StepRun, runs_in
@@ -25,6 +29,7 @@ from tupli_mcap.viewer.live.new_rows import NewSteps, messages_of
 
 _STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8")])
 _ENDS = np.dtype([*_STARTS.descr, ("length", "<u8"), ("return", "<f8")])
+_LOOKED_AT = 500  # ends whose metadata are read at a time
 _NUMBER = len(CDR_HEADER)  # where messages have the number of their episode
 
 
@@ -66,6 +71,7 @@ class EpisodeNews:
         self._last: dict[int, StepRun] = {}  # by sub-environment
         self._waiting: dict[int, StepRun] = {}  # by number, ended episodes that wait for the second look
         self.count = 0  # ended episodes
+        self.successes: list[bool] = []  # of the ends written since the last look, where they say it
 
     def look(
         self,
@@ -84,6 +90,7 @@ class EpisodeNews:
             starts, rows = starts[:-1], self._rows[self._start]
             self._rows[self._start], self._seen[self._start] = rows[:-1], rows.stop - 1
         ends = self._fields(self._end, _ENDS)
+        self.successes = list(self._told())
         known = self._ends.note(ends["episode"])
         self._known = {
             self._start: self._starts.note(starts["episode"]),
@@ -102,6 +109,15 @@ class EpisodeNews:
         self.count = store.count(self._end) - self._earlier + len(self._ends.ahead)
         fresh = ends[~np.isin(ends["episode"], list(known))]
         return np.concatenate([fresh, np.array([end for end in made if end is not None], _ENDS)])
+
+    def _told(self) -> Iterator[bool]:
+        """Whether the newest episodes whose ends are written succeeded, as far as their metadata say it."""
+        for _, message in messages_of(self._store, self._end, self._rows[self._end][-_LOOKED_AT:]):
+            with contextlib.suppress(FormatError):  # a damaged one is not shown
+                metadata = EpisodeEnd.decode(memoryview(message)[_NUMBER:]).metadata
+                said = None if metadata == "{}" else success_of(jsonvalue.loads(metadata))
+                if said is not None:
+                    yield said
 
     def _fields(self, channel: int, dtype: np.dtype[np.void]) -> Array:
         """The first fields of the new messages of a channel."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +176,11 @@ class Follower:
     def episodes(self) -> int:
         """Episodes that have ended up to the last look."""
         return self._news.count
+
+    @property
+    def successes(self) -> Sequence[bool]:
+        """Whether the episodes succeeded whose ends were new at the last look, of those that say it."""
+        return self._news.successes
 
     def look(self) -> tuple[list[NewSteps], Array]:
         """The newest of the new steps by sub-environment, and the new ends of episodes (see `EpisodeNews`)."""

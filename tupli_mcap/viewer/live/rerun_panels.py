@@ -43,6 +43,7 @@ class LivePanels:
         self._steps: list[NewSteps] = []  # seen, and not sent yet; the same for infos
         self._infos: list[NewInfo] = []
         self._returns: list[float] = []
+        self._successes: list[bool] = []
         self._lengths: list[int] = []
         self._began = 0.0
         self._next_overview = 0.0
@@ -69,6 +70,7 @@ class LivePanels:
         self._steps += steps
         self._infos += follower.infos(MOST_INFOS)
         self._returns = [*self._returns, *ended["return"].tolist()][-_BARS:]
+        self._successes = [*self._successes, *follower.successes][-_BARS:]
         self._lengths = [*self._lengths, *ended["length"].tolist()][-_BARS:]
 
     def _draw(self, follower: Follower) -> None:
@@ -128,6 +130,9 @@ class LivePanels:
                 text = f"mean return {spread.mean:.4g}{f' ({odd})' if odd else ''}"
                 text = f"return {odd}" if spread.nan == len(self._returns) else text
                 lines.append(f"{follower.episodes:,} episodes; the last {len(self._returns):,}: {text}")
+            if self._successes:
+                share = f"{np.mean(self._successes):.0%} of the last {len(self._successes):,} that say it"
+                lines += ["", f"success {share}"]
             for name, values in (("return", self._returns), ("length", self._lengths)):
                 finite = np.nan_to_num(np.array(values, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
                 stream.log(f"/overview/{name}", rr.BarChart(tensor_array([finite], ["episode"])), static=True)
