@@ -93,26 +93,24 @@ def file_path(place: str | os.PathLike[str]) -> Path:
 def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """See `Dataset.save`."""
     target = file_path(place)
-    chosen: dict[str, list[int]] = {}
-    for header in dataset.headers:
-        chosen.setdefault(header.recording, []).append(header.episode)
+    chosen = dataset._chosen
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
-    sources = [dataset._recordings.get(name).path for name in chosen]
+    sources = [dataset._open(name).path for name in chosen]
     if target.exists() and any(source is not None and target.samefile(source) for source in sources):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()
-        source = dataset._recordings.get(name)
+        source = dataset._open(name)
         said = say_made_of([source], "filter", **_query_of(dataset))
         rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
     excerpts = []
     for name, numbers in chosen.items():
-        source = dataset._recordings.get(name)
+        source = dataset._open(name)
         excerpts.append(Excerpt(source, source.index[np.isin(source.index["episode"], numbers)]))
     with replacing(target) as (fd, _):
         merge_excerpts(excerpts, Container(fd, str(target), "zstd"))
@@ -152,11 +150,10 @@ def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, ove
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or overwrite it")
     target.parent.mkdir(parents=True, exist_ok=True)
-    names = list(dict.fromkeys(header.recording for header in dataset.headers))
     with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
         chosen = save(dataset, Path(folder) / target.name, overwrite=False)
         with Recording(chosen) as recording:
-            sources = [dataset._recordings.get(name) for name in names]
+            sources = [dataset._open(name) for name in dataset._chosen]
             make(recording, target, sources=sources)
     return target
 

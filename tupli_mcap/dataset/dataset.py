@@ -6,6 +6,8 @@ import hashlib
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
@@ -24,6 +26,7 @@ from tupli_mcap.dataset.sources import (
     OpenRecordings,
     Source,
     StorageSource,
+    numbers_by_recording,
 )
 from tupli_mcap.dataset.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.errors import FilterError, did_you_mean
@@ -199,7 +202,7 @@ class Dataset(RandomAccess):
         return self._source, (self if filter is None else self.filter(filter)).headers
 
     def _episode(self, header: EpisodeHeader) -> Episode:
-        recording = self._recordings.get(header.recording)
+        recording = self._open(header.recording, [header.episode])
         position = int(np.searchsorted(recording.index["episode"], header.episode))
         episode = recording.episodes[position]
         episode.listed = header
@@ -211,8 +214,19 @@ class Dataset(RandomAccess):
     def example(self) -> Recording | None:
         """One of the recordings, for its spaces and labels; of a dataset that filters left empty, one they left out.
         None where there is none at all."""
-        headers = self.headers or self._source.episodes(None, None)
-        return self._recordings.get(headers[0].recording) if headers else None
+        if self.headers:
+            return self._open(self.headers[0].recording)
+        left_out = self._source.episodes(None, None)
+        return self._source.open(left_out[0].recording, [left_out[0].episode]) if left_out else None
+
+    @cached_property
+    def _chosen(self) -> Mapping[str, Sequence[int]]:
+        """The numbers of the episodes, by recording."""
+        return numbers_by_recording(self.headers)
+
+    def _open(self, name: str, needed: Sequence[int] | None = None) -> Recording:
+        """A recording with the dataset's episodes of it, or at least those that are needed."""
+        return self._recordings.get(name, self._chosen[name], needed)
 
     def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
         made = Dataset(self._source, headers)
@@ -393,7 +407,8 @@ class Dataset(RandomAccess):
         if self._steps is None:
             groups = itertools.groupby(self.headers, key=lambda header: header.recording)
             self._steps = RecordedSteps(
-                (ListedEpisodes.of(name, group) for name, group in groups), self._recordings.lent
+                (ListedEpisodes.of(name, group) for name, group in groups),
+                lambda name: nullcontext(self._open(name)),
             )
         return self._steps
 
@@ -405,8 +420,7 @@ class Dataset(RandomAccess):
         return self._episode(self.headers[place]).frames
 
     def _step_seconds(self) -> float | None:
-        names = dict.fromkeys(header.recording for header in self.headers)
-        known = {self._recordings.get(name).labels.step_seconds for name in names}
+        known = {self._open(name).labels.step_seconds for name in self._chosen}
         return known.pop() if len(known) == 1 else None
 
     def loader(

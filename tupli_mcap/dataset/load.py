@@ -78,9 +78,10 @@ def read_columns(
         progress(total, "Loading") as bar,
     ):
         reader = _Reader(fields, selector, known, total)
-        for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-            with source.open(name) as recording:
-                reader.read(recording, list(group), bar)
+        for name, same in itertools.groupby(headers, key=lambda header: header.recording):
+            group = list(same)
+            with source.open(name, [header.episode for header in group]) as recording:
+                reader.read(recording, group, bar)
         return reader.finish(headers)
 
 

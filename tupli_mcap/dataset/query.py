@@ -12,7 +12,7 @@ from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, Record
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
 from tupli_mcap.dataset.load import Selected, TupleFilter, read_columns, selector_of
-from tupli_mcap.dataset.sources import Source
+from tupli_mcap.dataset.sources import Source, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
@@ -104,9 +104,12 @@ class Query:
             seen: dict[str, Recording] = {}
             headers = self.refresh(seen) if self._headers is None else self._headers
             mask = None if self._selector is None else self.selected.mask
+            chosen = numbers_by_recording(headers)
             self._recorded = RecordedSteps(
                 _listed(headers),
-                lambda name: nullcontext(seen.pop(name)) if name in seen else self.source.open(name),
+                lambda name: (
+                    nullcontext(seen.pop(name)) if name in seen else self.source.open(name, chosen[name])
+                ),
                 mask,
                 cache_bytes=self.cache_bytes,
                 threads=self.threads,

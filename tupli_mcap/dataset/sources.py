@@ -8,7 +8,6 @@ import os
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -41,6 +40,7 @@ __all__ = [
     "Source",
     "StorageSource",
     "episode_headers",
+    "numbers_by_recording",
 ]
 
 _MOST_OPEN = 64
@@ -70,8 +70,8 @@ class Source(Protocol):
 
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str: ...
 
-    def open(self, recording: str) -> Recording:
-        """The recording that a header names; the caller closes it."""
+    def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        """The recording that a header names; the caller closes it. `episodes` as in `TupliStorage.open_recording`."""
         ...
 
 
@@ -108,8 +108,8 @@ class StorageSource:
         wanted = FilterIN(key="benchmark_id", value=ids)
         return wanted if episode_filter is None else wanted & episode_filter
 
-    def open(self, recording: str) -> Recording:
-        return self.storage.open_recording(recording)
+    def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        return self.storage.open_recording(recording, episodes)
 
     def __repr__(self) -> str:
         return repr(self.storage)
@@ -200,7 +200,7 @@ class FilesSource:
         """Files have no SQL: what every episode is tried against."""
         return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
 
-    def open(self, recording: str) -> Recording:
+    def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return Recording(self._addresses.get(recording, recording), cache_bytes=_CACHE_BYTES)
 
     def __repr__(self) -> str:
@@ -243,8 +243,8 @@ class JoinedSource:
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
         return "\n".join(source.explain(benchmark_filter, episode_filter) for source in self._sources)
 
-    def open(self, recording: str) -> Recording:
-        return self._of[recording][0].open(recording)
+    def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        return self._of[recording][0].open(recording, episodes)
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self._sources))
@@ -335,19 +335,29 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
 class OpenRecordings:
     """Opens recordings by name. An `Episode` keeps its recording open for as long as it lives. Not thread-safe."""
 
-    def __init__(self, open_recording: Callable[[str], Recording]) -> None:
+    def __init__(self, open_recording: Callable[[str, Sequence[int]], Recording]) -> None:
         self._open = open_recording
-        self._kept: OrderedDict[str, Recording] = OrderedDict()
+        self._kept: OrderedDict[str, tuple[Recording, frozenset[int]]] = OrderedDict()  # with their episodes
 
-    def get(self, name: str) -> Recording:
-        """The recording; RecordingError if it cannot be opened."""
-        if name not in self._kept:
-            self._kept[name] = self._open(name)
+    def get(self, name: str, episodes: Sequence[int], needed: Sequence[int] | None = None) -> Recording:
+        """The recording, with some of its episodes at least: `needed`, by default all these `episodes`.
+
+        Raises:
+            RecordingError: it cannot be opened.
+        """
+        kept = self._kept.get(name)
+        if kept is None or not kept[1].issuperset(episodes if needed is None else needed):
+            recording = self._open(name, episodes)
+            self._kept[name] = recording, frozenset(recording.index["episode"].tolist())
             if len(self._kept) > _MOST_OPEN:
                 self._kept.popitem(last=False)  # closed when nobody holds an episode of it
         self._kept.move_to_end(name)
-        return self._kept[name]
+        return self._kept[name][0]
 
-    def lent(self, name: str) -> AbstractContextManager[Recording]:
-        """The same, for a `with` block that must not close it."""
-        return nullcontext(self.get(name))
+
+def numbers_by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[int]]:
+    """The numbers of episodes, by the recording they are in."""
+    found: dict[str, list[int]] = {}
+    for header in headers:
+        found.setdefault(header.recording, []).append(header.episode)
+    return found

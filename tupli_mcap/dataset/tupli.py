@@ -196,8 +196,8 @@ class TupliDataset(RandomAccess):
 
     def _step_seconds(self) -> float | None:
         known = set()
-        for name in dict.fromkeys(header.recording for header in self._headers):
-            with self._query.source.open(name) as recording:
+        for name, episode in {header.recording: header.episode for header in self._headers}.items():
+            with self._query.source.open(name, [episode]) as recording:
                 known.add(recording.labels.step_seconds)
         return known.pop() if len(known) == 1 else None
 

@@ -261,7 +261,8 @@ def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iter
     for header in headers:
         by_recording.setdefault(header.recording, []).append(header)
     for name, group in by_recording.items():
-        yield Subject(name, partial(source.open, name), partial(_positions, headers=group))
+        numbers = [header.episode for header in group]
+        yield Subject(name, partial(source.open, name, numbers), partial(_positions, headers=group))
 
 
 def _narrowed(dataset: TupliDataset, episode_filter: BaseFilter) -> TupliDataset:

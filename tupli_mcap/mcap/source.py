@@ -9,7 +9,9 @@ import mmap
 import os
 import stat
 import threading
+import weakref
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
@@ -172,6 +174,28 @@ class PathSource:
             self.close()
 
 
+class TemporarySource(PathSource):
+    """A file that is deleted when nobody reads it any more; errors call it `name`.
+
+    A copy in another process reads it for as long as it is there.
+    """
+
+    def __init__(self, place: Path, name: str, *, owned: bool = True) -> None:
+        super().__init__(place)
+        self.path, self.name, self._place = None, name, place
+        if owned:
+            weakref.finalize(self, _delete, place, os.getpid())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(TemporarySource, owned=False), (self._place, self.name)
+
+
+def _delete(place: Path, process: int) -> None:
+    if os.getpid() == process:  # and no fork of it
+        with contextlib.suppress(OSError):
+            place.unlink()
+
+
 class FileSource:
     """An open, seekable binary file; it is not closed unless it is ours."""
 
@@ -240,8 +264,10 @@ def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]
         ) from err
 
 
-def open_source(source: str | os.PathLike[str] | BinaryIO) -> Source:
+def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource) -> Source:
     """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file."""
+    if isinstance(source, TemporarySource):
+        return source
     if isinstance(source, str) and source.startswith("file://"):
         return PathSource(Path(unquote(urlsplit(source).path)))
     if isinstance(source, str) and is_url(source):

@@ -17,7 +17,7 @@ from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrus
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import BODY, read_attachment, read_metadata
-from tupli_mcap.mcap.source import Source, open_source
+from tupli_mcap.mcap.source import Source, TemporarySource, open_source
 from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summary
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
@@ -98,7 +98,12 @@ class RecordedBenchmark(NamedTuple):
 class OpenedRecording:
     """An open file whose structure is sound, and what it says of itself. The arguments are those of `Recording`."""
 
-    def __init__(self, source: str | os.PathLike[str] | BinaryIO, *, cache_bytes: int = CACHE_BYTES) -> None:
+    def __init__(
+        self,
+        source: str | os.PathLike[str] | BinaryIO | TemporarySource,
+        *,
+        cache_bytes: int = CACHE_BYTES,
+    ) -> None:
         self._source = open_source(source)
         self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)
         self._cache_bytes = cache_bytes

@@ -247,7 +247,7 @@ class Library:
     def with_tuples(self, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeItem]:
         """Episodes of the catalog with their tuples."""
 
-        def opened(name: str) -> Recording:
+        def opened(name: str, _: Sequence[int]) -> Recording:
             with self.database.reading() as connection:
                 found = select(FILE.c.place).where(FILE.c.path == escape_text(name))
                 place = connection.execute(found).scalar()

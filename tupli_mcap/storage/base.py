@@ -169,8 +169,11 @@ class TupliStorage(ABC):
         """
 
     @abstractmethod
-    def open_recording(self, recording: str) -> Recording:
-        """The recording of an `EpisodeHeader.recording`; the caller closes it."""
+    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        """The recording of an `EpisodeHeader.recording`; the caller closes it.
+
+        episodes: numbers of those that will be read, where these are not all: others may be missing in it.
+        """
 
     @abstractmethod
     def declare_key(self, key: str) -> None:

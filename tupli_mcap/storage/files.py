@@ -315,7 +315,7 @@ class FileStorage(TupliStorage):
         """
         return self._recordings.path(recording)
 
-    def open_recording(self, recording: str) -> Recording:
+    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         path = self._recordings.path(recording)
         try:
             return Recording(path)

@@ -251,14 +251,15 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
 
 
 def with_tuples(
-    headers: Sequence[EpisodeHeader], open_recording: Callable[[str], Recording]
+    headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
 ) -> Iterator[EpisodeItem]:
     """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
 
     A tuple's values have the type of the space's own samples; the info is empty where none was recorded.
     """
-    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        with open_recording(name) as recording:
+    for name, same in itertools.groupby(headers, key=lambda header: header.recording):
+        group = list(same)
+        with open_recording(name, [header.episode for header in group]) as recording:
             positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
             for header in group:
                 if header.episode not in positions:
