@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
+import pickle
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -15,11 +18,14 @@ import pytest
 from gymnasium import spaces
 from test_server import Things, Users, things, token_of, users
 
-from tupli_mcap import EpisodeData, Recording, verify_recording, write_recording
-from tupli_mcap.errors import FormatError
+import tupli_mcap
+from tupli_mcap import EpisodeData, Recording, TupliDataset, verify_recording, write_recording
+from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
+from tupli_mcap.remote import is_cut_cheaper
 from tupli_mcap.schema import BaseFilter, F, FilterEQ
+from tupli_mcap.server.app import create_app
 from tupli_mcap.storage import TupliAPIClient
 
 __all__ = ["things", "users"]  # fixtures
@@ -152,3 +158,90 @@ def test_a_stream_tells_what_goes_wrong(tmp_path: Path) -> None:
 
     with pytest.raises(FormatError, match="CRC|decompress"):
         list(stream_excerpts(opened()))
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The bytes of all bodies that the server sends."""
+    found: list[int] = []
+
+    def counted(library: Any) -> Any:
+        app = create_app(library)
+
+        async def counting(scope: Any, receive: Any, send: Any) -> None:
+            async def count(message: Any) -> None:
+                found.append(len(message.get("body", b"")))
+                await send(message)
+
+            await app(scope, receive, count)
+
+        return counting
+
+    monkeypatch.setattr("serving.create_app", counted)
+    return found
+
+
+def temporary_files() -> set[Path]:
+    return set(Path(tempfile.gettempdir()).glob("tupli-mcap-*.mcap"))
+
+
+def test_few_short_episodes_of_a_server_move_few_bytes(sent: list[int], users: Users, tmp_path: Path) -> None:
+    before = temporary_files()
+    path = short_episodes(tmp_path / "a.mcap", 4000, 0)
+    users.ann.push(path)
+    best = list(range(7, 4000, 100))
+    expected = Recording(path).read(best)
+    sent.clear()
+    dataset = TupliDataset(users.ann).with_episode_filter(F("metadata.best") == True)  # noqa: E712
+    dataset.load()
+    assert sum(sent) < 0.02 * path.stat().st_size
+    assert np.array_equal(dataset.convert_to_numpy()[0], expected.states)
+    sent.clear()
+    some = tupli_mcap.open(users.ann).filter("metadata.best")
+    assert np.array_equal(some.read(["actions"]).actions, expected.actions)
+    assert sum(sent) < 0.02 * path.stat().st_size
+    sent.clear()
+    with Recording(some.save(tmp_path / "saved.mcap")) as saved:
+        assert saved.index["episode"].tolist() == best
+        assert np.array_equal(saved.read().rewards, expected.rewards)
+    assert sum(sent) < 0.02 * path.stat().st_size
+    windows = some.windows(8)
+    copy = pickle.loads(pickle.dumps(windows))
+    assert np.array_equal(copy[100].states, windows[100].states)
+    assert [episode.number for episode in some] == best and len(temporary_files() - before) == 1
+    del some, windows, copy, dataset
+    gc.collect()
+    assert temporary_files() == before
+
+
+def test_an_episode_that_was_not_cut_out_is_fetched_all_the_same(users: Users, tmp_path: Path) -> None:
+    """A dataset that was narrowed shares what is open with the one that it was narrowed from."""
+    users.ann.push(short_episodes(tmp_path / "a.mcap", 1000, 0))
+    everything = tupli_mcap.open(users.ann)
+    assert len(everything[:3][0].states) == everything.lengths[0]
+    assert len(everything[500].states) == everything.lengths[500]
+    local = tupli_mcap.open(tmp_path / "a.mcap")
+    assert np.array_equal(everything[999].states, local[999].states)
+    numbers = [1, 2, 3]
+    few, many = (users.ann.open_recording(everything.headers[0].recording, n) for n in (numbers, range(900)))
+    assert few.index["episode"].tolist() == numbers and len(many) == 1000
+    with pytest.raises(NotFoundError, match="there is no such episode"):
+        users.ann.open_recording(everything.headers[0].recording, [5000])
+
+
+@pytest.mark.parametrize(
+    ("wanted", "episodes", "size", "cut"),
+    [
+        (90, 9000, 10 << 20, True),  # short ones, which lie in nearly all chunks
+        (9000, 9000, 10 << 20, False),
+        (4500, 9000, 10 << 20, False),
+        (4, 380, 49 << 20, False),  # of a thousand steps
+        (1, 1, 1 << 30, False),
+        (1, 100, 100 << 10, True),  # the tail alone is more
+    ],
+)
+def test_the_server_cuts_where_ranges_bring_much_more(
+    wanted: int, episodes: int, size: int, cut: bool
+) -> None:
+    assert is_cut_cheaper(range(wanted), episodes, size) == cut
+    assert not is_cut_cheaper(None, episodes, size)

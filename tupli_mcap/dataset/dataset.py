@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -34,11 +35,11 @@ from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.frames import Frames
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_url, is_web
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
-from tupli_mcap.storage import FileStorage, TupliStorage
+from tupli_mcap.storage import FileStorage, TupliStorage, storage_at
 from tupli_mcap.storage.listing import find_recordings, is_storage
 
 if TYPE_CHECKING:
@@ -54,7 +55,8 @@ Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Datas
 
 
 def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
-    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a URL, a recording, or a list of them.
+    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
+    a server: "http://lab:8080"), or a list of them.
 
     An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
     far as it has come, and ends as interrupted.
@@ -78,6 +80,8 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         folder = Path(name).expanduser()
+        if _is_server(name):
+            return Dataset(StorageSource(storage_at(name)))
         if is_url(name) or not folder.is_dir():
             return Dataset(FilesSource(source))
         files = _files_in(folder)
@@ -89,6 +93,11 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
             f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
         )
     return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
+
+
+def _is_server(name: str) -> bool:
+    """Whether it is the address of a web server, and not of a file on it."""
+    return is_web(name) and not urlsplit(name).path.strip("/")
 
 
 def _place_of(recording: Recording) -> str:

@@ -1,15 +1,26 @@
 """Files on web servers and in buckets, read in place.
 
 objects:  one object behind a URL: its size, its version, and ranges of its bytes (obstore, or fsspec).
-plan:     which ranges are asked for together.
+plan:     which ranges are asked for together, and when to let a server cut.
 source:   what a reader reads from: it plans ahead, keeps what came, and stops if the object changes.
 patterns: the URLs that a pattern such as "s3://bucket/runs/*.mcap" matches.
 names:    URLs, and how they may be shown.
 """
 
-from tupli_mcap.remote.names import is_url, shown
+from tupli_mcap.remote.names import is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import matching
+from tupli_mcap.remote.plan import is_cut_cheaper
 from tupli_mcap.remote.source import RemoteSource, copied, open_url
 
-__all__ = ["RemoteSource", "copied", "is_url", "matching", "open_store", "open_url", "shown"]
+__all__ = [
+    "RemoteSource",
+    "copied",
+    "is_cut_cheaper",
+    "is_url",
+    "is_web",
+    "matching",
+    "open_store",
+    "open_url",
+    "shown",
+]

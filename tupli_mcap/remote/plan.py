@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-__all__ = ["pieces_of"]
+__all__ = ["is_cut_cheaper", "pieces_of"]
 
 Range = tuple[int, int]  # first byte, and the one behind the last
 
@@ -15,6 +15,9 @@ _LARGEST_PIECE = 8 << 20
 # first one, which are a seventh of a file of small steps: a whole field must not become a request for each chunk.
 _WASTE = 5
 _LITTLE = 16 << 10
+_CHUNK = 128 << 10  # about what a chunk takes
+_TAIL = 128 << 10  # what opening takes
+_CUT = 4
 
 
 def pieces_of(wanted: Iterable[Range]) -> list[Range]:
@@ -56,3 +59,18 @@ def _cut(start: int, stop: int) -> list[Range]:
     count = -(-(stop - start) // _LARGEST_PIECE)
     size = -(-(stop - start) // count)
     return [(at, min(stop, at + size)) for at in range(start, stop, size)]
+
+
+def is_cut_cheaper(wanted: Sequence[int] | None, episodes: int, size: int) -> bool:
+    """Whether a server should make a recording of the wanted ones (None: all) of a file's episodes, rather than be
+    asked for ranges of the file.
+
+    Ranges bring the index, and whole chunks: of each wanted episode its own, and one for what lies beside it. What is
+    cut brings its rows only, but the server has to unpack and pack them, which takes as long as to send some times as
+    many bytes. The index would tell the bytes exactly; it can have more of them than the wanted episodes.
+    """
+    if wanted is None or not episodes:
+        return False
+    rows = size / episodes
+    ranges = _TAIL + min(size, len(wanted) * (rows + _CHUNK))
+    return _CUT * len(wanted) * rows < ranges

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
+from starlette.middleware.gzip import GZipMiddleware
 
 import tupli_mcap
 from tupli_mcap.page.directory import OpenedRecordings
@@ -19,6 +20,9 @@ from tupli_mcap.server.wire import Error, tell_errors, told
 
 __all__ = ["create_app"]
 
+# Recordings are compressed already. A page may repeat what a stranger's link says beside what only its reader may see;
+# the size of both compressed would tell the one from the other.
+_AS_THEY_ARE = ("application/octet-stream", "text/html", "font/*", "image/*", "video/*")
 _REFUSALS = {status: {"model": Error} for status in (400, 401, 403, 404, 409)}
 
 
@@ -39,6 +43,7 @@ def create_app(library: Library) -> FastAPI:
         redoc_url=None,
     )
     app.state.library = library
+    app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
     for routes in (accounts, items, episodes, query, recordings, viewers, pytupli):
         app.include_router(routes.router, responses=_REFUSALS)  # type: ignore[arg-type]
     tell_errors(app)

@@ -36,13 +36,14 @@ _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
 
 class StoredFile(NamedTuple):
-    """The file of a recording: its place among the blobs, SHA-256 and size; `whole` if the caller may read all
-    of it."""
+    """The file of a recording: its place among the blobs, SHA-256, size, and how many episodes are in it; `whole` if
+    the caller may read all of it."""
 
     name: str
     place: str
     digest: str
     size: int
+    episodes: int
     whole: bool
 
 
@@ -81,7 +82,8 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
             seen = count_episodes(connection, caller, FilterEQ(key="recording", value=each))
             if seen:
                 place = unescape_text(found.place)
-                return StoredFile(each, place, found.digest, found.size, seen == found.episodes)
+                whole = seen == found.episodes
+                return StoredFile(each, place, found.digest, found.size, found.episodes, whole)
     raise NotFoundError(f"there is no recording {name[:200]!r}")
 
 

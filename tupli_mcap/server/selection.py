@@ -32,12 +32,13 @@ _CACHE_BYTES: Final = 32 << 20  # of all recordings of an answer
 class EpisodeQuery(BaseModel):
     """Which episodes: those of which all that is given is true.
 
-    recordings: names of recordings, as headers of episodes give them.
+    recordings: names of recordings, as headers of episodes give them. episodes: numbers, where one recording is named.
     """
 
     filter: BaseFilter | None = None
     benchmark_filter: BaseFilter | None = None
     recordings: list[str] | None = Field(default=None, max_length=10_000)
+    episodes: list[int] | None = None
 
 
 class Selected(NamedTuple):
@@ -58,6 +59,10 @@ def select_episodes(
         StorageError: they are of more recordings than one answer can hold.
         FilterError: a filter names what there is not.
     """
+    if query.episodes is not None and len(query.recordings or ()) != 1:
+        raise StorageError(
+            "expected numbers of episodes (`episodes`) with the name of one recording (`recordings`)"
+        )
     wanted: list[BaseFilter] = [] if query.filter is None else [query.filter]
     if query.benchmark_filter is not None:
         ids = [header.id for header in items.list_benchmarks(connection, caller, query.benchmark_filter)]
@@ -67,8 +72,10 @@ def select_episodes(
         wanted.append(FilterIN(key="recording", value=names))
     meant = reduce(and_, wanted) if wanted else None
     numbers: dict[str, list[int]] = {}
+    kept = None if query.episodes is None else frozenset(query.episodes)
     for header in episodes.find_episodes(connection, caller, meant):
-        numbers.setdefault(header.recording, []).append(header.episode)
+        if kept is None or header.episode in kept:
+            numbers.setdefault(header.recording, []).append(header.episode)
     if not numbers:
         raise NotFoundError("there is no such episode")
     if len(numbers) > _MOST:

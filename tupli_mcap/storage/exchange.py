@@ -158,7 +158,7 @@ def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: s
             if path is not None:
                 yield path
                 return
-    with source.open_recording(name) as recording:
+    with source.open_recording(name, numbers) as recording:
         path = recording.file.source.path
         if path is not None and recording.complete and len(numbers) == len(recording):
             yield path

@@ -40,12 +40,16 @@ class Named(BaseModel):
 
 
 class Ticket(BaseModel):
-    """Where a recording can be read without signing in, for a while; not `whole` if some of it may not be read."""
+    """Where a recording can be read without signing in, for a while; not `whole` if some of it may not be read.
+
+    digest, size, episodes: of the whole file.
+    """
 
     path: str
     whole: bool
     digest: str
     size: int
+    episodes: int
 
 
 # --- sending ---
@@ -168,7 +172,7 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
         found = episodes.file_of(connection, caller, told.recording)
     ticket = library.tokens.ticket(caller.name, found.name)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
-    return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size)
+    return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
 
 
 @router.get("/files/{name:path}")

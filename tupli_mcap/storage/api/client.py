@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,8 +16,10 @@ from pydantic import BaseModel, Field
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
+from tupli_mcap.mcap.source import TemporarySource
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.remote import is_cut_cheaper
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -35,6 +38,7 @@ from tupli_mcap.storage.api.outbox import Outbox, Waiting, outbox_of
 from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.session import Session, as_told, pages
 from tupli_mcap.storage.api.upload import Tell, send_file
+from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, published_in
 from tupli_mcap.storage.benchmark_json import declared_spaces, plain, recording_attachments
 from tupli_mcap.storage.downloads import fetched
@@ -296,18 +300,29 @@ class TupliAPIClient(People, TupliStorage):
     def ingest(self, path: Path) -> None:
         self._outbox.send(path)
 
-    def open_recording(self, recording: str) -> Recording:
+    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         if not isinstance(recording, str):
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
             )
         ticket = self._ticket(recording)
-        if ticket.whole:
+        if ticket.whole and not is_cut_cheaper(episodes, ticket.episodes, ticket.size):
             return Recording(self.url + ticket.path)
-        with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
-            path = Path(folder) / recording.rpartition("/")[2]
-            path.write_bytes(self._session.send("GET", ticket.path).content)
-            return Recording(path)  # which stays readable when its name is gone
+        return self._cut(recording, episodes)
+
+    def _cut(self, recording: str, episodes: Sequence[int] | None) -> Recording:
+        """A recording of some episodes of another one, which the server makes; here it is a file while it is open."""
+        asked = {"recordings": [recording], "episodes": None if episodes is None else list(episodes)}
+        handle, name = tempfile.mkstemp(prefix="tupli-mcap-", suffix=".mcap")
+        place = Path(name)
+        try:
+            with os_errors("cannot write", place), os.fdopen(handle, "wb") as file:
+                self._session.fetch("/v1/query", asked, file)
+            source = TemporarySource(place, recording)
+        except BaseException:
+            place.unlink()
+            raise
+        return Recording(source)
 
     @contextlib.contextmanager
     def downloaded(self, recording: str, what: str = "") -> Iterator[Path | None]:
@@ -390,6 +405,7 @@ class _Ticket(BaseModel):
     whole: bool
     digest: str = Field(pattern="^[0-9a-f]{64}$")
     size: int
+    episodes: int
 
 
 def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import re
 import time
 import weakref
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -284,6 +284,24 @@ class Session:
             for piece in response.iter_raw():
                 yield piece[skipped:]
                 skipped = max(0, skipped - len(piece))
+
+    def fetch(self, path: str, told: Any, file: BinaryIO) -> None:
+        """Writes what the server answers to a JSON body into a file, anew where the connection breaks off."""
+        import httpx
+
+        content, headers = jsonvalue.dumps(told).encode(), {"Content-Type": "application/json"}
+        for attempt in range(_ATTEMPTS):
+            file.truncate(file.seek(0))
+            try:
+                answer = self.send("POST", path, content=content, headers=headers, stream=True, repeat=True)
+                with contextlib.closing(answer):
+                    for piece in answer.iter_bytes():
+                        file.write(piece)
+                return
+            except httpx.TransportError as err:
+                if attempt == _ATTEMPTS - 1:
+                    raise self._unreachable(err) from None
+            time.sleep(0.2 * 2**attempt)
 
     def _token(self) -> str:
         return os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
