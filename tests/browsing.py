@@ -21,7 +21,7 @@ from playwright.sync_api import Page, sync_playwright
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
-_FLAGS = (
+FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -81,7 +81,7 @@ def browse(url: str, seconds: float = 150.0, size: tuple[int, int] = (1000, 700)
     It reaches this machine only: what the page asks of others is refused.
     """
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *_FLAGS])
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *FLAGS])
         page = chromium.new_page(viewport={"width": size[0], "height": size[1]})
         page.add_init_script("console.debug = console.log = () => {}")  # thousands of lines on shaders
         page.route(lambda target: not target.startswith("http://127.0.0.1:"), lambda route: route.abort())

@@ -60,10 +60,12 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
         show: whether to open it in a browser.
 
     Raises:
-        RecordingError: there is no such file.
+        RecordingError, FormatError: there is no such file, or it is no recording.
         StorageError: the port is taken.
     """
-    app = create_app(shelf_of(path))
+    shelf = shelf_of(path)
+    shelf.ask(lambda connection: None)  # new recordings are catalogued before anybody waits for a page
+    app = create_app(shelf)
     listening = _listen(port)
     address = f"http://{_HOST}:{listening.getsockname()[1]}"
     tell(address)

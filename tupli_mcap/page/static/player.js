@@ -27,7 +27,7 @@ export function player(section) {
 // A function that shows the picture of a step; one that is asked for while another one comes waits for it.
 function film(image) {
   const shows = JSON.parse(image.dataset.shows); // the steps, or how many pictures there are, one a step
-  const base = image.src.replace(/\d+$/, "");
+  const base = image.getAttribute("src").replace(/\d+$/, "");
   let wanted = null;
   let busy = false;
   const next = () => {
@@ -37,7 +37,7 @@ function film(image) {
     busy = true;
     const coming = new Image();
     coming.onload = coming.onerror = () => {
-      if (coming.naturalWidth) image.src = coming.src;
+      if (coming.naturalWidth) image.src = base + place;
       busy = false;
       next();
     };

@@ -1,0 +1,267 @@
+"""The page in a real browser: what it does, that nothing of a file acts on it, and that everybody can use it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from browsing import CHROMIUM, FLAGS
+from pages import EVIL, browsing, carts, robot
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+from serving import PASSWORD, serving
+
+from tupli_mcap.server.settings import Settings
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: tools/setup-viewer web")
+PATIENCE = 60_000.0  # ms for what happens at last
+
+
+class Seen(NamedTuple):
+    """What a page complained of, and which hosts it asked."""
+
+    complaints: list[str]
+    hosts: set[str]
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *FLAGS])
+        yield browser
+        browser.close()
+
+
+@contextlib.contextmanager
+def opened(chromium: Browser, address: str, **options: Any) -> Iterator[tuple[Page, Seen]]:
+    """A new page of a new visitor, which tells what goes wrong in it."""
+    context = chromium.new_context(base_url=address, viewport={"width": 1280, "height": 900}, **options)
+    page, seen = context.new_page(), Seen([], set())
+    page.set_default_timeout(PATIENCE)
+    page.on("console", lambda told: seen.complaints.append(told.text) if told.type == "error" else None)
+    page.on("pageerror", lambda error: seen.complaints.append(str(error)))
+    page.on("request", lambda asked: seen.hosts.add(asked.url.split("/")[2]) if "://" in asked.url else None)
+    try:
+        yield page, seen
+    finally:
+        context.close()
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    root = tmp_path_factory.mktemp("lab")
+    carts(root, seeds=2, episodes=6)
+    robot(root / "<b>evil<b>.mcap", text=EVIL)
+    with browsing(root) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(Settings(tmp_path_factory.mktemp("kept"))) as url:
+        yield url
+
+
+def places(address: str) -> list[str]:
+    """A page of each kind."""
+    told = httpx.get(f"{address}/episodes?format=json").json()["episodes"]
+    uris = list({episode["recording"]: episode["id"] for episode in told}.values())
+    of_carts = [episode["id"] for episode in told if episode["run"]["name"].startswith("ppo")]
+    return [
+        "/",
+        "/?q=nothing",
+        "/episodes?sort=-return",
+        "/episodes?filter=steps+%3E",
+        "/dataset/CartPole-v1",
+        "/dataset/-",
+        *(f"/episode/{uri}" for uri in uris),
+        f"/compare?episode={of_carts[0]}&episode={of_carts[-1]}",
+        "/episode/nope",
+    ]
+
+
+def sign_in(page: Page, name: str = "admin", password: str = PASSWORD) -> None:
+    page.goto("/sign-in")
+    page.get_by_label("Name").fill(name)
+    page.get_by_label("Password").fill(password)
+    page.get_by_role("button", name="Sign in").click()
+    expect(page.get_by_role("heading", name="Datasets")).to_be_visible()
+
+
+def violations(page: Page) -> list[str]:
+    found = Axe().run(page).response["violations"]
+    return [f"{each['id']}: {node['html'][:120]}" for each in found for node in each["nodes"]]
+
+
+class TestEverybody:
+    @pytest.mark.parametrize("scheme", ["light", "dark"])
+    def test_nothing_stands_in_the_way(self, chromium: Browser, lab: str, scheme: Any) -> None:
+        with opened(chromium, lab, color_scheme=scheme) as (page, _):
+            for place in places(lab):
+                page.goto(place)
+                assert violations(page) == [], place
+
+    def test_pages_of_servers(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            page.goto("/")
+            assert violations(page) == []
+            sign_in(page)
+            for place in ("/", "/upload", "/groups", "/group?name=global", "/users", "/account"):
+                page.goto(place)
+                assert violations(page) == [], place
+
+    def test_a_phone(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, _):
+            page.set_viewport_size({"width": 360, "height": 740})
+            for place in places(lab):
+                page.goto(place)
+                wide = page.evaluate("document.documentElement.scrollWidth")
+                assert wide <= 360, place
+
+    def test_without_scripts(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab, java_script_enabled=False) as (page, _):
+            page.goto("/episodes?dataset=CartPole-v1&sort=-return")
+            boxes = page.locator("input[name=episode]")
+            for i in range(2):
+                boxes.nth(i).check()
+            page.get_by_role("button", name="Compare").click()
+            expect(page.get_by_role("heading", name="2 episodes compared")).to_be_visible()
+            page.goto("/dataset/CartPole-v1")
+            page.locator(".stage h2 a").click()
+            page.locator("input[type=range]").fill("3")
+            page.get_by_role("button", name="Show").click()
+            expect(page.locator(".transport output")).to_contain_text("step 3 of")
+
+
+class TestNothingActs:
+    def test_texts_of_files(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, seen):
+            dialogs: list[str] = []
+            page.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+            for place in places(lab):
+                page.goto(place)
+                page.wait_for_load_state("networkidle")
+                assert "pwned" not in page.title().replace(EVIL, ""), place
+                assert page.evaluate("document.querySelectorAll('main script, main img[src=x]').length") == 0
+            assert dialogs == []
+            assert {host.split(":")[0] for host in seen.hosts} == {"127.0.0.1"}
+            statuses = ("status of 404", "status of 400")
+            assert [told for told in seen.complaints if not any(status in told for status in statuses)] == []
+
+    def test_no_page_of_another_host_frames_it(self, chromium: Browser, lab: str, tmp_path: Path) -> None:
+        outer = tmp_path / "outer.html"
+        outer.write_text(f'<iframe src="{lab}/" width="600" height="400"></iframe>')
+        with opened(chromium, lab) as (page, seen):
+            page.goto(outer.as_uri())
+            page.wait_for_timeout(500)
+            assert any("frame-ancestors" in told for told in seen.complaints)
+
+
+class TestPlayer:
+    def test_it_moves_pictures_lines_and_values(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, seen):
+            page.goto(f"/episode/{told[0]['id']}")
+            slider, picture = page.get_by_label("Step", exact=True), page.locator(".films img")
+            value = page.locator("output[data-name='joints[0]']")
+            expect(value).to_have_text("0")
+            slider.focus()
+            for _ in range(4):
+                page.keyboard.press("ArrowRight")
+            expect(page.locator(".transport output")).to_have_text("step 4 of 20")
+            expect(picture).to_have_attribute(
+                "src", f"/episode/{told[0]['id']}/picture/0/4", timeout=PATIENCE
+            )
+            expect(value).to_have_text("0.2")
+            line = page.locator(".cursor line")
+            assert float(line.get_attribute("x1").rstrip("%")) == pytest.approx(100 * 4 / 19)
+            box = page.locator(".row .plot").first.bounding_box()
+            page.mouse.click(box["x"] + box["width"], box["y"] + 5)
+            expect(page.locator(".transport output")).to_have_text("step 19 of 20")
+            expect(value).to_have_text("0.95")
+            page.get_by_role("button", name="Play").click()
+            expect(page.locator(".transport output")).to_have_text("step 19 of 20", timeout=PATIENCE)
+            expect(page.get_by_role("button", name="Play")).to_be_visible()
+            assert seen.complaints == []
+
+    def test_rerun_is_shown_within_the_page(self, chromium: Browser, lab: str) -> None:
+        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+        uri = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1").json()["episodes"][0]["id"]
+        with opened(chromium, lab) as (page, seen):
+            page.goto(f"/episode/{uri}")
+            page.get_by_role("link", name="Replay in Rerun").click()
+            viewer = page.frame_locator("iframe")
+            expect(viewer.locator("canvas")).to_be_visible(timeout=PATIENCE)
+            expect(viewer.locator(".coming")).to_have_count(0, timeout=180_000)
+            assert {host.split(":")[0] for host in seen.hosts} == {"127.0.0.1"}
+
+
+class TestTable:
+    def test_choosing_by_keyboard(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, _):
+            page.goto("/episodes?dataset=CartPole-v1&sort=-return")
+            compare = page.get_by_role("button", name="Compare")
+            expect(compare).to_be_disabled()
+            page.get_by_label("Choose episode", exact=False).first.focus()
+            page.keyboard.press("Space")
+            expect(page.locator("[data-count]")).to_have_text("1 chosen")
+            expect(compare).to_be_disabled()
+            page.get_by_label("Choose episode", exact=False).nth(1).focus()
+            page.keyboard.press("Space")
+            expect(compare).to_be_enabled()
+            compare.focus()
+            page.keyboard.press("Enter")
+            expect(page.get_by_role("heading", name="2 episodes compared")).to_be_visible()
+
+    def test_all_of_a_page(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):
+            page.goto("/episodes?dataset=CartPole-v1")
+            page.get_by_label("Choose all of this page").check()
+            expect(page.locator("[data-count]")).to_have_text("12 chosen")
+            expect(page.get_by_role("button", name="Compare")).to_be_disabled()
+            page.get_by_role("button", name="Copy Python", exact=True).click()
+            expect(page.get_by_role("button", name="Copied")).to_be_visible()
+            copied = page.evaluate("navigator.clipboard.readText()")
+            assert copied.startswith("tupli_mcap.open(") and copied.count('", "') == 11
+            expect(page.locator("td.spark path")).to_have_count(12)
+            with page.expect_download() as download:
+                page.get_by_role("button", name="Download", exact=True).click()
+            assert download.value.suggested_filename == "ppo-seed0-12-episodes.mcap"
+
+    def test_skipping_to_the_content(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, _):
+            page.goto("/")
+            page.keyboard.press("Tab")
+            expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
+
+
+class TestUpload:
+    def test_dropped_files(self, chromium: Browser, server: str, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        (tmp_path / "no recording.mcap").write_bytes(b"<script>1</script>")
+        with opened(chromium, server) as (page, seen):
+            sign_in(page)
+            page.get_by_role("link", name="Upload").click()
+            for _ in range(2):
+                page.get_by_label("Drop recordings here", exact=False).set_input_files(
+                    [tmp_path / "ppo0.mcap"]
+                )
+            rows = page.locator(".uploads li")
+            expect(rows.nth(0)).to_contain_text("is here", timeout=PATIENCE)
+            expect(rows.nth(1)).to_contain_text("is here already", timeout=PATIENCE)
+            page.evaluate(
+                """() => {
+                    const data = new DataTransfer();
+                    data.items.add(new File(["<script>1</script>"], "<img src=x>.mcap"));
+                    document.querySelector(".drop").dispatchEvent(new DragEvent("drop", { dataTransfer: data }));
+                }"""
+            )
+            expect(rows.nth(2)).to_contain_text("<img src=x>.mcap")
+            expect(rows.nth(2).locator(".failed")).to_contain_text("expected", timeout=PATIENCE)
+            rows.nth(0).get_by_role("link").click()
+            expect(page.locator(".count")).to_contain_text("2 episodes")
+            assert [told for told in seen.complaints if "status of 400" not in told] == []
