@@ -35,4 +35,5 @@ def layers() -> str:
 
 def _sentence(room: str) -> str:
     text = " ".join((importlib.import_module(room).__doc__ or "").split("\n\n")[0].split())
+    text = text.replace("`", "")
     return text if len(text) <= 92 else text[: text.rfind(" ", 0, 90)] + " …"

@@ -207,7 +207,9 @@ def _version() -> None:
 
 def _help(
     context: typer.Context,
-    command: Annotated[str | None, typer.Argument(metavar="[COMMAND]", help="What to explain.")] = None,
+    command: Annotated[
+        str | None, typer.Argument(metavar="[COMMAND]", help="The command to explain.")
+    ] = None,
 ) -> None:
     """Explain a command, or list them all."""
     root = context.find_root()

@@ -54,18 +54,20 @@ def doctor(
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="ID.NAME=N", help="Another threshold; --list --json names them."),
+        typer.Option("--set", metavar="ID.NAME=N", help="Change a threshold; --list --json names them."),
     ] = None,
     list_checks: Annotated[bool, typer.Option("--list", help="List the checks instead.")] = False,
     as_json: Json = False,
 ) -> None:
     """Look at recorded data before training on it.
 
-    Finds NaN and infinities, values outside their space, dimensions that never change, actions that never occur,
-    missing terminals, episodes of one step, wrong resets, duplicates, frozen cameras, reward outliers, clock jumps.
+    Finds NaN and infinities, values outside their space, dimensions that never change,
+    actions that never occur, missing terminals, episodes of one step, wrong resets,
+    duplicates, frozen cameras, reward outliers, clock jumps.
 
-    An error is wrong data, a warning is probably wrong, info is worth knowing. Exit code 1 if there is an
-    error (see --fail-on) or a file that cannot be read; the others are examined all the same.
+    An error is wrong data, a warning is probably wrong, an info is worth knowing. The command
+    exits with 1 if there is an error (see --fail-on), or a file that cannot be read; the
+    other files are examined all the same.
     """
     from tupli_mcap.dataset.which import chosen_from
     from tupli_mcap.doctor import Severity, examine

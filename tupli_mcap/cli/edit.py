@@ -41,7 +41,7 @@ _SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
 
 def merge(
     files: Annotated[
-        list[Path], typer.Argument(metavar="FILE", help="Recordings of the same spaces.", parser=local_path)
+        list[Path], typer.Argument(metavar="FILE", help="Recordings with the same spaces.", parser=local_path)
     ],
     output: _Output,
     force: _Force = False,
@@ -50,9 +50,10 @@ def merge(
 ) -> None:
     """Write the episodes of several recordings into one.
 
-    They keep their times, and are numbered anew. Recordings that were made at the same time, or of different numbers of
-    sub-environments, become sub-environments of one; the run of each episode says where it comes from. The new
-    recording has ids of its own, the environment of the first one, and no signature.
+    They keep their times, and get new numbers. Recordings that were made at the same time, or
+    that have different numbers of sub-environments, become sub-environments of one; the run
+    of each episode says where it comes from. The new recording has ids of its own, the
+    environment of the first one, and no signature.
     """
     from tupli_mcap.recording import merge_recordings
 
@@ -66,7 +67,10 @@ def merge(
 def split(
     file: File,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="The first one; FILE_0001.mcap, … follow.")
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The first new recording; FILE_0001.mcap, … follow."
+        ),
     ],
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes in each file.")] = None,
     max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes of each file, roughly.")] = None,
@@ -92,19 +96,19 @@ def split(
 
 def tag(
     files: Annotated[
-        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, and what to say.")
+        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, then what to note.")
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Take back what was said last.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last note.")] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Say more about episodes, such as success=true.
+    """Note something about episodes, such as success=true.
 
-    --episodes or --filter says which; --episodes all means all. Values count more than the metadata that were
-    recorded, in filters and tables too. They are JSON where they look like it, else texts; KEY= takes a key away. The
-    end of a file is written anew, its steps are not touched; who said it and when is kept. A signature is left out.
+    A note counts more than the metadata that were recorded, in filters and tables too. Values
+    are JSON if they look like it, else texts; KEY= removes a key. The file keeps who noted it
+    and when. Its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.jsonvalue import dumps_any
@@ -149,20 +153,22 @@ def edit(
     name: Annotated[str | None, typer.Option(help="Of the run.")] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Of the run's metadata; KEY= removes it."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; KEY= removes it."),
     ] = None,
     tags: Annotated[
-        list[str] | None, typer.Option("--tag", help="Of the run, in place of those it has.")
+        list[str] | None,
+        typer.Option("--tag", help="The run's tags, in place of those it has; may be repeated."),
     ] = None,
-    run_split: Annotated[str | None, typer.Option("--split", help="train, eval, …")] = None,
+    run_split: Annotated[
+        str | None, typer.Option("--split", help="What the run is for: train, eval, …")
+    ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit.")] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Change what recordings say of their runs.
+    """Change what recordings say about their runs.
 
-    A recording keeps its identity; the end of the file is written anew, its steps are not touched. A signature is
-    left out.
+    A recording keeps its identity, and its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.recording import edit_run, undo_edit
 
@@ -190,16 +196,17 @@ def edit(
 def filter_(
     file: File,
     filter_text: Annotated[
-        str, typer.Argument(metavar="FILTER", help="Such as 'return > 100 and metadata.success'.")
+        str,
+        typer.Argument(metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."),
     ],
     output: _Output,
     force: _Force = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write the episodes that a filter is true of into a file.
+    """Write the episodes that match a filter into a file.
 
-    They keep their ids. A signature is left out.
+    They keep their ids. A signature is dropped.
     """
     from tupli_mcap.dataset import filter_recording
 
@@ -213,7 +220,7 @@ def filter_(
 def trim(
     file: File,
     steps: Annotated[
-        str, typer.Option("--steps", metavar="10:-5", help="The steps that stay: first, and where to stop.")
+        str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a slice of Python.")
     ],
     output: _Output,
     episodes: Episodes = None,
@@ -222,11 +229,12 @@ def trim(
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write a recording with fewer steps at the ends of episodes.
+    """Cut steps off the ends of episodes, into a new recording.
 
-    10:-5 leaves out the first ten steps and the last five, :200 all from step 200 on. Episodes that are not chosen stay
-    whole. One that loses its end ends as interrupted, with the state that followed as its final one; one that loses
-    its beginning has no seed. The new recording has an id of its own, and no signature.
+    10:-5 leaves out the first ten steps and the last five, :200 all from step 200 on.
+    Episodes that are not chosen stay whole. An episode that loses its end ends as
+    interrupted, and the state that followed becomes its final state. One that loses its
+    beginning has no seed. The new recording has an id of its own, and no signature.
     """
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.recording import Recording, trim_recording
@@ -262,16 +270,17 @@ def recover(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
     in_place: Annotated[
-        bool, typer.Option("--in-place", help="Finish the file itself; only where nothing is lost.")
+        bool, typer.Option("--in-place", help="Finish the file itself, if nothing is lost.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Save everything good in a damaged recording into a new one.
+    """Save what is good in a damaged recording into a new one.
 
-    One that its writer did not finish is damaged, too. The file itself is only read, but with --in-place, which
-    finishes it as appending to it would. What was lost is said by episode and step; an episode that lost steps in the
-    middle becomes several. Exit code 1 only if nothing could be saved, or no step of a recording that had some.
+    A recording that its writer did not finish counts as damaged, too. The file itself is only
+    read; with --in-place, it is finished as appending to it would. The command says by
+    episode and step what was lost. An episode that lost steps in the middle becomes several.
+    It exits with 1 only if nothing could be saved, or no step of a recording that had some.
     """
     from tupli_mcap.recording import finish_recording, recover_recording
 

@@ -115,10 +115,11 @@ def info(
 ) -> None:
     """Show what is in a recording, or in all of a directory.
 
-    Spaces, benchmark, statistics, returns and lengths of episodes, how rewards, actions and states are
-    distributed, channels and attachments. Of long recordings, only some steps are read; of URLs, none.
-    Of a directory: its runs, environments and episodes, and the keys of their metadata.
-    --episodes and --filter say of which episodes; channels, attachments and size are those of the whole file.
+    Of a recording: its run, spaces, benchmark, returns and lengths of episodes, distributions
+    of rewards, actions and states, channels and attachments. Of a long recording, only some
+    of the steps are read; of a URL, none. Of a directory: its runs, environments, episodes
+    and metadata keys. --episodes and --filter choose episodes; channels, attachments and size
+    are always those of the whole file.
     """
     import numpy as np
 

@@ -108,10 +108,11 @@ def ls(
 ) -> None:
     """List recordings in files and directories: their runs.
 
-    Columns are recording, run, environment, episodes, steps, return, success, started, size, state.
-    RETURN is the mean over episodes. STATE is complete; recording, while a writer is at work; recovered: its writer
-    was killed or failed, and all steps that were finished are there; or incomplete: its journal is missing, too.
-    Deleted episodes of a storage are not counted; with --filter, only episodes that it is true of are.
+    Columns are recording, run, environment, episodes, steps, return, success, started, size,
+    state. RETURN is the mean over episodes. STATE is `complete`, `recording` while somebody
+    writes it, or `recovered` if its writer was killed or failed; then all finished steps are
+    there, if its journal is. Deleted episodes are not counted. With --filter, only the
+    episodes that match are counted.
     """
     from tupli_mcap.storage.listing import list_recordings
 
@@ -220,9 +221,10 @@ def episodes(
 ) -> None:
     """List episodes of recordings, directories and storages.
 
-    Filters compare keys of episodes (steps, return, end, seed, env, ended, metadata.<name>, run.<name>, ...) with
-    = != > >= < <= in, and join with and, or, not. Times are "2026-11-23", "2026-11-23 03:31:07", "yesterday",
-    "last tuesday", "7d ago", ...: a text means all of the time that it names. --sort and --columns take the same keys.
+    A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
+    run.<name>, ...) with = != > >= < <= in, and joins comparisons with and, or, not. Times
+    are texts: "2026-11-23", "2026-11-23 03:31:07", "yesterday", "last tuesday", "7d ago";
+    each means the whole time that it names. --sort and --columns take the same keys.
     """
     from tupli_mcap import open as open_dataset
 

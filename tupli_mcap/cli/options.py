@@ -49,12 +49,14 @@ Sort = Annotated[
 ]
 ColumnNames = Annotated[
     str | None,
-    typer.Option("--columns", metavar="A,B,…", help="Which columns, such as steps,return."),
+    typer.Option("--columns", metavar="A,B,…", help="The columns, such as steps,return."),
 ]
-Limit = Annotated[int | None, typer.Option(min=0, help="Print at most so many.")]
+Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many.")]
 FilterText = Annotated[
     str | None,
-    typer.Option("--filter", metavar="FILTER", help="Such as 'return > 100 and metadata.success'."),
+    typer.Option(
+        "--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."
+    ),
 ]
 StoragePath = Annotated[
     Path,

@@ -66,61 +66,67 @@ def _check_policy(value: str | None) -> str | None:
     return value
 
 
-_EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="As gymnasium.make takes it.")]
+_EnvId = Annotated[
+    str, typer.Argument(metavar="ENV_ID", help="What gymnasium.make takes, such as CartPole-v1.")
+]
 _Output = Annotated[
     str,
     typer.Option(
-        "--output", "-o", metavar="FILE|DIR/", help="The recording (.mcap), or where a new one is made."
+        "--output", "-o", metavar="FILE|DIR/", help="The recording (.mcap), or a directory for a new one."
     ),
 ]
-_Steps = Annotated[int, typer.Option(min=1, help="Steps to record, in total.")]
-_Seed = Annotated[int | None, typer.Option(min=0, help="Of the first reset and of random actions.")]
-_NumEnvs = Annotated[int, typer.Option(min=1, help="Sub-environments side by side.")]
+_Steps = Annotated[int, typer.Option(min=1, help="How many steps to record, in total.")]
+_Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the first reset and of random actions.")]
+_NumEnvs = Annotated[int, typer.Option(min=1, help="How many sub-environments to step side by side.")]
 _Policy = Annotated[
     str | None,
     typer.Option(
         metavar="MODULE:FUNCTION",
         callback=_check_policy,
-        help="Called with an observation, returns an action; random without it.",
+        help="A function from an observation to an action; without it, actions are random.",
     ),
 ]
 _ModeOption = Annotated[
     _Mode,
     typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
 ]
-_CompressionOption = Annotated[_Compression, typer.Option(help="Of the chunks.")]
+_CompressionOption = Annotated[_Compression, typer.Option(help="How chunks are compressed.")]
 _RecordInfo = Annotated[bool, typer.Option("--record-info", help="Record the infos of steps too.")]
 _DurabilityOption = Annotated[
-    _Durability, typer.Option(help="What a power loss leaves: step and chunk wait for the disk.")
+    _Durability, typer.Option(help="What survives a power loss: step and chunk wait for the disk.")
 ]
 _Live = Annotated[
     str | None,
-    typer.Option(metavar="VIEWER", help="Show it meanwhile: rerun, foxglove, or the URL of a viewer."),
+    typer.Option(
+        metavar="VIEWER", help="Show the rollout while it is recorded: rerun, foxglove, or a viewer's URL."
+    ),
 ]
 _Frames = Annotated[
     bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
 ]
-_Every = Annotated[int, typer.Option(min=1, help="With --frames: of every so many steps.")]
-_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What the file carries of the environment.")]
+_Every = Annotated[int, typer.Option(min=1, help="With --frames: only every n-th step.")]
+_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What to store of the environment.")]
 _MaxBytes = Annotated[
-    int | None, typer.Option(min=1, help="Go on in FILE_0001.mcap, … once so much is in a file.")
+    int | None, typer.Option(min=1, help="Continue in FILE_0001.mcap, … when a file has this many bytes.")
 ]
 _MaxSeconds = Annotated[
     float | None,
-    typer.Option(min=0.001, help="The same after so many seconds; a running episode stays whole."),
+    typer.Option(
+        min=0.001, help="Continue in a new file after this many seconds. An episode stays in one file."
+    ),
 ]
 
-_Name = Annotated[str | None, typer.Option(metavar="NAME", help="What the run is called.")]
+_Name = Annotated[str | None, typer.Option(metavar="NAME", help="The name of the run.")]
 _Set = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; may be repeated.")
 ]
 _Tag = Annotated[
-    list[str] | None, typer.Option("--tag", metavar="WORD", help="For the run; may be repeated.")
+    list[str] | None, typer.Option("--tag", metavar="WORD", help="A tag of the run; may be repeated.")
 ]
-_Split = Annotated[str, typer.Option("--split", metavar="WORD", help="train, eval, …")]
+_Split = Annotated[str, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")]
 _CaptureOption = Annotated[
     _Capture,
-    typer.Option("--capture", help="What the file says of this process: command, commit, host, versions."),
+    typer.Option("--capture", help="What to store about this process: command, commit, host, versions."),
 ]
 
 
@@ -150,9 +156,9 @@ def record(
 ) -> None:
     """Record rollouts of an environment.
 
-    Modules (of a policy, or an ENV_ID such as my_envs:Maze-v0) are looked for in the current directory too,
-    after the installed ones.
-    Ctrl-C ends the recording early; what was recorded stays, and how much that is is said.
+    A policy, or an ENV_ID such as my_envs:Maze-v0, may be in a module of the current
+    directory. Ctrl-C ends the recording early: what was recorded stays, and the command says
+    how much that is.
     """
     if every > 1 and not frames:
         raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")

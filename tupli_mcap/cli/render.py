@@ -45,9 +45,11 @@ _Source = Annotated[
     ),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
-_Every = Annotated[int, typer.Option(min=1, help="A frame of every so many steps, and the last.")]
-_Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Of the frames (pixels).")]
-_FrameFormat = Annotated[_Format, typer.Option("--format", help="Of the frames in a .mcap: png is exact.")]
+_Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]
+_Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Width of the frames, in pixels.")]
+_FrameFormat = Annotated[
+    _Format, typer.Option("--format", help="Format of the frames in a .mcap; png is exact.")
+]
 _Trust = Annotated[
     bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
 ]
@@ -64,23 +66,26 @@ def render(
     frame_format: _FrameFormat = _Format.png,
     trust: _Trust = False,
     rerun: Annotated[
-        bool, typer.Option("--rerun", help="Take the episodes again, also where pictures were recorded.")
+        bool, typer.Option("--rerun", help="Take the episodes again, even if pictures were recorded.")
     ] = False,
     force: _Force = False,
     as_json: Json = False,
 ) -> None:
     """Make a film of episodes, or pictures of those without.
 
-    An MP4 or GIF shows the pictures that were recorded: frames, or an image of the states. Nothing is executed.
+    An MP4 or a GIF shows the pictures that were recorded: frames, or an image of the states.
+    Nothing is executed.
 
-    Where there are none, with --rerun, and for a .mcap, the environment is rebuilt, takes the episodes again, and
-    every step is compared with the recording, bit for bit. The frames go into a copy of the recording (as
-    /camera/render), into an MP4, or into a GIF.
+    If there are none, with --rerun, and for an .mcap, the environment is rebuilt and takes
+    the episodes again. Every step is compared with the recording, bit for bit. The frames go
+    into a copy of the recording (as /camera/render), into an MP4, or into a GIF.
 
-    Of a storage, best and worst are those of all its recordings; other choices have to be of one recording.
+    In a storage, best and worst are looked for in all recordings; other episodes have to be
+    in one recording.
 
-    Where the replay differs from the recording, rendering ends: the frames before that are written, the
-    difference is named, and the exit code is 1. So is it for an episode that cannot be replayed.
+    Where the environment behaves differently, rendering ends: the frames before that are
+    written, the command names the difference, and exits with 1. It also exits with 1 if an
+    episode cannot be taken again.
     """
     from tupli_mcap.replay import film, has_pictures, render
 
@@ -198,26 +203,27 @@ def plot(
             "--episodes",
             "--episode",
             metavar="N|best|worst|...",
-            help="Whose steps to show: a number, best, worst, first, last.",
+            help="The episode whose steps are shown: a number, best, worst, first, last.",
         ),
     ] = "best",
     x: Annotated[
         _X | None,
         typer.Option(
-            "--x", help="What returns are drawn over; by default episodes of one recording, steps of several."
+            "--x", help="The horizontal axis; by default episodes of one recording, or steps of several."
         ),
     ] = None,
     filter_text: FilterText = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the output if it is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
     as_json: Json = False,
 ) -> None:
     """Draw a report of recordings as a picture or a page.
 
-    Returns, lengths, success, numbers of infos and metadata, states, actions, rewards, and one episode step by step.
-    Several recordings are compared; runs whose names or settings differ by their seeds only are one: their mean, with
-    its 95% interval (percentile bootstrap) as far as all of them go, and a thin line for each.
-    The extension of the output says what it is; an .html needs no network. Needs the extra plot (matplotlib).
-    Nothing in a file is executed.
+    It shows returns, lengths, success, numbers of infos and metadata, states, actions,
+    rewards, and one episode step by step. Several recordings are compared. Runs whose names
+    or settings differ by their seeds only are drawn as one: their mean with its 95% interval
+    (percentile bootstrap) as far as all of them go, and a thin line for each. The output's
+    extension says what it is; an .html needs no network. Nothing in a file is executed. Needs
+    the extra `plot` (matplotlib).
     """
     from tupli_mcap.plots import check_goal, report
 

@@ -19,13 +19,13 @@ _Sources = Annotated[
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Split = Annotated[
     bool,
-    typer.Option("--split/--joined", help="Each episode as a recording of its own, or all on one timeline."),
+    typer.Option("--split/--joined", help="Each episode on its own, or all on one timeline."),
 ]
 _Save = Annotated[
     Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead.")
 ]
 _Web = Annotated[
-    bool, typer.Option("--web", help="Serve a viewer for the browser, on 127.0.0.1, until Ctrl-C.")
+    bool, typer.Option("--web", help="Serve a viewer for the browser on 127.0.0.1, until Ctrl-C.")
 ]
 _Connect = Annotated[
     str | None,
@@ -37,7 +37,7 @@ _Force = Annotated[bool, typer.Option("--force", help="Replace the file if it ex
 _Layout = Annotated[
     Path | None,
     typer.Option(
-        "--layout", metavar="FILE.json", help="Write a layout for Foxglove, which plots the recording."
+        "--layout", metavar="FILE.json", help="Write a layout with which Foxglove plots the recording."
     ),
 ]
 
@@ -56,9 +56,10 @@ def replay(
 ) -> None:
     """Look at recordings in the Rerun viewer.
 
-    States, actions, rewards, infos and images over time; of more than ten episodes the last, the best and the worst,
-    with the returns of all above them (--episodes all shows the others). Needs the extra `rerun`.
-    Timelines: step, episode_time (where the recording knows how long a step takes), and wall clock.
+    It shows states, actions, rewards, infos and images over time. Of more than ten episodes,
+    it shows the last, the best and the worst below the returns of all; --episodes all shows
+    every one. Timelines are the step, the episode's time (if the recording knows how long a
+    step takes), and the wall clock. Needs the extra `rerun`.
     """
     goals = sum([web, save is not None, connect is not None])
     if layout is not None:

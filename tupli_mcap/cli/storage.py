@@ -130,7 +130,7 @@ def list_episodes(
 _Paths = Annotated[
     list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
 ]
-_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say how many there are.")]
+_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only count them.")]
 
 
 def delete(
@@ -138,15 +138,16 @@ def delete(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Remove a recording of which nothing is left.")
+        bool, typer.Option("--force", help="Remove a recording that has no episode left.")
     ] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Delete episodes, so that restore brings them back.
+    """Delete episodes; restore brings them back.
 
-    compact frees their space. A note beside the recording (FILE.json) says that they are gone; the recording itself
-    is not touched. Who copies the recording alone copies them too, unless it was compacted.
+    A note beside the recording (FILE.json) says that they are deleted; the recording itself
+    is not touched. compact frees their space. Before that, whoever copies the recording alone
+    copies the deleted episodes too.
     """
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
@@ -185,7 +186,7 @@ def restore(
 ) -> None:
     """Bring deleted episodes back, by default all.
 
-    Those that compact has freed the space of are gone.
+    Those whose space compact has freed are gone.
     """
     from tupli_mcap.dataset.which import bounds_of
     from tupli_mcap.recording.recover.prefix import metadata_at
@@ -251,7 +252,9 @@ def compact(
 
 
 def rename(
-    benchmark: Annotated[str, typer.Argument(metavar="BENCHMARK_ID", help="4 digits may do.")],
+    benchmark: Annotated[
+        str, typer.Argument(metavar="BENCHMARK_ID", help="The benchmark's id; its first 4 digits are enough.")
+    ],
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="The new name.")] = None,
     description: Annotated[str | None, typer.Option(help="The new description.")] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last change.")] = False,
@@ -261,7 +264,8 @@ def rename(
 ) -> None:
     """Give a benchmark another name or description.
 
-    It keeps its id and its episodes; lists, filters and bundles show the new name. A run has its name changed by edit.
+    It keeps its id and its episodes; lists, filters and bundles show the new name. The name
+    of a run is changed by edit.
     """
     if Path(benchmark).is_file():
         raise typer.BadParameter(

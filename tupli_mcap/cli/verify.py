@@ -34,11 +34,13 @@ def verify(
     ],
     replay: Annotated[
         bool,
-        typer.Option("--rerun", "--replay", help="Also take the episodes again and compare, bit for bit."),
+        typer.Option(
+            "--rerun", "--replay", help="Also take the episodes again, and compare them bit for bit."
+        ),
     ] = False,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="With --rerun: run the code that the files carry, with all options."),
+        typer.Option("--trust", help="With --rerun: run code from the files, with all reset options."),
     ] = False,
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -46,13 +48,15 @@ def verify(
 ) -> None:
     """Check files for damage.
 
-    Structure, CRCs, indexes, layouts, alignment and digests are checked. Every episode has to start, go on and
-    end, without a gap or a step twice. Of a storage, artifacts, benchmarks and the catalog are checked too.
-    Nothing is executed, nothing is written. Exit code 1 if something is damaged.
+    Checks structure, CRCs, indexes, layouts, alignment and digests: every episode has to
+    start, go on and end, without a gap or a repeated step. In a storage, artifacts,
+    benchmarks and the catalog are checked too. Nothing is executed, nothing is written. The
+    command exits with 1 if something is damaged.
 
-    --rerun rebuilds the environment of each recording, takes every episode again with its seed, options and
-    actions, and says where something differs. Exit code 1 if something does, or nothing could be checked.
-    --episodes and --filter choose those that are taken again; what they depend on is, too.
+    --rerun rebuilds the environment of each recording, takes every episode again with its
+    seed, options and actions, and says where something differs. It exits with 1 if something
+    does, or if nothing could be checked. --episodes and --filter choose the episodes; those
+    that they depend on are taken again too.
     """
     replays = _Replays(trust, episodes, filter_of(filter_text)) if replay else None
     if replays is None and (trust or episodes is not None or filter_text is not None):

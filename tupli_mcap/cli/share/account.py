@@ -76,13 +76,14 @@ def signup(username: Username, url: Url = None, as_json: Json = False) -> None:
 
 
 def password(
-    username: Annotated[str | None, typer.Argument(metavar="[USER]", help="You, by default.")] = None,
+    username: Annotated[str | None, typer.Argument(metavar="[USER]", help="By default, you.")] = None,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
     """Change a password, and end all sign-ins.
 
-    Passwords are asked for, or are in TUPLI_MCAP_PASSWORD (the old one) and TUPLI_MCAP_NEW_PASSWORD.
+    Passwords are asked for, or taken from TUPLI_MCAP_PASSWORD (the old one) and
+    TUPLI_MCAP_NEW_PASSWORD.
     """
     from tupli_mcap.storage import TupliAPIClient
 

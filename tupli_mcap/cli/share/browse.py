@@ -17,7 +17,7 @@ def browse(
     path: Annotated[
         Path, typer.Argument(metavar="[PATH]", help="A directory, a storage, or a recording.")
     ] = Path(),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="By default, one that is free.")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="By default, a free one.")] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only print the address.")] = False,
 ) -> None:
     """Look through recordings in a browser.

@@ -32,7 +32,11 @@ Source = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path
 
 def bundle(
     source: Annotated[
-        str, typer.Argument(metavar="BENCHMARK_ID|FILE", help="A benchmark (4 digits may do) or a recording.")
+        str,
+        typer.Argument(
+            metavar="BENCHMARK_ID|FILE",
+            help="A benchmark's id (its first 4 digits are enough), or a recording.",
+        ),
     ],
     output: Output,
     storage_path: StoragePath = DEFAULT_STORAGE,
@@ -48,14 +52,14 @@ def bundle(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a benchmark with all it needs to a file.
+    """Write a benchmark with everything it needs to a file.
 
-    The file carries the benchmark, its artifacts and its episodes: nothing else is needed to use it.
-    A benchmark id takes all its episodes (or those of the filter) from the storage. FILE takes the
-    episodes of that recording, and what it lacks from the storage.
+    The file carries the benchmark, its artifacts and its episodes: nothing else is needed to
+    use it. A benchmark's id takes all its episodes (or those of the filter) from the storage.
+    FILE takes the episodes of that recording, and what it lacks from the storage.
 
-    --sign takes a key that `ssh-keygen -t ed25519` makes; its passphrase is asked for, or is in
-    TUPLI_MCAP_KEY_PASSPHRASE.
+    --sign takes a key that `ssh-keygen -t ed25519` makes. Its passphrase is asked for, or
+    taken from TUPLI_MCAP_KEY_PASSPHRASE.
     """
     key = None if sign is None else _signing_key(sign)
     if is_url(source) or source.endswith(".mcap") or Path(source).is_file():
@@ -117,8 +121,9 @@ def import_(
 ) -> None:
     """Take a bundle into a storage.
 
-    The storage is made if it is missing. Importing a file again changes nothing. Nothing in the file is
-    executed. Where a key that you trust has signed it, its environment may be rebuilt afterwards.
+    A missing storage is made. Importing a file again changes nothing. Nothing in the file is
+    executed. If a key that you trust has signed it, its environment may be rebuilt
+    afterwards.
     """
     from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key

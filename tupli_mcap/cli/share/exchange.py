@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["publish", "pull", "push", "unpublish"]
 
-Benchmark = Annotated[str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark (4 digits may do).")]
+Benchmark = Annotated[
+    str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark's id; its first 4 digits are enough.")
+]
 Group = Annotated[str, typer.Option(metavar="GROUP", help="Who sees it: 'global' is everybody.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
@@ -43,9 +45,9 @@ def push(
 ) -> None:
     """Send a storage or a recording to a server.
 
-    All benchmarks of a storage are sent, with their artifacts and episodes.
-    What the server has already is not sent again. Nobody else sees it before it is published.
-    Without DIR or FILE, what was recorded to the server and waits here is sent.
+    All benchmarks of a storage are sent, with their artifacts and episodes. What the server
+    has already is not sent again. Nobody else sees it until you publish it. Without DIR or
+    FILE, recordings to the server that wait here are sent.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
     from tupli_mcap.storage.exchange import copy_episodes, push_recording
@@ -107,14 +109,18 @@ def pull(
         str | None,
         typer.Argument(
             metavar="[BENCHMARK_ID|EPISODE_ID]",
-            help="A benchmark with its episodes (4 digits may do), or one episode.",
+            help="A benchmark with its episodes (the first 4 digits of its id are enough), or one episode.",
             readable=False,
         ),
     ] = None,
     storage_path: Annotated[
         Path,
         typer.Option(
-            "--storage", envvar="TUPLI_MCAP_STORAGE", help="Where to.", parser=local_path, readable=False
+            "--storage",
+            envvar="TUPLI_MCAP_STORAGE",
+            help="The storage's directory.",
+            parser=local_path,
+            readable=False,
         ),
     ] = DEFAULT_STORAGE,
     filter_text: FilterText = None,
@@ -124,9 +130,10 @@ def pull(
 ) -> None:
     """Fetch benchmarks and episodes from a server.
 
-    Of a benchmark, all of its episodes, or those of the filter; with a filter alone, those of all
-    benchmarks. Their environments are as untrusted as a file from a stranger, unless a key that you trust
-    has signed them. Fetched again, only what is new comes.
+    A benchmark comes with all its episodes, or with those of the filter; a filter alone
+    fetches the episodes of all benchmarks that match. Environments are as untrusted as a file
+    from a stranger, unless a key that you trust has signed them. Fetching again brings only
+    what is new.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
     from tupli_mcap.storage.exchange import copy_episodes

@@ -24,7 +24,7 @@ __all__ = [
 
 Group = Annotated[str, typer.Argument(metavar="GROUP")]
 Users = Annotated[list[str], typer.Argument(metavar="USER")]
-Description = Annotated[str | None, typer.Option(help="What it is for.")]
+Description = Annotated[str | None, typer.Option(help="Its description.")]
 
 
 def list_users(url: Url = None, as_json: Json = False) -> None:
@@ -111,7 +111,7 @@ def add_group_members(
     users: Users,
     roles: Annotated[
         list[str] | None,
-        typer.Option("--role", metavar="ROLE", help="What they may do, member by default. Repeatable."),
+        typer.Option("--role", metavar="ROLE", help="Their role, member by default; may be repeated."),
     ] = None,
     url: Url = None,
     as_json: Json = False,
@@ -150,7 +150,7 @@ def list_roles(url: Url = None, as_json: Json = False) -> None:
 
 def create_role(
     role: Annotated[str, typer.Argument(metavar="ROLE")],
-    rights: Annotated[list[str], typer.Argument(metavar="RIGHT", help="Such as episode_read.")],
+    rights: Annotated[list[str], typer.Argument(metavar="RIGHT", help="A right, such as episode_read.")],
     description: Description = None,
     url: Url = None,
     as_json: Json = False,
@@ -200,10 +200,10 @@ def list_tokens(url: Url = None, as_json: Json = False) -> None:
 
 
 def create_token(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="What it is called.")],
-    write: Annotated[bool, typer.Option("--write", help="It may write, too; else it may read.")] = False,
-    days: Annotated[int, typer.Option(min=1, max=3650, help="For how long it is valid.")] = 90,
-    forever: Annotated[bool, typer.Option("--forever", help="It is valid until it is deleted.")] = False,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Its name.")],
+    write: Annotated[bool, typer.Option("--write", help="Let it write too, not only read.")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")] = 90,
+    forever: Annotated[bool, typer.Option("--forever", help="Keep it valid until it is deleted.")] = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
@@ -222,7 +222,7 @@ def create_token(
 
 
 def delete_token(
-    token: Annotated[str, typer.Argument(metavar="ID", help="As list-tokens shows it.")],
+    token: Annotated[str, typer.Argument(metavar="ID", help="The token's id, as list-tokens shows it.")],
     url: Url = None,
     as_json: Json = False,
 ) -> None:

@@ -15,18 +15,21 @@ __all__ = ["serve"]
 
 def serve(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Where the server keeps everything.")],
-    host: Annotated[str, typer.Option(help="The address to listen at; 0.0.0.0 is every one.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="The address to listen at; 0.0.0.0 is all of them.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
-    open_signup: Annotated[bool, typer.Option("--open-signup", help="Let everybody make a user.")] = False,
+    open_signup: Annotated[bool, typer.Option("--open-signup", help="Let everybody sign up.")] = False,
     guests: Annotated[
-        bool, typer.Option("--guests", help="Show what is published in 'global' without a sign-in.")
+        bool,
+        typer.Option("--guests", help="Show what is published in 'global' to everybody, without a sign-in."),
     ] = False,
     database: Annotated[
         str,
         typer.Option(
             envvar="TUPLI_MCAP_DATABASE",
             metavar="URL",
-            help="Such as postgresql+psycopg://…; SQLite in DIR by default.",
+            help="A database's URL, such as postgresql+psycopg://…; by default SQLite in DIR.",
         ),
     ] = "",
     blobs: Annotated[

@@ -25,23 +25,24 @@ def trust(
     file: Annotated[
         Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Only show what the file says of it.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Only show what the file says about it.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
     key: Annotated[
         str | None,
         typer.Option("--key", metavar="KEY", help="Trust what this public key signs (a .pub file)."),
     ] = None,
-    name: Annotated[str | None, typer.Option("--name", help="What to call the key.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="A name for the key.")] = None,
     listed: Annotated[bool, typer.Option("--list", help="Only list what is trusted.")] = False,
     as_json: Json = False,
 ) -> None:
     """Let the environment in a file be rebuilt.
 
-    Rebuilding it may run code that came with the file, as this user, on this machine. --show tells what the
-    file says of that code, and runs nothing: of a pickle, the names that it imports. They prove nothing.
-    Options of resets that may name files or code are trusted with it. Reading the episodes of a file needs
-    no trust. Only this user's processes trust it from then on; one changed byte of the environment ends
-    that. --key trusts every environment that somebody signs, see bundle --sign.
+    Rebuilding it may run code that came with the file, as this user, on this machine. --show
+    tells what the file says about that code, and runs nothing: of a pickle, the names that it
+    imports, which prove nothing. Options of resets that may name files or code are trusted
+    with it. Reading the episodes of a file needs no trust. Only this user's processes trust
+    it from then on; one changed byte of the environment ends that. --key trusts every
+    environment that somebody signs, see bundle --sign.
     """
     from tupli_mcap.recording.sign.carried_code import carried_code, set_trust
 
@@ -78,7 +79,9 @@ def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
 def untrust(
     what: Annotated[
         str | None,
-        typer.Argument(metavar="[FILE|DIGEST]", help="A recording, or a digest (8 digits may do)."),
+        typer.Argument(
+            metavar="[FILE|DIGEST]", help="A recording, or a digest; its first 8 digits are enough."
+        ),
     ] = None,
     key: Annotated[
         str | None, typer.Option("--key", metavar="KEY", help="A key: its name, fingerprint or .pub file.")
@@ -87,8 +90,8 @@ def untrust(
 ) -> None:
     """Trust an environment or a key no longer.
 
-    FILE takes the environment in a recording, DIGEST one that `trust --list` shows. Without a key, all that
-    only it has signed is not trusted either.
+    FILE is a recording with the environment, DIGEST one that `trust --list` shows. Without a
+    key, everything that only this key has signed is not trusted either.
     """
     from tupli_mcap import trust
     from tupli_mcap.recording.sign.carried_code import untrust
