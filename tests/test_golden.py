@@ -27,7 +27,9 @@ from tupli_mcap.mcap.container import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording, finish_recording
 from tupli_mcap.recording.check.verify import verify_recording
+from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
+from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -198,6 +200,27 @@ def test_rewriting_one_keeps_everything(name: str, tmp_path: Path) -> None:
     with Recording(tmp_path / "new.mcap") as rewritten:
         assert_same(list(as_read(rewritten)), expected(name))
         assert (rewritten.uuid, rewritten.complete) == (uuid, True)
+
+
+@pytest.mark.parametrize("without", [("states", "infos"), ("actions", "frames"), ("states", "actions")])
+@pytest.mark.parametrize("name", NAMES)
+def test_fields_can_be_left_out(name: str, without: tuple[str, str], tmp_path: Path) -> None:
+    with Recording(finished(name, tmp_path)) as recording:
+        whole = list(as_read(recording))
+        opened = contextlib.nullcontext([Excerpt(recording, recording.index)])
+        (tmp_path / "few.mcap").write_bytes(b"".join(stream_excerpts(opened, without)))
+        cameras = recording.cameras
+    assert verify_recording(tmp_path / "few.mcap").problems == []
+    with Recording(tmp_path / "few.mcap") as few:
+        assert few.cameras == (() if "frames" in without else cameras)
+        for episode in whole:
+            nothing = [{}] * len(episode["rewards"])
+            episode |= {field: nothing for field in ("states", "actions") if field in without}
+            if "states" in without and episode["final_state"] is not None:
+                episode["final_state"] = {}
+            if "infos" in without:
+                episode["infos"] = None
+        assert_same(list(as_read(few)), whole)
 
 
 @pytest.mark.parametrize("name", NAMES)

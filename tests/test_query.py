@@ -16,11 +16,13 @@ import httpx
 import numpy as np
 import pytest
 from gymnasium import spaces
+from test_schemas import validator
 from test_server import Things, Users, things, token_of, users
 
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, TupliDataset, verify_recording, write_recording
 from tupli_mcap.errors import FormatError, NotFoundError
+from tupli_mcap.recording import made_of
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.remote import is_cut_cheaper
@@ -103,6 +105,23 @@ def test_episodes_of_several_recordings_are_merged(users: Users, names: list[str
     refused = asked(users.ann)
     assert (refused.status_code, refused.json()["error"]) == (400, "SpaceError")
     assert names[2] in refused.json()["detail"] and str(tmp_path) not in refused.text
+
+
+def test_fields_that_are_not_asked_for_are_left_out(users: Users, names: list[str], tmp_path: Path) -> None:
+    whole = asked(users.ann, recordings=names[:2])
+    answer = asked(users.ann, recordings=names[:2], fields=["actions", "rewards"])
+    assert len(answer.content) < 0.7 * len(whole.content)
+    with kept(answer, tmp_path / "few.mcap") as few, kept(whole, tmp_path / "whole.mcap") as merged:
+        assert (few.observation_space, few.action_space) == (spaces.Dict({}), merged.action_space)
+        assert np.array_equal(few.read().actions, merged.read().actions)
+        assert [e.metadata for e in few.episodes] == [e.metadata for e in merged.episodes]
+        told = made_of(few)
+        assert told is not None and told["without"] == ["frames", "infos", "states"]
+        validator("made_of.schema.json").validate(told)
+    unlike = asked(users.ann, fields=["actions"])  # their states differ, their actions do not
+    assert kept(unlike, tmp_path / "unlike.mcap").num_steps > 0
+    refused = asked(users.ann, fields=["velocity"])
+    assert refused.status_code == 400 and "expected fields from states" in refused.json()["detail"]
 
 
 def test_benchmarks_and_rights(users: Users, things: Things, names: list[str], tmp_path: Path) -> None:

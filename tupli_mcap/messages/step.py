@@ -84,6 +84,20 @@ class StepLayout:
         self.nest_action = structure(action_space)
         self.nest_reward = structure(reward)
 
+    def without(self, fields: Collection[str]) -> StepLayout:
+        """The same where "states" or "actions", or both, are nothing."""
+        nothing = gym.spaces.Dict({})
+        left_out = [leaf.name for leaf in self.state if "states" in fields]
+        left_out += [leaf.name for leaf in self.action if "actions" in fields]
+        return StepLayout(
+            nothing if "states" in fields else self.observation_space,
+            nothing if "actions" in fields else self.action_space,
+            self.reward_space,
+            {name: dtype for name, dtype in self.dtypes.items() if name not in left_out},
+            {name: found for name, found in self.inner_dtypes.items() if name not in left_out},
+            [] if "states" in fields else self.stacks,
+        )
+
     @property
     def leaves(self) -> list[Leaf]:
         return [*self.state, *self.action, *self.reward]

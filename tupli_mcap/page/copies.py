@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -41,13 +41,15 @@ def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingRes
     return streamed(contextlib.nullcontext(excerpts))
 
 
-def streamed(opening: AbstractContextManager[Sequence[Excerpt]], **headers: str) -> StreamingResponse:
+def streamed(
+    opening: AbstractContextManager[Sequence[Excerpt]], without: Collection[str] = (), **headers: str
+) -> StreamingResponse:
     """An answer that is a recording of these episodes, made while it is sent; see `stream_excerpts`.
 
     Raises:
         SpaceError, RecordingError: they cannot be merged. What goes wrong later ends the connection.
     """
-    pieces = stream_excerpts(opening)
+    pieces = stream_excerpts(opening, without)
     first = next(pieces)
     return _Streamed(_after(first, pieces), media_type=_MEDIA, headers=headers)
 

@@ -14,6 +14,7 @@ from sqlalchemy import Connection, select
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.schema import BaseFilter, FilterIN
 from tupli_mcap.server import episodes
@@ -33,12 +34,23 @@ class EpisodeQuery(BaseModel):
     """Which episodes: those of which all that is given is true.
 
     recordings: names of recordings, as headers of episodes give them. episodes: numbers, where one recording is named.
+    fields: what of the steps: "states", "actions", "infos", "frames"; rewards, flags and times are always there.
     """
 
     filter: BaseFilter | None = None
     benchmark_filter: BaseFilter | None = None
     recordings: list[str] | None = Field(default=None, max_length=10_000)
     episodes: list[int] | None = None
+    fields: list[str] | None = None
+
+    @property
+    def left_out(self) -> list[str]:
+        """The fields that are not asked for. Raises StorageError where there is no such field."""
+        if self.fields is None:
+            return []
+        wanted = field_names(self.fields, error=StorageError)
+        wanted += ["states"] if "next_states" in wanted else []
+        return [field for field in ("states", "actions", "infos", "frames") if field not in wanted]
 
 
 class Selected(NamedTuple):

@@ -14,6 +14,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
@@ -73,6 +74,7 @@ class EpisodeCopier:
         frames: of a camera, in place of the source's.
         values: of steps, in place of the source's.
         trims: of episodes of which some steps stay, by number.
+        layout: of the target, where it is the source's `without` some fields.
     """
 
     def __init__(
@@ -87,7 +89,10 @@ class EpisodeCopier:
         frames: NewFrames | None = None,
         values: NewValues | None = None,
         trims: Mapping[int, Trim] | None = None,
+        layout: StepLayout | None = None,
     ) -> None:
+        self._layout = source.layout if layout is None else layout
+        self._is_whole = layout is None
         self._first_env = first_env
         self._trims = trims or {}
         self._values = values or NewValues({}, {}, {})
@@ -109,6 +114,7 @@ class EpisodeCopier:
         Infos are left to `infos` where the source's sub-environments become others.
         """
         layout = self._source.layout
+        infos = INFO in self._topics and self._to(self._topics[INFO]) in self._target.container.channels
         rows = self._trimmed(rows)
         firsts = np.zeros(len(rows), dtype=np.int64)
         for env, channel in enumerate(self._file.steps):
@@ -119,11 +125,11 @@ class EpisodeCopier:
             spans = _merged([(int(rows["first_row"][i]), int(rows["length"][i])) for i in chosen])
             self._copy(channel, spans, layout.step_message.dtype if layout.constant else None)
             topics = Topics.of_step(self._file.contents.channels[channel].topic)
-            for leaf in layout.images:
+            for leaf in self._layout.images:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
         self._frames(rows)
-        if INFO in self._topics and self._first_env is None:
+        if infos and self._first_env is None:
             self._copy_places(self._topics[INFO], self._infos(rows), numbered=True)
         return self._episodes(rows, firsts)
 
@@ -155,6 +161,7 @@ class EpisodeCopier:
 
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
         moved = self._shift or self._first_env is not None or self._to(channel) != channel
+        moved = moved or (channel in self._file.steps and not self._is_whole)
         if moved or channel in self._values.columns:
             return 0
         return self._target.copy_first(self._file, channel, count, dtype)
@@ -171,7 +178,10 @@ class EpisodeCopier:
             messages = (m for first, count in spans for m in self._step_messages(channel, first, count))
             self._write(channel, messages, numbered=True)
             return
-        self._target.add_rows(self._to(channel), self._rows(channel, spans, dtype))
+        rows = self._rows(channel, spans, dtype)
+        if channel in self._file.steps and not self._is_whole:
+            rows = (_narrowed(part, self._layout.step_message.dtype) for part in rows)
+        self._target.add_rows(self._to(channel), rows)
 
     def _rows(self, channel: int, spans: Iterable[tuple[int, int]], dtype: np.dtype[Any]) -> Iterator[Array]:
         """Rows of constant size, with the new numbers of their episodes."""
@@ -204,13 +214,13 @@ class EpisodeCopier:
                 yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
 
     def _step_messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
-        """Those of a channel of steps that differ in size, with new values."""
-        messages, new = self._messages(channel, first, count), self._values.columns.get(channel)
-        if new is None:
+        """Those of a channel of steps that differ in size, with new values, or without some."""
+        messages, new = self._messages(channel, first, count), self._values.columns.get(channel, {})
+        if not new and self._is_whole:
             yield from messages
             return
-        layout = self._source.layout
-        decoder, encoders = MessageDecoder(layout), leaf_encoders(layout, layout.step_leaves)
+        decoder = MessageDecoder(self._source.layout)
+        encoders = leaf_encoders(self._layout, self._layout.step_leaves)
         for row, (time_ns, body) in enumerate(messages, first):
             values = decoder.step(memoryview(body)) | {name: column[row] for name, column in new.items()}
             out = bytearray(body[:8])
@@ -276,9 +286,10 @@ class EpisodeCopier:
         new = self._values.finals.get(int(row["episode"]))
         if new is not None:
             return self._time_of(channel, place), partial(bytes, numbers + new)
-        return self._time_of(
-            channel, place
-        ), lambda: numbers + next(body for _, body in self._messages(channel, place, 1))[8:]
+        time_ns = self._time_of(channel, place)
+        if not self._layout.state:
+            return time_ns, lambda: numbers
+        return time_ns, lambda: numbers + next(body for _, body in self._messages(channel, place, 1))[8:]
 
     def _starts(self, rows: Array) -> list[list[tuple[int, EpisodeStart]]]:
         """(log_time, start) of the resets without a step before each episode, and of its own.
@@ -367,6 +378,15 @@ class EpisodeCopier:
             for first, count in _merged([(place, 1) for place in self._infos(rows).tolist()]):
                 for time_ns, body in self._messages(self._topics[INFO], first, count):
                     yield time_ns, self._renumbered(body)
+
+
+def _narrowed(rows: Array, dtype: np.dtype[Any]) -> Array:
+    """Rows of constant size with the fields of another such layout, which has only some of theirs."""
+    found = np.zeros(len(rows), dtype)
+    for name in dtype.names or ():
+        found[name] = rows[name]
+    found["#length"] = dtype.itemsize - 9
+    return found
 
 
 def _merged(spans: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ import heapq
 import os
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -104,14 +104,18 @@ def merge_recordings(
     return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)
 
 
-def merge_excerpts(excerpts: Sequence[Excerpt], container: Container) -> Assembler:
+def merge_excerpts(
+    excerpts: Sequence[Excerpt], container: Container, without: Collection[str] = ()
+) -> Assembler:
     """Writes a recording of episodes of several, as `merge_recordings` does. There must be one.
+
+    without: fields that are left out: "states", "actions", "infos", "frames".
 
     Raises:
         SpaceError: they have different spaces or dtypes.
         RecordingError, FormatError: as `merge_recordings`.
     """
-    sources, attachments = check_mergeable(excerpts)
+    sources, attachments = check_mergeable(excerpts, without)
     now, first = time.time_ns(), sources[0].recording
     turns = _turns(sources)
     lanes = _lanes(sources, turns=len(turns))
@@ -119,15 +123,16 @@ def merge_excerpts(excerpts: Sequence[Excerpt], container: Container) -> Assembl
         turns = [(i, np.arange(len(source.rows))) for i, source in enumerate(sources)]
     numbered, next_episode = _numbered(sources, turns)
     target = Assembler(container)
-    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), "merge")}
+    facts = {"without": sorted(without)} if without else {}
+    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), "merge", **facts)}
     target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
-    if lanes is None:
+    if lanes is None and not without:
         define(first, target)
     envs = first.num_envs if first.is_vector else None
     if lanes is not None:
         envs = max(lane + source.recording.num_envs for lane, source in zip(lanes, sources, strict=True))
     for source in sources:
-        _define_missing(source.recording, container, envs)
+        _define_missing(source.recording, container, envs, without)
     container.define_channels()
     episodes, infos = [], []
     for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
@@ -136,8 +141,12 @@ def merge_excerpts(excerpts: Sequence[Excerpt], container: Container) -> Assembl
         cameras = {
             name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
             for name, pairs_of in camera_channels(recording, container).items()
+            if "frames" not in without
         }
-        copier = EpisodeCopier(recording, target, cameras, channels=channels, shift=shift, first_env=lane)
+        layout = recording.layout.without(without) if without else None
+        copier = EpisodeCopier(
+            recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout
+        )
         episodes += copier.copy(rows)
         infos.append(copier.infos(rows))
     target.add_episodes(episodes)
@@ -155,10 +164,12 @@ def merge_excerpts(excerpts: Sequence[Excerpt], container: Container) -> Assembl
     return target
 
 
-def check_mergeable(excerpts: Sequence[Excerpt]) -> tuple[list[Excerpt], dict[str, tuple[str, bytes]]]:
+def check_mergeable(
+    excerpts: Sequence[Excerpt], without: Collection[str] = ()
+) -> tuple[list[Excerpt], dict[str, tuple[str, bytes]]]:
     """Those with episodes, in the order of their times, and their attachments. Raises as `merge_excerpts`."""
     sources = sorted((e for e in excerpts if len(e.rows)), key=lambda e: int(e.rows["start_time"].min()))
-    _check_alike(sources)
+    _check_alike(sources, without)
     return sources, _attachments([source.recording for source in sources])
 
 
@@ -205,7 +216,7 @@ def _channels(source: Recording, container: Container, lane: int | None) -> dict
             there = Topics.of(lane + parsed.env).top + topic.removeprefix(parsed.topics.top)
         else:
             there = topic
-        found[channel] = ids.get(there, channel)
+        found[channel] = ids.get(there, 0)
     return found
 
 
@@ -237,16 +248,19 @@ def _numbered(
     return numbered, free
 
 
-def _define_missing(source: Recording, container: Container, envs: int | None) -> None:
+def _define_missing(
+    source: Recording, container: Container, envs: int | None, without: Collection[str]
+) -> None:
     """Adds the channels that earlier sources do not have; `envs` is None for those of a single environment."""
     info = None
     contents, topics = source.file.contents, source.file.topics
-    if INFO in topics:
+    if INFO in topics and "infos" not in without:
         channel = contents.channels[topics[INFO]]
         text = contents.schemas[channel.schema_id].data.decode()
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     png = png_leaves(container.channels or contents.channels)  # the first recording decides
-    register_channels(container, source.name, source.layout, envs, info, source.cameras, png)
+    cameras = () if "frames" in without else source.cameras
+    register_channels(container, source.name, source.layout.without(without), envs, info, cameras, png)
 
 
 def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
@@ -257,15 +271,15 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
             raise RecordingError(f"{target} exists; choose another path, or overwrite it")
 
 
-def _check_alike(sources: Sequence[Excerpt]) -> None:
+def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
     first = sources[0].recording
-    expected = first.layout.to_metadata()
+    expected = first.layout.without(without).to_metadata()
     seen = {(first.uuid, int(number)): first for number in sources[0].rows["episode"]}
     steps = sum(int(source.rows["length"].sum()) for source in sources)
     if steps > LAST_ROW:
         raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer")
     for other, rows in sources[1:]:
-        description = other.layout.to_metadata()
+        description = other.layout.without(without).to_metadata()
         for name in _SPACES:
             if description[name] != expected[name]:
                 raise SpaceError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import AbstractContextManager
 
 from tupli_mcap.mcap.container import COMPRESSIONS, Container
@@ -16,11 +16,14 @@ __all__ = ["stream_excerpts"]
 _PIECE = 1 << 16  # what a pipe holds
 
 
-def stream_excerpts(opening: AbstractContextManager[Sequence[Excerpt]]) -> Generator[bytes]:
+def stream_excerpts(
+    opening: AbstractContextManager[Sequence[Excerpt]], without: Collection[str] = ()
+) -> Generator[bytes]:
     """The bytes of a recording of these episodes, no faster than they are taken; each excerpt has some.
 
-    Of one recording they keep their numbers, and the recording its UUID; several are merged, as `merge_recordings`
-    does. A thread of its own opens the recordings, writes, and closes them; it gives up once the iterator is closed.
+    Of one recording they keep their numbers, and the recording its UUID. Several are merged, as `merge_recordings`
+    does, and so are those `without` some fields ("states", "actions", "infos", "frames"). A thread of its own opens the
+    recordings, writes, and closes them; it gives up once the iterator is closed.
 
     Raises:
         SpaceError, RecordingError: they cannot be merged.
@@ -29,18 +32,18 @@ def stream_excerpts(opening: AbstractContextManager[Sequence[Excerpt]]) -> Gener
 
     def write(fd: int) -> None:
         with opening as excerpts:
-            _write(excerpts, fd)
+            _write(excerpts, fd, without)
 
     return _through_a_pipe(write)
 
 
-def _write(excerpts: Sequence[Excerpt], fd: int) -> None:
+def _write(excerpts: Sequence[Excerpt], fd: int, without: Collection[str]) -> None:
     source, rows = excerpts[0]
     table = source.file.store.table
     compression = COMPRESSIONS[int(table["compression"][0])]  # so that chunks can be copied as they are
     container = Container(fd, source.name, compression)
-    if len(excerpts) > 1:
-        merge_excerpts(excerpts, container)
+    if len(excerpts) > 1 or without:
+        merge_excerpts(excerpts, container, without)
         return
     whole = len(rows) == len(source)
     numbers = None if whole else rows["episode"].tolist()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Body
@@ -25,18 +25,22 @@ def query_episodes(
     """A recording of exactly the episodes that are meant.
 
     Of one recording (`Recording-Count: 1`) they keep their numbers. Those of several are merged: numbered anew, in the
-    order of their times; where their spaces differ, the error names two that do.
+    order of their times; where their spaces differ, the error names two that do. Where states or actions are not asked
+    for, their spaces are empty.
     """
+    left_out = told.left_out
     with library.database.reading() as connection:
         selected = select_episodes(connection, caller, library.items, told)
-    return streamed(library, selected)
+    return streamed(library, selected, left_out)
 
 
-def streamed(library: Library, selected: Sequence[Selected]) -> StreamingResponse:
+def streamed(
+    library: Library, selected: Sequence[Selected], without: Collection[str] = ()
+) -> StreamingResponse:
     """The answer that a recording of some episodes is, see `copies.streamed`."""
     headers = {
         "Content-Disposition": 'attachment; filename="episodes.mcap"',
         "Episode-Count": str(sum(len(each.numbers) for each in selected)),
         "Recording-Count": str(len(selected)),
     }
-    return copies.streamed(opened(library.blobs, selected), **headers)
+    return copies.streamed(opened(library.blobs, selected), without, **headers)
