@@ -185,10 +185,34 @@ def test_atari_is_grey_where_nothing_says_what_the_values_are(
     assert len(found.rows("/state", "Image:buffer")[0][0]) == side * side  # a byte a pixel
 
 
-def test_a_stack_of_other_values_is_no_picture(tmp_path: Path) -> None:
-    found = replayed(tmp_path, Sampled(Box(0, 1, (4, 20, 16), np.float32)))
-    tensor = found.rows("/state", "Tensor:data")[0][0]
-    assert (tensor["shape"], tensor["names"]) == ([4, 20, 16], ["[0]", "height", "width"])
+@pytest.mark.parametrize(
+    ("shape", "side"), [((4, 20, 16), (40, 32)), ((20, 16, 3), (20, 16)), ((20, 16, 4), (20, 16))]
+)
+@pytest.mark.parametrize(("low", "high"), [(0, 1), (-1, 1), (0, 255), (-np.inf, np.inf)])
+def test_pictures_of_floats_are_shown_between_their_bounds(
+    tmp_path: Path, shape: tuple[int, ...], side: tuple[int, int], low: float, high: float
+) -> None:
+    found = replayed(tmp_path, Sampled(Box(low, high, shape, np.float32)))
+    (form,) = found.rows("/state", "Image:format")
+    assert (form[0]["height"], form[0]["width"]) == side
+    pictures = np.array(found.rows("/state", "Image:buffer"), np.uint8)
+    with Recording(tmp_path / "sampled.mcap") as recording:
+        seen = np.concatenate([states_of(episode) for episode in recording.episodes])
+    if np.isinf(low):  # between the values that there are
+        assert pictures.min() < 20 and pictures.max() > 235
+        return
+    shades = np.rint((seen - low) / (high - low) * 255)
+    if shape[0] == 4:  # the newest frame stands first
+        shown, shades = pictures.reshape(-1, *side)[:, :20, :16], shades[:, -1]
+    else:
+        shown = pictures.reshape(-1, *shape)
+    np.testing.assert_allclose(shown, shades, atol=1)
+
+
+@pytest.mark.parametrize("shape", [(20, 16), (20, 16, 7), (4, 8, 8)])
+def test_fields_of_floats_are_grids(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    found = replayed(tmp_path, Sampled(Box(0, 1, shape, np.float32)))
+    assert found.rows("/state", "Tensor:data")[0][0]["shape"] == list(shape)
 
 
 def test_camera_frames_are_sent_as_they_are(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.messages.step import StepLayout, can_stack
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.spaces.labels import Labels
@@ -28,6 +28,7 @@ from tupli_mcap.viewer.panels import (
     Series,
     Words,
     infos_of,
+    is_image,
     value_range,
 )
 
@@ -150,8 +151,8 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
         scene.beside.append(Words(leaf, column, entity, title))
     elif not leaf.size:
         scene.unseen.append(f"{title_of(leaf)} has no values")
-    elif leaf.apart or _are_frames(leaf, column, material):
-        scene.beside.append(Picture(leaf, column, entity, title))
+    elif picture := _picture(leaf, column, material):
+        scene.beside.append(picture)
     elif type(leaf.space) is spaces.Discrete:
         panels.append(_discrete(leaf, column, material))
     elif leaf.size <= MOST_LINES:
@@ -162,14 +163,31 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
         panels += _many(scene, leaf, column, material)
 
 
-def _are_frames(leaf: Leaf, column: str, material: _Material) -> bool:
-    """Whether an array that is not declared as such looks like a grey image, or like a stack of frames."""
-    grey = leaf.dtype == np.uint8 and len(leaf.shape) == 2
-    if not grey and (not can_stack(leaf) or leaf.shape[0] > _MOST_FRAMES):
-        return False
-    if min(leaf.shape if grey else leaf.shape[1:3]) < _LEAST_FRAME:
-        return False
-    return all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample)
+def _picture(leaf: Leaf, column: str, material: _Material) -> Picture | None:
+    """A picture of an image, or of an array that looks like one or like a stack of frames; None for anything else.
+
+    What is not uint8 is shown between its bounds, or between the values that there are where it has none.
+    """
+    entity, title = entity_of(leaf), title_of(leaf)
+    if leaf.apart:
+        return Picture(leaf, column, entity, title)
+    shape = leaf.shape
+    if leaf.dtype is None or not (leaf.dtype == np.uint8 or (leaf.dtype.kind == "f" and len(shape) > 2)):
+        return None
+    if not (is_image(shape) or len(shape) == 2):
+        if len(shape) not in (3, 4) or not 2 <= shape[0] <= _MOST_FRAMES:
+            return None
+        shape = shape[1:]
+    if min(shape[:2]) < _LEAST_FRAME or not (is_image(shape) or len(shape) == 2):
+        return None
+    if all(leaf.get(getattr(part, column)).dtype == np.uint8 for part in material.sample):
+        return Picture(leaf, column, entity, title)
+    space: Any = leaf.space
+    low, high = float(np.min(space.low)), float(np.max(space.high))
+    if not np.isfinite([low, high]).all():
+        lows, highs = value_range(material.values(leaf, column))
+        low, high = float(lows.min()), float(highs.max())
+    return Picture(leaf, column, entity, title, low, high) if np.isfinite(high - low) and low < high else None
 
 
 def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:

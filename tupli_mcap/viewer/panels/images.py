@@ -20,12 +20,24 @@ _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
 _AXES = {2: ("row", "column"), 3: ("[0]", "height", "width")}
 _FRAMES_AT_ONCE = 64
 _FRAMES_A_LINE = 4  # of a stack, at most
+_CHANNELS = (1, 3, 4)
 _ATARI = (84, 84, 4)  # four frames, where nothing says what the channels are
+
+
+def is_image(shape: Sequence[int]) -> bool:
+    """Whether it is that of one image: height, width and channels."""
+    return len(shape) == 3 and shape[2] in _CHANNELS
 
 
 @dataclass(frozen=True)
 class Picture(LeafPanel):
-    """An image leaf: one picture a step. A stack shows all its frames side by side, the newest first."""
+    """An image leaf: one picture a step. A stack shows all its frames side by side, the newest first.
+
+    `black` and `white` are the values of leaves that are not uint8 at both ends of what is shown.
+    """
+
+    black: float = 0.0
+    white: float = 255.0
 
     def declare(self, place: Place) -> None:
         import rerun as rr
@@ -40,9 +52,16 @@ class Picture(LeafPanel):
     def send(self, place: Place, block: Block, times: Times) -> None:
         import rerun as rr
 
-        pictures = self._tiled(self.leaf.get(getattr(block.columns, self.column)))
+        pictures = self._tiled(self._bytes(self.leaf.get(getattr(block.columns, self.column))))
         values = np.ascontiguousarray(pictures).reshape(len(pictures), -1)
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
+
+    def _bytes(self, values: Array) -> Array:
+        if values.dtype == np.uint8:
+            return values
+        shades = (values.astype(np.float32) - self.black) * (255.0 / (self.white - self.black))
+        pictures: Array = np.nan_to_num(shades, nan=0.0).clip(0.0, 255.0).round().astype(np.uint8)
+        return pictures
 
     def _tiled(self, values: Array) -> Array:
         """Pictures (rows x height x width x channels) of a column; black where the last line of a stack is not full."""
@@ -50,7 +69,7 @@ class Picture(LeafPanel):
         frames_last = leaf.frames_last or leaf.shape == _ATARI
         if len(leaf.shape) == 2:
             return values[..., None]
-        if leaf.kind == "image" and not frames_last:
+        if not frames_last and leaf.kind != "stack" and is_image(leaf.shape):
             return values
         frames = (np.moveaxis(values, -1, 1) if frames_last else values)[:, ::-1]
         rows, count, height, width = frames.shape[:4]
