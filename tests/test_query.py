@@ -200,12 +200,12 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-def temporary_files() -> set[Path]:
-    return set(Path(tempfile.gettempdir()).glob("tupli-mcap-*.mcap"))
-
-
-def test_few_short_episodes_of_a_server_move_few_bytes(sent: list[int], users: Users, tmp_path: Path) -> None:
-    before = temporary_files()
+def test_few_short_episodes_of_a_server_move_few_bytes(
+    sent: list[int], users: Users, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     path = short_episodes(tmp_path / "a.mcap", 4000, 0)
     users.ann.push(path)
     best = list(range(7, 4000, 100))
@@ -227,10 +227,10 @@ def test_few_short_episodes_of_a_server_move_few_bytes(sent: list[int], users: U
     windows = some.windows(8)
     copy = pickle.loads(pickle.dumps(windows))
     assert np.array_equal(copy[100].states, windows[100].states)
-    assert [episode.number for episode in some] == best and len(temporary_files() - before) == 1
+    assert [episode.number for episode in some] == best and len(list(temporary.iterdir())) == 1
     del some, windows, copy, dataset
     gc.collect()
-    assert temporary_files() == before
+    assert list(temporary.iterdir()) == []
 
 
 def test_an_episode_that_was_not_cut_out_is_fetched_all_the_same(users: Users, tmp_path: Path) -> None:
