@@ -615,10 +615,10 @@ def test_defects_in_benchmark_json_are_format_errors() -> None:
         return json.dumps({**good, "environment": {**good["environment"], **environment}}).encode()
 
     cases: list[tuple[bytes, bytes | None, str]] = [
-        (b"", None, "no benchmark document"),
-        (b"\xff\xfe", None, "no benchmark document"),
-        (b"[" * 100_000, None, "no benchmark document"),
-        (b"3", None, "no benchmark document"),
+        (b"", None, "not a benchmark document"),
+        (b"\xff\xfe", None, "not a benchmark document"),
+        (b"[" * 100_000, None, "not a benchmark document"),
+        (b"3", None, "not a benchmark document"),
         (json.dumps({**good, "version": 2}).encode(), record.pickle, "version"),
         (record.to_json(), None, "is missing beside it"),
         (record.to_json(), (record.pickle or b"")[:-1], "expected a pickled environment of"),
@@ -626,7 +626,7 @@ def test_defects_in_benchmark_json_are_format_errors() -> None:
         (changed(pickle=None), None, "expected an environment with digest"),
         (changed(spec={"id": "CartPole-v1"}), record.pickle, "found both"),
         (changed(spec=3), record.pickle, "environment.spec"),
-        (changed(spec={"id": float("nan")}, pickle=None), None, "no strict JSON"),
+        (changed(spec={"id": float("nan")}, pickle=None), None, "not strict JSON"),
     ]
     for data, beside, message in cases:
         with pytest.raises(FormatError, match=message):

@@ -113,7 +113,7 @@ class TestCopies:
         data = pickle.dumps(Recording(path))
         with cart_pole(path, mode="w") as env:
             roll(env, 10)
-        with pytest.raises(RecordingError, match="is another recording by now"):
+        with pytest.raises(RecordingError, match="is a different recording now"):
             pickle.loads(data)
 
     def test_of_an_open_file_are_refused(self, tmp_path: Path) -> None:

@@ -951,7 +951,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (
             ["cartpole.mcap", "--filter", "n_tuples > 99999"],
             1,
-            'there is no episode that F("n_tuples") > 99999 is true of',
+            'no episode matches F("n_tuples") > 99999',
         ),
         (["cartpole.mcap", "--filter", "n_tuples >"], 2, "error: "),
         (["cartpole.mcap", "--x", "days"], 2, "'days' is not one of 'steps', 'episodes', 'time'"),

@@ -131,7 +131,7 @@ def test_records_that_are_no_rows(tmp_path: Path) -> None:
             if at == 11:  # the sequence
                 assert rows(bytes(data))["x"].tolist() == [9, 9, 9]
                 continue
-            with pytest.raises(FormatError, match="chunk 0 holds records that are no rows of its channel"):
+            with pytest.raises(FormatError, match="chunk 0 holds records that are not rows of its channel"):
                 rows(bytes(data))
 
 

@@ -554,7 +554,7 @@ def test_a_signature_that_is_none_is_a_format_error(bundle: Path, tmp_path: Path
         for bad in (b"", b"[", b"{}", b"[" * 100_000, *(json.dumps({**good, k: 3}).encode() for k in good)):
             attachment = {SIGNATURE_NAME: ("application/json", bad)}
             rewrite_recording(recording, tmp_path / "bad.mcap", attachments=attachment)
-            with pytest.raises(FormatError, match=r"bad\.mcap: signature\.ed25519 is no signature"):
+            with pytest.raises(FormatError, match=r"bad\.mcap: signature\.ed25519 is not a signature"):
                 verified(tmp_path / "bad.mcap")
             with Recording(tmp_path / "bad.mcap") as damaged, pytest.raises(UntrustedError):
                 damaged.benchmark.make_env()

@@ -71,7 +71,7 @@ def filter_recording(
                 raise RecordingError(f"{target} exists; choose another path, or overwrite it")
         positions = candidates(recording, wanted)
         if not len(positions):
-            raise RecordingError(f"{recording.name} has no episode that {wanted} is true of")
+            raise RecordingError(f"{recording.name} has no episode that matches {wanted}")
         rows = recording.index[positions]
         steps, left_out = int(rows["length"].sum()), len(recording) - len(rows)
         report = FilterReport(target, len(rows), steps, left_out)

@@ -136,7 +136,7 @@ def named_positions(
         FilterError: the text is none of this.
         RecordingError: there is no such episode, or none at all.
     """
-    why = "" if filter is None else f" that {filter} is true of"
+    why = "" if filter is None else f" that matches {filter}"
     if not len(among):
         raise RecordingError(f"{recording.name} has no episode{why}")
     chosen: dict[int, None] = {}
@@ -377,7 +377,7 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
         for file in _files_of(item, {file: total for file, (total, _) in named[item].items()}):
             chosen.setdefault(file, {}).update(dict.fromkeys(named[item][file][1]))
     if not chosen:
-        why = "" if filter is None else f" that {filter} is true of"
+        why = "" if filter is None else f" that matches {filter}"
         raise RecordingError(
             f"{folder} has no episode {text!r}{why} in any recording; see tupli-mcap ls {folder}"
         )

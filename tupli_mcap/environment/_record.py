@@ -146,7 +146,7 @@ class EnvironmentRecord:
         except ValidationError as err:
             first = err.errors(include_url=False, include_input=False)[0]
             place = ".".join(str(part) for part in first["loc"]) or "the document"
-            raise FormatError(f"{where}: no benchmark document: {place}: {first['msg']}") from err
+            raise FormatError(f"{where}: not a benchmark document: {place}: {first['msg']}") from err
         environment = document.environment
         if environment.pickle is not None:
             _check_pickle(environment.pickle, pickle, environment.spec is not None, where)
@@ -161,7 +161,7 @@ class EnvironmentRecord:
         try:
             digest = record.digest
         except (ValueError, RecursionError) as err:
-            raise FormatError(f"{where}: the environment's spec is no strict JSON: {err}") from err
+            raise FormatError(f"{where}: the environment's spec is not strict JSON: {err}") from err
         if digest != environment.digest:
             raise FormatError(
                 f"{where}: expected an environment with digest {environment.digest}, found {digest}"

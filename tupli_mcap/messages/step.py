@@ -67,7 +67,7 @@ class StepLayout:
         }
         if given:
             raise SpaceError(
-                f"dtypes are given for {sorted(given)}, which are no constant leaves of these spaces"
+                f"dtypes are given for {sorted(given)}, which are not leaves of constant size in these spaces"
             )
         # an image whose values are not uint8 is no image that viewers know, but an array like any other
         self.state = [

@@ -75,7 +75,7 @@ def report(
             with subject.open() as recording:
                 measured.append(measure(recording, subject.choose(recording), READ_BYTES // len(subjects)))
         if episode_filter is not None and not any(len(one.rows) for one in measured):
-            raise RecordingError(f"there is no episode that {episode_filter} is true of; use another filter")
+            raise RecordingError(f"no episode matches {episode_filter}; use another filter")
         _shorten_names(measured)
         traces = _traces(subjects, measured, str(episode))
         return Report(measured, traces, _make_comparable(measured), x)

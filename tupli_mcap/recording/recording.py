@@ -82,7 +82,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
         if self.path is None:
-            raise RecordingError(f"{self.name} is no file that can be changed; fetch it, and open the copy")
+            raise RecordingError(f"{self.name} cannot be changed here; download it, and open the copy")
         annotate_episodes(self.path, values, episodes)
         with Recording(self.path) as changed:
             self.annotations = changed.annotations
@@ -413,6 +413,6 @@ def _opened_again(source: str, uuid: str, cache_bytes: int) -> Recording:
     if recording.uuid != uuid:
         recording.close()
         raise RecordingError(
-            f"{source} is another recording by now (expected {uuid}, found {recording.uuid})"
+            f"{source} is a different recording now (expected {uuid}, found {recording.uuid})"
         )
     return recording

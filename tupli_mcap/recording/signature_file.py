@@ -82,9 +82,11 @@ class Signed(NamedTuple):
         except ValidationError as err:
             first = err.errors(include_url=False, include_input=False)[0]
             place = ".".join(str(part) for part in first["loc"]) or "the document"
-            raise FormatError(f"{where}: {SIGNATURE_NAME} is no signature: {place}: {first['msg']}") from err
+            raise FormatError(
+                f"{where}: {SIGNATURE_NAME} is not a signature: {place}: {first['msg']}"
+            ) from err
         except (ValueError, RecursionError) as err:
-            raise FormatError(f"{where}: {SIGNATURE_NAME}: its manifest is no strict JSON: {err}") from err
+            raise FormatError(f"{where}: {SIGNATURE_NAME}: its manifest is not strict JSON: {err}") from err
         return cls(document.public_key, bytes.fromhex(document.signature), document.manifest)
 
 

@@ -51,19 +51,18 @@ class EpisodeWriter(Recorder):
             writer.end(final_state)
 
     A step is (state, action, reward, terminal, timeout); `state` is the observation that `action` was chosen on. It is
-    safe, whatever happens to the process, as soon as `step()` has returned. What still runs at `close()`, at garbage
-    collection and at the end of the interpreter ends as "interrupted", without a final state.
+    safe, whatever happens to the process, as soon as `step()` has returned. An episode that still runs at `close()`, at
+    garbage collection or at the end of the interpreter ends as "interrupted", without a final state.
 
     Args:
-        path: the recording, or a directory: it gets a new file named by time. Directories that are missing are made.
-            `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
+        path: the recording, or a directory, in which a new file is named by time. Missing directories are made.
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
-        num_envs: None for one stream of episodes; a number for as many streams in one file, as a vector environment has
-            sub-environments. Each has an episode of its own, and `env` says which of them is meant.
+        num_envs: None for one stream of episodes; a number for as many streams in one file, like the sub-environments
+            of a vector environment. Each has an episode of its own; `env` in the calls says which stream is meant.
         labels: this and every other argument is as `tupli_mcap.RecordEpisodes` takes it.
 
     Raises:
-        SpaceError: a space that cannot be recorded, with the path of the leaf.
+        SpaceError: a space cannot be recorded; the message has the path of the leaf.
         RecordingError: the file exists, is being written, or cannot be written.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.

@@ -68,38 +68,39 @@ def write_rollout(
     truncations: Any = None,
     next_observations: Any = None,
 ) -> None:
-    """Writes a recording of arrays that hold whole rollouts.
+    """Writes a recording from arrays that hold whole rollouts.
 
         write_rollout("run.mcap", observations, actions, rewards, terminations, truncations, autoreset="next-step")
         write_rollout("demos.mcap", states=[s0, s1], actions=[a0, a1], rewards=[r0, r1], terminals=[True, False])
 
-    Arrays are NumPy's, or have `__dlpack__` or `__array__` (torch, JAX); states and actions may be dicts and tuples of
-    them, as their spaces are. Given as arrays, they hold T steps: [T, …], or [T, N, …] of N sub-environments, each of
-    which becomes a stream of episodes of its own. Given as lists, each entry is an episode: [T of this one, …].
+    Arrays are NumPy's, or have `__dlpack__` or `__array__` (torch, JAX). States and actions may be dicts and tuples of
+    arrays, as their spaces are. Arrays hold T steps: [T, …], or [T, N, …] for N sub-environments, each of which becomes
+    a stream of episodes of its own. In lists, each entry is an episode: [T of this one, …].
 
     Args:
-        states: what the actions were chosen on; one more than there are steps (T + 1) tells the state after the last.
-        terminals, timeouts: whether a step ended its episode; of lists, one flag an episode will do. By default false.
-            Steps after the last end are an episode that was interrupted.
-        next_states: the state after each step, in arrays of the actions' lengths; only final states are taken of it.
+        states: what the actions were chosen on. If there is one more than there are steps (T + 1), it is the state
+            after the last one.
+        terminals, timeouts: whether a step ended its episode; in lists, one flag for each episode will do. By default
+            false. Steps after the last end are an interrupted episode.
+        next_states: the state after each step, in arrays as long as the actions; only final states are taken from it.
         final_states: instead of that, one for each episode that a flag ends, in the order of
-            `numpy.argwhere(terminals | timeouts)`; of lists, one for each episode, None where it is not known.
-        infos: name -> array, along the same axes as the rewards; of lists, one such dict for each episode.
-        metadata: of every episode; of lists, one for each or one for all.
-        autoreset: what the step after an end is, where arrays go on after one. "next-step": a reset, whose action and
-            reward are left out; "same-step": a step of the next episode, and the state after an end is its first one;
+            `numpy.argwhere(terminals | timeouts)`; in lists, one for each episode, None if it is not known.
+        infos: name -> array, along the same axes as the rewards; in lists, one such dict for each episode.
+        metadata: of every episode; in lists, one for each or one for all.
+        autoreset: what the row after an end is, if arrays continue after one. "next-step": a reset; its action and
+            reward are left out. "same-step": a step of the next episode, whose first state follows the end.
             "disabled": the same, and the caller has reset between the steps.
         observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds.
         reward_space: for rewards that are arrays.
-        run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` has them.
-        labels, attachments, compression, mode, benchmark_id: those of `tupli_mcap.RecordEpisodes`.
+        run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` takes them.
+        labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
         observations, terminations, truncations, next_observations: Gymnasium's names of states, terminals, timeouts,
             next_states.
 
     Raises:
-        StepError: arrays that do not fit together, or values that cannot be stored exactly; of lists, the episodes
-            before that one are in the file.
-        SpaceError: a space that cannot be recorded.
+        StepError: arrays do not fit together, or values cannot be stored exactly; of lists, the episodes before that
+            one are in the file.
+        SpaceError: a space cannot be recorded.
         RecordingError: the file exists, is being written, or cannot be written.
     """
     given = _Given(

@@ -42,21 +42,20 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
         PPO("MlpPolicy", venv).learn(100_000)
         venv.close()
 
-    What it sees is recorded, and what it returns is what it got: inside `VecNormalize` that is what the environments
-    gave, around it what the policy learns from. An episode's final state is `terminal_observation` of its last info;
-    it ends as a timeout where `TimeLimit.truncated` says so. `EvalCallback` needs both environments wrapped alike;
-    `split="eval"` marks what is recorded of the second one.
-    `make_vec_env(..., wrapper_class=RecordEpisodes, wrapper_kwargs={"path": "runs/"})` makes a file of each
-    sub-environment instead.
+    It records what passes through it: inside `VecNormalize`, what the environments gave; around it, what the policy
+    learns from. The final state of an episode is `terminal_observation` of its last info. An episode ends as a timeout
+    if that info says `TimeLimit.truncated`. `EvalCallback` needs both environments wrapped alike; give the second one
+    `split="eval"`. `make_vec_env(..., wrapper_class=RecordEpisodes, wrapper_kwargs={"path": "runs/"})` makes a file for
+    each sub-environment instead.
 
     Args:
         venv: `DummyVecEnv`, `SubprocVecEnv`, a wrapper around one, or a `VecEnv` of your own.
-        path: the recording, or a directory, which gets a new file named by environment and time.
-        options: those of `tupli_mcap.RecordEpisodes`, and what `tupli_mcap.vector.RecordEpisodes` says of them.
+        path: the recording, or a directory, in which a new file is named by environment and time.
+        options: those of `tupli_mcap.RecordEpisodes` and of `tupli_mcap.vector.RecordEpisodes`.
 
     Raises:
         MissingExtraError: Stable-Baselines3 is not installed (at import; extra `sb3`).
-        RecordingError: no `VecEnv`; else as `tupli_mcap.RecordEpisodes`.
+        RecordingError: it is no `VecEnv`; else as `tupli_mcap.RecordEpisodes`.
 
     Not thread-safe.
     """

@@ -40,60 +40,62 @@ from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, met
 class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     """Records the episodes of `env` into the MCAP file `path`.
 
-    Nothing the policy sees changes: the same objects are returned. A step is safe, whatever happens to the process,
-    as soon as `step()` has returned. A reset in mid-episode, `close()`, garbage collection and the end of the
-    interpreter end the running episode as "interrupted".
+    The policy sees what it would see without a recorder: the same objects are returned. A step is safe, whatever
+    happens to the process, as soon as `step()` has returned. A reset in mid-episode, `close()`, garbage collection
+    and the end of the interpreter end the running episode as "interrupted".
 
     Args:
         env: any environment whose spaces are Gymnasium's own.
-        path: the recording, or a directory: it gets a new file named by environment and time. Directories that are
-            missing are made. `mode` "x" refuses to overwrite, "w" replaces, "a" continues it, or makes it.
-        metadata_callback: called with every step (an RLTuple), returns the episode's metadata (a dict); reset after
-            it, and before the first one. Where the last info says `is_success` or `success`, the metadata have it as
-            `success`, unless the callback says it.
-        record_info: False, True (everything), a list of names, or a function from info to what is recorded.
+        path: the recording, or a directory, in which a new file is named by environment and time. Missing
+            directories are made.
+        mode: if the file exists, "x" refuses, "w" replaces it, and "a" continues it. "a" also makes a missing file.
+        metadata_callback: called with every step (an RLTuple); the dict it returns at the last one is the episode's
+            metadata. It is reset before each episode. If the last info has `is_success` or `success`, the metadata
+            gets that as `success`, unless the callback sets it.
+        record_info: False, True (everything), a list of names, or a function from an info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".
         reward_space: for rewards that are arrays.
-        benchmark_id: the benchmark the episodes belong to.
-        capture_env: what the file says of the environment. "spec": the EnvSpec (id, arguments, wrappers) if it has one,
-            the names of its classes, versions of packages. "pickle": its pickle instead of the EnvSpec, code that this
-            user's own recordings run without a question. None: nothing, names from its documentation left out too.
-            Whether a spec rebuilds it as it was is found out by `verify --rerun`. No other environment is made.
+        benchmark_id: the benchmark that the episodes belong to.
+        capture_env: what to store of the environment. "spec": the EnvSpec (id, arguments, wrappers) if it has one,
+            the names of its classes, versions of packages. "pickle": its pickle instead of the EnvSpec; this is code,
+            which runs without a question for the user who recorded it. None: nothing, and no names from its
+            documentation. No other environment is made; `verify --rerun` finds out whether a spec rebuilds it.
         attachments: name -> (media type, bytes), written before the first step instead of what `capture_env` says.
-        labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one a
-            dimension, or one a value of a Discrete. By default what the environment's documentation says.
-        flush_seconds: also write chunks this many seconds after the last ones, full or not.
+        labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one for
+            each dimension, or for each value of a Discrete. By default those in the environment's documentation.
+        flush_seconds: write chunks at least this often (seconds), full or not.
         journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
         chunk_size: bytes of a chunk before compression.
-        durability: what a power loss or a crash of the system leaves. "os": what it happened to have written (a killed
-            process loses nothing in any case); "chunk": every chunk, waiting for the disk after each; "step": every
-            step, waiting for the disk in each `step()`, which takes as long as the disk does (0.1 to 20 ms).
-        frames: True records what `env.render()` gives of every state, a number n every n-th and the last one; the
-            environment must be made with render_mode="rgb_array".
+        durability: what survives a power loss or a crash of the system; a killed process loses nothing in any case.
+            "os": what the system happened to have written. "chunk": every chunk; each waits for the disk. "step":
+            every step; each `step()` waits for the disk (0.1 to 20 ms).
+        frames: True records what `env.render()` gives for every state; a number n does so for every n-th state and
+            the last one. The environment must be made with render_mode="rgb_array".
         frame_format: "png" (exact) or "jpeg" (faster; smaller for photographs, not for drawings).
-        image_format: of the images in states, both exact. "raw": pixels, which the chunk's compression makes small;
-            "png": each image, and each frame of a stack, as a PNG (extra `frames`): smaller for photographs, larger for
-            drawn screens, and 4 to 35 times slower to record.
-        stack_size: how many frames an observation stacks, each of which is then stored once. By default what
+        image_format: how images in states are stored, exactly in both cases. "raw": pixels, which the chunk's
+            compression makes small. "png": each image, and each frame of a stack, as a PNG (extra `frames`): smaller
+            for photographs, larger for drawn screens, and 4 to 35 times slower to record.
+        stack_size: how many frames an observation stacks; each of them is then stored once. By default what
             `FrameStackObservation`, or another wrapper with `stack_size` or `num_stack`, says in this process.
-        live: shows the rollout while it is recorded: "rerun" (starts the viewer if none listens at 127.0.0.1:9876),
-            "rerun+http://host:port/proxy" (one that is running), "foxglove" or "foxglove://127.0.0.1:8765" (a server
-            to connect Foxglove to). A viewer that is missing, slow or closed changes nothing about the recording.
-        max_bytes, max_seconds: goes on in another file (run_0001.mcap, run_0002.mcap, … after run.mcap) when that much
-            is in the file, or it has been open so long, as soon as no episode is running: one that runs goes on in its
-            file, however long it is. `path` is the file that is recorded to, `paths` are all of them. With mode "a" the
-            last one is gone on with.
-        name, metadata, tags, split: of the run: what it is called ("ppo-seed3"; it names new files in a directory),
-            what was tried ({"algo": "ppo", "lr": 3e-4}), words for it, "train" or "eval". A recording that is gone on
-            with keeps the run it has.
-        capture: what the file says of this process. "all": its command line, git commit, host, versions of Python and
-            packages; "versions": these; "none".
+        live: shows the rollout while it is recorded. "rerun": starts the viewer if none listens at 127.0.0.1:9876.
+            "rerun+http://host:port/proxy": a viewer that is running. "foxglove" or "foxglove://127.0.0.1:8765": a
+            server to which Foxglove connects. A missing, slow or closed viewer changes nothing about the recording.
+        max_bytes, max_seconds: continue in another file (run_0001.mcap, run_0002.mcap, … after run.mcap) when the
+            file has this many bytes, or was open this long, and no episode is running: an episode is always in one
+            file. `path` is the current file, `paths` are all of them. Mode "a" continues the last one.
+        name: what the run is called, such as "ppo-seed3"; new files in a directory are named by it. This, `metadata`,
+            `tags` and `split` are ignored where a recording is continued: it keeps the run it has.
+        metadata: what was tried, such as {"algo": "ppo", "lr": 3e-4}.
+        tags: words for the run.
+        split: "train", "eval" or another word.
+        capture: what to store about this process. "all": its command line, git commit, host, versions of Python and
+            packages. "versions": only these. "none": nothing.
 
     Raises:
-        SpaceError: a space that cannot be recorded, with the path of the leaf.
+        SpaceError: a space cannot be recorded; the message has the path of the leaf.
         MissingExtraError: the extra that `live` needs is not installed.
-        RecordingError: the file exists, is being written, or cannot be written; a vector environment.
+        RecordingError: the file exists, is being written, or cannot be written; or it is a vector environment.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """

@@ -42,15 +42,17 @@ from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, met
 class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
-    Arguments are those of `tupli_mcap.RecordEpisodes`; the environment in the file is the first sub-environment, and
-    where that lives in another process, what `gymnasium.make_vec` has noted of it.
-    A metadata callback is copied for each sub-environment.
-    `autoreset_mode` ("NextStep", "SameStep" or "Disabled") is by default what the environment declares
-    (`env.metadata["autoreset_mode"]`). Where it declares nothing, final states in its infos tell of same-step
-    autoreset; without them next-step autoreset is assumed, with a warning. A batch that contradicts the mode is
-    refused. With "SameStep" given, episodes whose final states are in no infos are recorded without.
-    With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an episode; where there is
-    always one that is, at a `reset` of all.
+    Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file stores the first sub-environment,
+    or, if that lives in another process, what `gymnasium.make_vec` knows of it. A metadata callback is copied for each
+    sub-environment. With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an episode;
+    if there is always one that is, at a `reset` of all.
+
+    Args:
+        autoreset_mode: "NextStep", "SameStep" or "Disabled"; by default what the environment declares
+            (`env.metadata["autoreset_mode"]`). If it declares nothing, final states in its infos are taken for
+            same-step autoreset, and without them next-step autoreset is assumed, with a warning. A batch that
+            contradicts the mode is refused. With "SameStep" given, episodes without a final state in an info are
+            recorded without one.
     """
 
     env: gym.vector.VectorEnv[Any, Any, Any]

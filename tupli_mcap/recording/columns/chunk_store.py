@@ -359,7 +359,9 @@ class ChunkStore:
             )
         rows = np.frombuffer(data, dtype)
         if not _are_rows(data, n, dtype.itemsize, channel):
-            raise FormatError(f"{self._source.name}: chunk {i} holds records that are no rows of its channel")
+            raise FormatError(
+                f"{self._source.name}: chunk {i} holds records that are not rows of its channel"
+            )
         if self.claims is not None and not self._held[i]:
             self._hold_rows(i, data, channel, n, dtype.itemsize)
         kept.rows = rows
@@ -382,7 +384,7 @@ class ChunkStore:
         if claims is not None and len(records):
             starts = records[:, 0]
             if int((records[:, 1] - starts).min()) < _LEAST_STEP:
-                raise FormatError(f"{where} holds messages that are no steps")
+                raise FormatError(f"{where} holds messages that are not steps")
             numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))
             claims.check(first, lambda places: numbers[starts[places] + BODY], where)
         self._held[i] = True

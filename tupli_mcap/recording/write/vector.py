@@ -297,7 +297,7 @@ class VectorRecorder:
         if missing and not resets.needs_no_finals:
             raise StepError(
                 f"expected the final state of sub-environment {missing[0]}, whose episode ended under same-step "
-                'autoreset, in infos["final_obs"], found none; if it is known to nobody, pass '
+                'autoreset, in infos["final_obs"], found none; if nobody knows it, pass '
                 'autoreset_mode="SameStep"; if the next step resets, "NextStep"'
             )
         resets.note_ends(known=not missing)

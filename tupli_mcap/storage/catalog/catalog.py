@@ -126,7 +126,7 @@ class Catalog:
         is locked for other writers.
 
         Raises:
-            FormatError: A row's metadata is no strict JSON object.
+            FormatError: A row's metadata is not a strict JSON object.
             StorageError: Two rows have one episode number, or SQLite refuses.
         """
         remaining = iter(rows)

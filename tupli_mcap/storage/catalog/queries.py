@@ -74,7 +74,7 @@ def put_recording(
     """Adds a recording in place of what was known of it. `runs` is JSON: a list of those that its episodes are of.
 
     Raises:
-        FormatError: A row's metadata is no strict JSON object.
+        FormatError: A row's metadata is not a strict JSON object.
     """
     number = _add_recording(connection, relpath, stamp, uuid, benchmark_id, runs)
     indexed = _indexed(connection)

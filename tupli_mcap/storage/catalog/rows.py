@@ -187,7 +187,7 @@ def _searchable(text: str) -> str:
     """Metadata as a database can hold them, with keys that it reads as Python does.
 
     Raises:
-        FormatError: The text is no strict JSON object.
+        FormatError: The text is not a strict JSON object.
     """
     if "\\" not in text and '"$' not in text and (text.isascii() or not _SURROGATE.search(text)):
         try:
