@@ -196,7 +196,7 @@ class TestEpisodes:
             facts = told(web, f"/episode/{episode.id}", step=7)
             assert facts["reset"]["seed"] == 1
             assert facts["cameras"] == [{"name": "wrist", "steps": list(range(20))}]
-            assert facts["step"]["state"]["joints[0]"] == f"{episode.states['joints'][7, 0]:.6g}"
+            assert facts["step"]["state"]["joints[0]"] == f"{episode.states['joints'][7, 0]:.5g}"
             assert facts["step"]["state"]["open the drawer"] == "open the drawer"
             assert facts["step"]["action"]["action"] == "open the drawer (1)"
             assert facts["step"]["info"] == {"force": "3.5", "said": "open the drawer"}

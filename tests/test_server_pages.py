@@ -308,6 +308,12 @@ class TestPeople:
             assert ann.post("/share", data={**told, "published": "false"}).status_code == 303
             assert episodes_of(bob) == []
             assert ann.post("/share", data={**told, "group": "nobody's"}).status_code == 404
+            some = {**told, "filter": "metadata.success == true"}
+            assert ann.post("/share", data=some).status_code == 303
+            assert [e["metadata"]["success"] for e in episodes_of(bob)] == [True]
+            assert ann.post("/share", data={**some, "published": "false"}).status_code == 303
+            wrong = ann.post("/share", data={**told, "filter": "steps >"})
+            assert (wrong.status_code, "needs a value" in wrong.text) == (400, True)
 
     def test_groups(self, server: str) -> None:
         with browser(server, "ann") as ann, browser(server, "bob") as bob:

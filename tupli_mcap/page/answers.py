@@ -137,7 +137,18 @@ def error_page(request: Request, err: Exception) -> Response:
         return _with_headers(RedirectResponse(address("sign-in", next=here), 303))
     status, text = _told(request, err)
     title = _TITLES.get(status, "This did not work")
-    return _with_headers(page(request, "error.html", {"error": text}, status=status, title=title))
+    return _with_headers(
+        page(
+            request, "error.html", {"error": text}, status=status, shelf=_shelf_or_none(request), title=title
+        )
+    )
+
+
+def _shelf_or_none(request: Request) -> Shelf | None:
+    try:
+        return _shelf(request)
+    except TupliError:
+        return None
 
 
 def _told(request: Request, err: Exception) -> tuple[int, str]:

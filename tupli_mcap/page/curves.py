@@ -109,7 +109,7 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     }
     if layout.reward[0].size == 1:
         rewards = recording.read_steps(episode.position, 0, step + 1, ("rewards",)).rewards
-        told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.6g}"
+        told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.5g}"
     if columns.terminals[0] or columns.timeouts[0]:
         told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
     if _few_infos(recording):
@@ -135,7 +135,7 @@ def _value_text(value: Any, of: LeafValues) -> str:
         place = int(value) - int(of.starts[0])
         if 0 <= place < len(of.value_names):
             return f"{of.value_names[place]} ({int(value)})"
-    return f"{value:.6g}" if isinstance(value, np.floating) else str(value)
+    return f"{value:.5g}" if isinstance(value, np.floating) else str(value)
 
 
 def _tracks(field: str, leaf: Leaf, labels: Labels, column: Array, notes: list[str]) -> Iterator[Track]:

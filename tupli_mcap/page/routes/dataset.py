@@ -94,7 +94,7 @@ def dataset(
 
 def _look(shelf: Shelf, header: EpisodeHeader) -> Seen | None:
     try:
-        return look(shelf, header, 0)
+        return look(shelf, header, header.n_tuples // 3)  # where something goes on, most often
     except TupliError:  # a damaged file must not hide the others
         return None
 
@@ -123,11 +123,12 @@ def _ends(values: Array) -> str:
 
 
 class Chart(NamedTuple):
-    """Numbers of episodes: one after another, and as a distribution."""
+    """Numbers of episodes: one after another, and as a distribution; `alike`: the value, where all have the same."""
 
     title: str
-    over_time: Markup
-    distribution: Markup
+    over_time: Markup = Markup("")
+    distribution: Markup = Markup("")
+    alike: str = ""
 
 
 def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[Chart]:
@@ -139,7 +140,9 @@ def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[
     ):
         drawable = np.where(np.isfinite(values), values, np.nan)
         known = drawable[np.isfinite(drawable)]
-        if len(known):
+        if len(known) and known.min() == known.max():
+            yield Chart(title, alike=texts.number(float(known[0])))
+        elif len(known):
             what = f"{title} of episodes over time"
             drawn = (
                 _by_recording(episodes, drawable, names, what) if names else _as_one(episodes, drawable, what)

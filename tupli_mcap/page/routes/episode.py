@@ -62,6 +62,10 @@ def episode(
             "options": seen.episode.options,
             "info": seen.episode.reset_info,
         },
+        "annotations": [
+            {"by": note.by, "at": note.at, "values": note.values}
+            for note in seen.episode.recording.annotations.of(header.episode)
+        ],
         "cameras": [{"name": camera.name, "steps": camera.steps.tolist()} for camera in seen.cameras],
         "step": {"number": seen.step, **seen.values},
         **neighbours._asdict(),

@@ -12,7 +12,7 @@ from sqlalchemy import Connection, func, select
 from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
-from tupli_mcap.schema import FilterEQ
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, parse_bound
 from tupli_mcap.server import episodes
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
@@ -29,9 +29,9 @@ _Text = Annotated[str, Form()]
 
 
 @router.get("/share")
-def show(request: Request, visit: Member, dataset: str) -> Response:
-    """Who sees a dataset, and the form to change it."""
-    return _page(request, visit, dataset)
+def show(request: Request, visit: Member, dataset: str, filter: str = "") -> Response:
+    """Who sees a dataset, or the episodes of it that a filter is true of, and the form to change it."""
+    return _page(request, visit, dataset, filter)
 
 
 @router.post("/share")
@@ -39,49 +39,53 @@ def change(
     request: Request,
     visit: Code,
     dataset: _Text = "",
+    filter: _Text = "",
     group: _Text = "",
     published: Annotated[bool, Form()] = True,
 ) -> Response:
-    """Lets a group see one's own part of a dataset, or no more: the benchmark, its artifacts, one's episodes."""
+    """Lets a group see one's own part of a dataset, or no more: the benchmark, its artifacts, one's episodes. With a
+    filter, only those of one's episodes that it is true of."""
 
     def work() -> None:
+        wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
+        shelf = shelf_of(request)
         with visit.library.database.writing() as connection:
-            _set(
-                connection,
-                visit,
-                find_dataset(shelf_of(request), connection, dataset),
-                group,
-                published=published,
-            )
+            if group not in _groups(connection, visit):
+                raise NotFoundError(f"you are in no group {group[:80]!r}")
+            found = find_dataset(shelf, connection, dataset)
+            whole = wanted is None and _turn_benchmark(connection, visit, found, group, published=published)
+            own: BaseFilter = FilterEQ(key="created_by", value=visit.caller.name)
+            turn = episodes.publish if published else episodes.unpublish
+            wanted = own if wanted is None else own & wanted
+            changed = turn(connection, visit.caller, wanted, group, only=of_dataset(found.key))
+            if not changed and not whole:
+                raise DeniedError("nothing of this is yours; only the owners may publish it")
 
-    return tried(
-        work,
-        lambda wrong, status: _page(request, visit, dataset, wrong, status),
-        address("share", dataset=dataset),
-    )
+    again = address("share", dataset=dataset, filter=filter)
+    return tried(work, lambda wrong, status: _page(request, visit, dataset, filter, wrong, status), again)
 
 
-def _set(connection: Connection, visit: Visit, dataset: Dataset, group: str, *, published: bool) -> None:
+def _turn_benchmark(
+    connection: Connection, visit: Visit, dataset: Dataset, group: str, *, published: bool
+) -> bool:
+    """Lets a group see a benchmark and its artifacts, or the benchmark no more; says whether it is the caller's."""
     library, caller = visit.library, visit.caller
-    if group not in _groups(connection, visit):
-        raise NotFoundError(f"you are in no group {group[:80]!r}")
-    turn = library.items.publish if published else library.items.unpublish
-    if dataset.benchmark is not None and dataset.benchmark.created_by == caller.name:
-        turn(connection, caller, "benchmark", dataset.benchmark_id, group)
-        found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
-        with contextlib.suppress(FormatError):  # one of somebody else's making names no artifacts
-            for artifact in unpack(found.serialized).artifacts if published else ():
-                turn(connection, caller, "artifact", artifact, group)
-    elif not dataset.recordings:
-        raise DeniedError("only its owner may publish it")
-    change = episodes.publish if published else episodes.unpublish
-    own = FilterEQ(key="created_by", value=caller.name)
-    changed = change(connection, caller, own, group, only=of_dataset(dataset.key))
-    if not changed and dataset.benchmark is None:
-        raise DeniedError("none of these episodes is yours; only their owner may publish them")
+    if dataset.benchmark is None or dataset.benchmark.created_by != caller.name:
+        return False
+    if not published:  # its artifacts stay: other benchmarks may need them
+        library.items.unpublish(connection, caller, "benchmark", dataset.benchmark_id, group)
+        return True
+    library.items.publish(connection, caller, "benchmark", dataset.benchmark_id, group)
+    found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
+    with contextlib.suppress(FormatError):  # one of somebody else's making names no artifacts
+        for artifact in unpack(found.serialized).artifacts:
+            library.items.publish(connection, caller, "artifact", artifact, group)
+    return True
 
 
-def _page(request: Request, visit: Visit, key: str, wrong: str = "", status: int = 200) -> Response:
+def _page(
+    request: Request, visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200
+) -> Response:
     shelf = shelf_of(request)
 
     def ask(connection: Connection) -> tuple[Dataset, list[dict[str, Any]], list[str]]:
@@ -94,9 +98,8 @@ def _page(request: Request, visit: Visit, key: str, wrong: str = "", status: int
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
         "episodes": audiences,
     }
-    return form_page(
-        request, visit, "share.html", facts, wrong=wrong, status=status, dataset=dataset, groups=groups
-    )
+    shown = {"dataset": dataset, "groups": groups, "filter": filter}
+    return form_page(request, visit, "share.html", facts, wrong=wrong, status=status, **shown)
 
 
 def _groups(connection: Connection, visit: Visit) -> list[str]:
