@@ -19,6 +19,7 @@ import tupli_mcap
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.directory import FileShelf
+from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import EpisodeRow, RecordingStamp
 
@@ -317,6 +318,25 @@ class TestChosen:
         assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (206, "*")
         assert answer.content == (lab / best[0]["recording"]).read_bytes()[:8]
         assert httpx.get(re.sub("/file/[^/]*/", "/file/guessed/", url)).status_code == 404
+
+
+class TestDocumentation:
+    def test_it_lists_the_fields_of_every_page(self, web: httpx.Client) -> None:
+        text = (Path(__file__).parents[1] / "docs" / "reference" / "page.md").read_text()
+        sections = dict(re.findall(r"## `(/[^`]*)`\n(.*?)(?=\n## |\Z)", text, re.DOTALL))
+        uri = told(web, "/episodes")["episodes"][0]["id"]
+        dataset = set(told(web, "/")["datasets"][0])
+        pages: dict[str, set[str]] = {
+            "/": {*told(web, "/"), *dataset},
+            "/dataset/KEY": set(told(web, "/dataset/CartPole-v1")) - dataset,
+            "/episodes": set(told(web, "/episodes")),
+            "/episode/ID": set(told(web, f"/episode/{uri}")) - set(EpisodeHeader.model_fields),
+        }
+        assert set(sections) == set(pages)
+        for address, fields in pages.items():
+            rows = re.findall(r"^\| (.*) \|$", sections[address], re.MULTILINE)
+            named = set(re.findall(r"`([a-z_]+)(?:\[\])?`", " ".join(rows)))
+            assert fields <= named, address
 
 
 class TestOneFile:

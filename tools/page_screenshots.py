@@ -19,6 +19,7 @@ import gymnasium as gym
 import httpx
 import numpy as np
 from gymnasium.envs.box2d.lunar_lander import heuristic
+from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
@@ -141,6 +142,8 @@ def shoot(
     page.goto(address)
     page.wait_for_load_state("networkidle")
     page.screenshot(path=path, full_page=whole)
+    small = Image.open(path).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
     page.close()
     print(path)
 
