@@ -44,8 +44,8 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file stores the first sub-environment,
     or, if that lives in another process, what `gymnasium.make_vec` knows of it. A metadata callback is copied for each
-    sub-environment. With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an episode;
-    if there is always one that is, at a `reset` of all.
+    sub-environment. With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an
+    episode; if there is always one that is, at a `reset` of all.
 
     Args:
         autoreset_mode: "NextStep", "SameStep" or "Disabled"; by default what the environment declares
