@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -417,3 +418,27 @@ class TestNothingActs:
     def test_nothing_can_be_changed(self, evil: httpx.Client) -> None:
         for method in ("POST", "PUT", "DELETE", "PATCH"):
             assert evil.request(method, "/episodes").status_code == 405
+
+
+@pytest.mark.filterwarnings("ignore:.*")  # of copies, and of files without their journals
+def test_every_kind_of_recording(tmp_path: Path) -> None:
+    """The golden files hold every space, dtype, image and info that there is."""
+    golden = Path(__file__).parent / "golden"
+    for file in golden.glob("*.mcap"):
+        shutil.copy(file, tmp_path)
+    with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=60) as client:
+        datasets = told(client, "/")["datasets"]
+        assert len(datasets) >= 4
+        for dataset in datasets:
+            assert client.get(f"/dataset/{dataset['key']}").status_code == 200
+            client.get(f"/cover/{dataset['key']}").raise_for_status()
+        seen: dict[str, list[str]] = {}
+        for episode in told(client, "/episodes")["episodes"]:
+            seen.setdefault(episode["recording"], []).append(episode["id"])
+        assert len(seen) > 15
+        for name, (uri, *_) in seen.items():
+            facts = told(client, f"/episode/{uri}", step=2)
+            assert client.get(f"/episode/{uri}").status_code == 200, name
+            for camera, _ in enumerate(facts["cameras"]):
+                assert client.get(f"/episode/{uri}/picture/{camera}/0").status_code == 200, name
+        client.get("/sparks", params={"episode": [uris[0] for uris in seen.values()]}).raise_for_status()
