@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import buckets
 import httpx
 import pytest
 from pages import carts, robot
@@ -59,10 +60,15 @@ class Api:
         self.post("/v1/episodes/publish", filter=wanted, group="global", published=published)
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+@pytest.fixture(scope="module", params=["sqlite and a directory", "postgresql and s3"])
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     root = tmp_path_factory.mktemp("server")
-    with serving(Settings(root / "kept")) as url:
+    with contextlib.ExitStack() as stack:
+        database = blobs = ""
+        if "postgresql" in request.param:
+            database = stack.enter_context(request.getfixturevalue("postgres").database())
+            blobs = stack.enter_context(buckets.bucket()).url
+        url = stack.enter_context(serving(Settings(root / "kept", database=database, blobs=blobs)))
         for name in ("ann", "bob"):
             Api(url, "admin").post("/v1/users", username=name, password=f"{name}'s password")
         (root / "ann").mkdir()

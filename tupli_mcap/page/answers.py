@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Annotated, Any, Final
 from urllib.parse import quote, urlencode
@@ -120,6 +121,8 @@ def _templates() -> Environment:
     )
     made.filters |= {name: getattr(texts, name) for name in texts.__all__}
     made.globals |= {
+        "can_film": importlib.util.find_spec("av") is not None,
+        "can_replay": importlib.util.find_spec("rerun") is not None,
         "address": address,
         "metadata_key": lambda key: join_key(["metadata", key]),
         "recording_filter": lambda name: format_filter(FilterEQ(key="recording", value=name)),

@@ -18,6 +18,7 @@ from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.page.answers import error_page
 from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
+from tupli_mcap.viewer.process import has_display
 
 __all__ = ["browse", "create_app"]
 
@@ -69,7 +70,7 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
     listening = _listen(port)
     address = f"http://{_HOST}:{listening.getsockname()[1]}"
     tell(address)
-    if show:
+    if show and has_display():  # else a browser may take over the terminal
         webbrowser.open(address)
     config = uvicorn.Config(app, log_level="warning", server_header=False, timeout_graceful_shutdown=2)
     uvicorn.Server(config).run([listening])

@@ -13,7 +13,7 @@ from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Filter
 from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.catalog.tables import EPISODE
 
-__all__ = ["Shelf", "find_episode", "find_some", "seen_episodes"]
+__all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes"]
 
 T = TypeVar("T")
 
@@ -92,3 +92,11 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
 def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
     """An episode by its id. Raises NotFoundError, as `find_some` does."""
     return find_some(shelf, connection, [uri])[0]
+
+
+def python_line(shelf: Shelf, filter: str, sort: str = "") -> str:
+    """The Python that opens the episodes that a filter is true of; all of them where it is empty."""
+    line = f"tupli_mcap.open({shelf.opened_by!r})"
+    line += f".filter({filter!r})" if filter else ""
+    falling = ", descending=True" if sort.startswith("-") else ""
+    return line + (f".sort({sort.removeprefix('-')!r}{falling})" if sort else "")

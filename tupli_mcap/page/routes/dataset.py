@@ -16,7 +16,6 @@ from tupli_mcap.errors import TupliError
 from tupli_mcap.page import charts, texts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_dataset, of_recording
-from tupli_mcap.page.python import python_line
 from tupli_mcap.page.routes.episode import Seen, look
 from tupli_mcap.page.samples import (
     SampledEpisodes,
@@ -25,7 +24,7 @@ from tupli_mcap.page.samples import (
     sample_numbers,
     sample_values,
 )
-from tupli_mcap.page.shelf import Shelf, seen_episodes
+from tupli_mcap.page.shelf import Shelf, python_line, seen_episodes
 from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import describe

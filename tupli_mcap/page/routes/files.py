@@ -33,10 +33,10 @@ _KEPT = {"Cache-Control": "private, max-age=3600"}
 
 @router.get("/static/{name}")
 def static(name: str) -> FileResponse:
-    """The style sheet, the script and the icon. Their address names the version."""
+    """The style sheet, the scripts and the icon."""
     if name not in _STATIC:
         raise NotFoundError(f"there is no file {name[:80]!r}")
-    return FileResponse(_STATIC[name], headers={"Cache-Control": "public, max-age=86400"})
+    return FileResponse(_STATIC[name], headers={"Cache-Control": "private, max-age=300"})
 
 
 @router.get("/cover/{key:path}")

@@ -18,8 +18,7 @@ from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
-from tupli_mcap.page.python import both, python_line
-from tupli_mcap.page.shelf import Shelf, find_episode, seen_episodes
+from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
 
@@ -109,7 +108,7 @@ def episodes(
     link = functools.partial(_link, dataset=dataset, filter=filter, sort=sort)
     return page(
         request, "episodes.html", facts, status=status, shelf=shelf, dataset=of, table=table, filter=filter, sort=sort,
-        link=link, most_compared=MOST_COMPARED, python=python_line(shelf, both(dataset_filter(dataset), filter), sort),
+        link=link, most_compared=MOST_COMPARED, python=python_line(shelf, _both(dataset_filter(dataset), filter), sort),
     )  # fmt: skip
 
 
@@ -158,6 +157,12 @@ def table_of(
         before=rows[0].id if rows and (after or (before and more)) else None,
         after=rows[-1].id if rows and (before or more) else None,
     )
+
+
+def _both(a: str, b: str) -> str:
+    """A filter that is true where two are."""
+    given = [text for text in (a, b) if text.strip()]
+    return given[0] if len(given) == 1 else " and ".join(f"({text})" for text in given)
 
 
 def _common_keys(rows: Sequence[EpisodeHeader]) -> list[str]:

@@ -7,10 +7,10 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 
-from tupli_mcap.errors import NotFoundError
-from tupli_mcap.page.answers import POLICY, PageRoute, Shown, address, page
+from tupli_mcap.errors import NotFoundError, TupliError
+from tupli_mcap.page.answers import POLICY, PageRoute, Shown, address, error_page, page
 from tupli_mcap.page.copies import replay_file, sent
-from tupli_mcap.page.shelf import find_some
+from tupli_mcap.page.shelf import Shelf, find_some
 from tupli_mcap.page.viewer_files import NAMES, viewer_file, viewer_version
 
 __all__ = ["router"]
@@ -25,15 +25,22 @@ _VIEWER_POLICY: Final = POLICY.replace("frame-ancestors 'none'", "frame-ancestor
 
 @router.get("/viewer")
 def viewer(request: Request, shelf: Shown, uris: _Ids) -> Response:
-    """A page with nothing but the viewer."""
+    """A page with nothing but the viewer; errors are shown in its place."""
+    try:
+        response = _viewer_page(request, shelf, uris)
+    except TupliError as err:
+        response = error_page(request, err)
+    response.headers["Content-Security-Policy"] = _VIEWER_POLICY
+    return response
+
+
+def _viewer_page(request: Request, shelf: Shelf, uris: list[str]) -> Response:
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
     replay = address("replay.rrd", episode=[header.id for header in headers])
     facts = {"replay": replay, "viewer": viewer_version()}
-    response = page(
+    return page(
         request, "viewer.html", facts, shelf=shelf, replay=replay, files=f"/viewer/{viewer_version()}"
     )
-    response.headers["Content-Security-Policy"] = _VIEWER_POLICY
-    return response
 
 
 @router.get("/viewer/{number}/{name}")
