@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import functools
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -89,7 +90,7 @@ def test_a_recording_comes_back_bit_for_bit_in_any_part(place: Place, large: Pat
     name, data = place.admin.push(large), large.read_bytes()
     told = place.admin._session.ask("POST", "/v1/tickets", {"recording": name})
     url, size = place.url + told["path"], len(data)
-    get = httpx.Client(follow_redirects=True).get
+    get = functools.partial(httpx.get, follow_redirects=True)
     whole = get(url)
     assert hashlib.sha256(whole.content).hexdigest() == told["digest"] == hashlib.sha256(data).hexdigest()
     tag = whole.headers["ETag"]
@@ -105,6 +106,9 @@ def test_a_recording_comes_back_bit_for_bit_in_any_part(place: Place, large: Pat
     assert get(url, headers={"If-Match": '"another"'}).status_code == 412
     with place.admin.open_recording(name) as sent, Recording(large) as original:
         assert np.array_equal(sent.read().states, original.read().states)
+        with place.admin.downloaded(name, len(original)) as fetched:
+            assert fetched is not None
+            assert fetched.read_bytes() == data
     if not place.bucket:
         head = httpx.head(url)
         assert (head.status_code, head.headers["Content-Length"], head.headers["ETag"]) == (

@@ -101,6 +101,10 @@ if hasattr(os, "register_at_fork"):
     )
 
 
+class LockedError(RecordingError):
+    """Somebody else writes to the recording."""
+
+
 class FileLock:
     """A recording opened for writing and locked; `fd` is the descriptor to write with.
 
@@ -268,7 +272,7 @@ def _lock(fd: int, path: Path) -> None:
             if err.errno not in _BUSY:
                 raise RecordingError(f"{path} cannot be locked: {os_reason(err)}") from err
             if time.monotonic() > deadline or not _try_shared(fd):
-                raise RecordingError(f"{path} is being recorded by another writer; close it first") from err
+                raise LockedError(f"{path} is being recorded by another writer; close it first") from err
         time.sleep(0.001)
 
 

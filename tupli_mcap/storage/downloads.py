@@ -128,6 +128,9 @@ def _fetch(
         fcntl.flock(fd, fcntl.LOCK_EX)
         if not _is_at(fd, part):  # another one has finished it, or it was deleted
             return
+        if path.exists():  # another one had finished it before this one was made
+            part.unlink()
+            return
         with os.fdopen(os.dup(fd), "r+b") as file:
             tell(file.seek(0, os.SEEK_END))
             for piece in pieces(file.tell()):

@@ -152,9 +152,7 @@ def _copy_recording(
 def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: str) -> Iterator[Path]:
     """A file with these episodes of a recording and no others: its own, where it is that."""
     if isinstance(source, TupliAPIClient):
-        of_it = FilterEQ(key="recording", value=name)
-        whole = len(numbers) == source.count_episodes(of_it)
-        with source.downloaded(name, place) if whole else contextlib.nullcontext() as path:
+        with source.downloaded(name, len(numbers), place) as path:
             if path is not None:
                 yield path
                 return

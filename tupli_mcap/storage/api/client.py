@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import base64
-import contextlib
-import os
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
-from tupli_mcap.mcap.source import TemporarySource
-from tupli_mcap.progress import progress
-from tupli_mcap.recording import Recording, write_recording
-from tupli_mcap.remote import is_cut_cheaper
+from tupli_mcap.recording import write_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -34,11 +29,12 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
+from tupli_mcap.storage.api.answers import as_told
 from tupli_mcap.storage.api.outbox import Outbox, Waiting, outbox_of
 from tupli_mcap.storage.api.people import People
-from tupli_mcap.storage.api.session import Session, as_told, pages
-from tupli_mcap.storage.api.upload import Tell, send_file
-from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.api.recordings import Recordings
+from tupli_mcap.storage.api.session import Session, pages
+from tupli_mcap.storage.api.upload import Tell
 from tupli_mcap.storage.base import TupliStorage, anew, published_in
 from tupli_mcap.storage.benchmark_json import declared_spaces, plain, recording_attachments
 from tupli_mcap.storage.downloads import fetched
@@ -52,7 +48,7 @@ _Model = TypeVar("_Model", bound=BaseModel)
 _EPISODE_ID: Final = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 
 
-class TupliAPIClient(People, TupliStorage):
+class TupliAPIClient(People, Recordings, TupliStorage):
     """A storage on the server at `url`: `tupli-mcap serve` starts one.
 
     Without a URL it is that of TUPLI_MCAP_URL, of the last `login` or `set_url`, or of this machine. What is recorded
@@ -133,13 +129,18 @@ class TupliAPIClient(People, TupliStorage):
         plain(benchmark_query.metadata)
         told = {**dict(benchmark_query), "metadata": benchmark_query.metadata.model_dump()}
         stored = as_told(BenchmarkHeader, self._session.ask("POST", "/v1/benchmarks", told, repeat=True))
-        self._benchmarks[stored.id] = Benchmark(**{**dict(stored), "serialized": benchmark_query.serialized})
+        self._note(Benchmark(**{**dict(stored), "serialized": benchmark_query.serialized}))
         return stored
 
     def load_benchmark(self, uri: str) -> Benchmark:
         found = as_told(Benchmark, self._session.ask("GET", f"/v1/benchmarks/{_hash(uri, 'benchmark')}"))
-        self._benchmarks[found.id] = found
+        self._note(found)
         return found
+
+    def _note(self, benchmark: Benchmark) -> None:
+        """Notes what recording asks for, when the server may be away: a benchmark, and who records."""
+        self._benchmarks[benchmark.id] = benchmark
+        outbox_of(self._session)
 
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
         return self._listed("/v1/benchmarks/list", BenchmarkHeader, _listing(filter, BenchmarkHeader))
@@ -300,67 +301,6 @@ class TupliAPIClient(People, TupliStorage):
     def ingest(self, path: Path) -> None:
         self._outbox.send(path)
 
-    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
-        if not isinstance(recording, str):
-            raise NotFoundError(
-                f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
-            )
-        ticket = self._ticket(recording)
-        if ticket.whole and not is_cut_cheaper(episodes, ticket.episodes, ticket.size):
-            return Recording(self.url + ticket.path)
-        return self._cut(recording, episodes)
-
-    def _cut(self, recording: str, episodes: Sequence[int] | None) -> Recording:
-        """A recording of some episodes of another one, which the server makes; here it is a file while it is open."""
-        asked = {"recordings": [recording], "episodes": None if episodes is None else list(episodes)}
-        handle, name = tempfile.mkstemp(prefix="tupli-mcap-", suffix=".mcap")
-        place = Path(name)
-        try:
-            with os_errors("cannot write", place), os.fdopen(handle, "wb") as file:
-                self._session.fetch("/v1/query", asked, file)
-            source = TemporarySource(place, recording)
-        except BaseException:
-            place.unlink()
-            raise
-        return Recording(source)
-
-    @contextlib.contextmanager
-    def downloaded(self, recording: str, what: str = "") -> Iterator[Path | None]:
-        """The file of a recording, valid in the block; None where not all of it may be read. `what` is part of a
-        progress bar's text.
-
-        Raises:
-            NotFoundError: there is no such recording, or another file has taken its place meanwhile.
-            FormatError: its bytes are not those that the server has named.
-        """
-        ticket = self._ticket(recording)
-        if not ticket.whole:
-            yield None
-            return
-
-        def pieces(start: int) -> Iterator[bytes]:
-            return self._session.stream(ticket.path, start, headers={"If-Match": f'"{ticket.digest}"'})
-
-        with contextlib.ExitStack() as stack:
-            with progress(ticket.size, f"fetching {what}", in_bytes=True) as bar:
-                kept = fetched(ticket.digest, pieces, digest=ticket.digest, tell=bar.advance)
-                path = stack.enter_context(kept)
-            yield path
-
-    def _ticket(self, recording: str) -> _Ticket:
-        asked = {"recording": recording}
-        return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
-
-    def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
-        """Store a recording that lies here; returns the name that `open_recording` takes. `tell` is told of bytes sent.
-
-        Stored twice, nothing changes; stored again after it has grown, it takes the place of the earlier one.
-
-        Raises:
-            StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
-        """
-        return send_file(self._session, Path(path), tell=tell)
-
     def declare_key(self, key: str) -> None:
         path_in(key, EpisodeHeader)
         self._session.ask("POST", "/v1/episodes/keys", {"key": key})
@@ -398,14 +338,6 @@ class TupliAPIClient(People, TupliStorage):
 
     def _unpublish(self, kind: str, uri: str, group: str) -> None:
         self._session.ask("DELETE", f"/v1/{kind}/{uri}/published", group=group)
-
-
-class _Ticket(BaseModel):
-    path: str = Field(pattern="^/v1/files/")
-    whole: bool
-    digest: str = Field(pattern="^[0-9a-f]{64}$")
-    size: int
-    episodes: int
 
 
 def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:

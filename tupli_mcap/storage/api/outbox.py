@@ -30,11 +30,13 @@ from typing import Final, NamedTuple
 import platformdirs
 
 from tupli_mcap import files
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.mcap.lock import LockedError, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
-from tupli_mcap.storage.api.session import ConflictError, Session, SignInError, UnreachableError
+from tupli_mcap.storage.api.answers import ConflictError, SignInError, UnreachableError
+from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
-from tupli_mcap.storage.api.waiting import BusyError, finished, kept, note, numbers_of, sent_before, state_of
+from tupli_mcap.storage.api.waiting import finished, note, numbers_of, sent_before, state_of
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.catalog.entries import rows_of
 from tupli_mcap.storage.sidecar import Sidecar
@@ -214,10 +216,15 @@ class Outbox:
                     return
                 if state == "unfinished":
                     path = finished(path)
-                with contextlib.suppress(BusyError), kept(path):
-                    self._send_whole(path, tell)
+                try:
+                    with writers_kept_out(path):
+                        self._send_whole(path, tell)
                     return
-                time.sleep(_POLL)
+                except LockedError:  # another process sends it
+                    time.sleep(_POLL)
+                except RecordingError:
+                    if path.exists():  # else another process has sent it
+                        raise
 
     def _send_whole(self, path: Path, tell: Tell) -> None:
         before = sent_before(path)

@@ -17,7 +17,8 @@ from tupli_mcap.schema import (
     UserOut,
     UserRole,
 )
-from tupli_mcap.storage.api.session import Session, SignInError, as_told
+from tupli_mcap.storage.api.answers import SignInError, as_told
+from tupli_mcap.storage.api.session import Session
 
 __all__ = ["People"]
 

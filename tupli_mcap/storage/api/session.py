@@ -4,61 +4,36 @@ where asking twice is as asking once."""
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import re
 import time
 import weakref
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
-
-from tupli_mcap import errors, jsonvalue, trust
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError, missing_extra
+from tupli_mcap import jsonvalue, trust
+from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
 from tupli_mcap.remote import shown
+from tupli_mcap.storage.api.answers import LATER, Page, UnreachableError, as_told, error_of
 from tupli_mcap.storage.api.tokens import TokenStore
-from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
     import httpx
 
-__all__ = [
-    "DEFAULT_URL",
-    "TIMEOUT",
-    "ConflictError",
-    "Session",
-    "SignInError",
-    "UnreachableError",
-    "as_told",
-    "pages",
-]
+__all__ = ["DEFAULT_URL", "TIMEOUT", "Session", "pages"]
 
 DEFAULT_URL: Final = "http://127.0.0.1:8080"
 TIMEOUT: Final = 60.0  # seconds without a byte
 _CONNECT_TIMEOUT: Final = 10.0
 _ATTEMPTS: Final = 4  # of a request that changes nothing when it is sent twice
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
+_MOST_REDIRECTIONS: Final = 3
 _NOTHING_LEFT: Final = 416  # there is nothing from that offset on
-_LATER: Final = (423, 429, 500, 502, 503, 504)
 _URL_VARIABLE: Final = "TUPLI_MCAP_URL"
 _TOKEN_VARIABLE: Final = "TUPLI_MCAP_TOKEN"
-_T = TypeVar("_T")
 _users: dict[tuple[str, str], str] = {}  # by server and token of the environment
-
-
-class UnreachableError(StorageError):
-    """The server does not answer, or not now."""
-
-
-class ConflictError(StorageError):
-    """Something else is there already."""
-
-
-class SignInError(StorageError):
-    """Nobody is signed in."""
 
 
 class Session:
@@ -216,7 +191,7 @@ class Session:
         if response.status_code >= 400 and not (stream and response.status_code == _NOTHING_LEFT):
             with contextlib.closing(response):
                 response.read()
-                raise self._error(response, anonymous)
+                raise error_of(response, shown(self.url), signed_in=not anonymous)
         return response
 
     def _sent(
@@ -237,13 +212,10 @@ class Session:
         last = (_ATTEMPTS if (method in _SAFE if repeat is None else repeat) else 1) - 1
         for attempt in range(last + 1):
             try:
-                client = self.client
-                request = client.build_request(method, path, headers=headers, **options)
-                # To a bucket, without the token; nothing that is sent goes elsewhere.
-                response = client.send(request, stream=stream, follow_redirects=method == "GET")
+                response = self._answered(method, path, stream, headers=headers, **options)
                 if attempt and method == "DELETE" and response.status_code == 404:
                     return httpx.Response(204)  # it was deleted, and the answer was lost
-                if attempt == last or response.status_code not in _LATER:
+                if attempt == last or response.status_code not in LATER:
                     return response
                 response.close()
             except httpx.TransportError as err:
@@ -251,6 +223,19 @@ class Session:
                     raise self._unreachable(err) from None
             time.sleep(0.2 * 2**attempt)
         raise UnreachableError(f"{shown(self.url)} does not answer")
+
+    def _answered(self, method: str, path: str, stream: bool, **options: Any) -> httpx.Response:
+        """The answer to a request; to a GET that of the bucket to which it is sent on, which is told no token."""
+        client = self.client
+        response = client.send(client.build_request(method, path, **options), stream=stream)
+        for _ in range(_MOST_REDIRECTIONS):
+            further = response.next_request
+            if further is None or method != "GET":
+                break
+            further.headers.pop("If-Match", None)  # the bucket has tags of its own
+            response.close()
+            response = client.send(further, stream=stream)
+        return response
 
     def _unreachable(self, err: Exception) -> UnreachableError:
         why = str(err) or type(err).__name__
@@ -306,37 +291,6 @@ class Session:
     def _token(self) -> str:
         return os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
 
-    def _error(self, response: httpx.Response, anonymous: bool) -> TupliError:
-        """The error that the server tells, of the class that a storage here would raise."""
-        status = response.status_code
-        try:
-            told = json.loads(response.content)
-            detail, name = str(told["detail"]), str(told.get("error", ""))
-        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            detail, name = f"it answers {status}", ""
-        detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
-        message = f"{detail} (says {shown(self.url)})"
-        if status == 401 and not anonymous:
-            return SignInError(f"{message}; sign in: tupli-mcap login USER --url {shown(self.url)}")
-        if status in (410, 460, *_LATER) or "Upload-Offset" in response.headers:
-            return UnreachableError(f"{message}; try again later")
-        if status == 409:
-            return ConflictError(message)
-        kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError
-        if not issubclass(kind, TupliError) or kind is TupliError:
-            kind = NotFoundError if status in (404, 412) else StorageError
-        return kind(message)
-
-
-def as_told(kind: type[_T], value: Any) -> _T:
-    """What a server tells, as a model, or a list of them. StorageError if it is something else."""
-    try:
-        return TypeAdapter(kind).validate_python(value)
-    except ValidationError as err:
-        raise StorageError(
-            f"expected {getattr(kind, '__name__', kind)} from the server, found something else: {first_defect(err)}"
-        ) from err
-
 
 class _NoTickets(logging.Filter):
     """httpx logs addresses; that of a recording opens it for whoever reads the log."""
@@ -370,14 +324,9 @@ def pages(session: Session, path: str, asked: dict[str, Any]) -> Iterator[dict[s
     """All that is listed, a page at a time; `limit` and `offset` in `asked` are of the whole."""
     left = asked.get("limit")
     while True:
-        page = as_told(_Page, session.ask("POST", path, {**asked, "limit": left}, repeat=True))
+        page = as_told(Page, session.ask("POST", path, {**asked, "limit": left}, repeat=True))
         yield from page.items
         left = None if left is None else left - len(page.items)
         if page.next is None or left == 0:
             return
         asked = {**asked, "cursor": page.next, "offset": 0}
-
-
-class _Page(BaseModel):
-    items: list[dict[str, Any]]
-    next: str | None

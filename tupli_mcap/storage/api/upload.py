@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from tupli_mcap.storage.api.session import TIMEOUT, Session, UnreachableError
+from tupli_mcap.storage.api.answers import UnreachableError
+from tupli_mcap.storage.api.session import TIMEOUT, Session
 from tupli_mcap.storage.atomic import os_errors
 
 __all__ = ["Tell", "send_file"]

@@ -6,40 +6,20 @@ from __future__ import annotations
 import contextlib
 import json
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.mcap.lock import is_locked, writers_kept_out
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.recording import Recording, finish_recording, journal_path, recover_recording
 
-__all__ = ["BusyError", "finished", "kept", "note", "numbers_of", "sent_before", "state_of"]
-
-
-class BusyError(Exception):
-    """Another process has the recording."""
-
-
-@contextlib.contextmanager
-def kept(path: Path) -> Iterator[None]:
-    """Keeps a finished recording from writers and other senders; BusyError while there is one, or if it is gone."""
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(writers_kept_out(path))
-        except RecordingError as err:
-            if not path.exists() or is_locked(path):
-                raise BusyError from err
-            raise
-        yield
+__all__ = ["finished", "note", "numbers_of", "sent_before", "state_of"]
 
 
 def state_of(path: Path) -> str:
     """`recording` while somebody writes to it, else `finished` or `unfinished`."""
-    with contextlib.suppress(
-        RecordingError, FormatError
-    ):  # the latter where it is gone on with at this moment
+    with contextlib.suppress(RecordingError, FormatError):  # where it is gone on with at this moment
         source = PathSource(path)
         try:
             if has_summary(source):

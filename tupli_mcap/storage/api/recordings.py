@@ -1,0 +1,99 @@
+"""Recordings on a server, read in place, fetched and sent: methods of `TupliAPIClient`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from pydantic import BaseModel, Field
+
+from tupli_mcap.errors import NotFoundError
+from tupli_mcap.mcap.source import TemporarySource
+from tupli_mcap.progress import progress
+from tupli_mcap.recording import Recording
+from tupli_mcap.remote import is_cut_cheaper
+from tupli_mcap.storage.api.answers import as_told
+from tupli_mcap.storage.api.session import Session
+from tupli_mcap.storage.api.upload import Tell, send_file
+from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.downloads import fetched
+
+__all__ = ["Recordings"]
+
+
+class Recordings:
+    """What a client does with the files of a server."""
+
+    _session: Session
+
+    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        if not isinstance(recording, str):
+            raise NotFoundError(
+                f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
+            )
+        ticket = self._ticket(recording)
+        if ticket.whole and not is_cut_cheaper(episodes, ticket.episodes, ticket.size):
+            return Recording(self._session.url + ticket.path)
+        return self._cut(recording, episodes)
+
+    def _cut(self, recording: str, episodes: Sequence[int] | None) -> Recording:
+        """A recording of some episodes of another one, which the server makes; here it is a file while it is open."""
+        asked = {"recordings": [recording], "episodes": None if episodes is None else list(episodes)}
+        handle, name = tempfile.mkstemp(prefix="tupli-mcap-", suffix=".mcap")
+        place = Path(name)
+        try:
+            with os_errors("cannot write", place), os.fdopen(handle, "wb") as file:
+                self._session.fetch("/v1/query", asked, file)
+            source = TemporarySource(place, recording)
+        except BaseException:
+            place.unlink()
+            raise
+        return Recording(source)
+
+    @contextlib.contextmanager
+    def downloaded(self, recording: str, episodes: int, what: str = "") -> Iterator[Path | None]:
+        """The file of a recording, valid in the block; None where it has other than so many episodes that may be read.
+        `what` is part of a progress bar's text.
+
+        Raises:
+            NotFoundError: there is no such recording, or another file has taken its place meanwhile.
+            FormatError: its bytes are not those that the server has named.
+        """
+        ticket = self._ticket(recording)
+        if not ticket.whole or ticket.episodes != episodes:
+            yield None
+            return
+
+        def pieces(start: int) -> Iterator[bytes]:
+            return self._session.stream(ticket.path, start, headers={"If-Match": f'"{ticket.digest}"'})
+
+        with contextlib.ExitStack() as stack:
+            with progress(ticket.size, f"fetching {what}", in_bytes=True) as bar:
+                kept = fetched(ticket.digest, pieces, digest=ticket.digest, tell=bar.advance)
+                path = stack.enter_context(kept)
+            yield path
+
+    def _ticket(self, recording: str) -> _Ticket:
+        asked = {"recording": recording}
+        return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
+
+    def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
+        """Store a recording that lies here; returns the name that `open_recording` takes. `tell` is told of bytes sent.
+
+        Stored twice, nothing changes; stored again after it has grown, it takes the place of the earlier one.
+
+        Raises:
+            StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
+        """
+        return send_file(self._session, Path(path), tell=tell)
+
+
+class _Ticket(BaseModel):
+    path: str = Field(pattern="^/v1/files/")
+    whole: bool
+    digest: str = Field(pattern="^[0-9a-f]{64}$")
+    size: int
+    episodes: int
