@@ -47,7 +47,8 @@ READING = {
     ("GET", "/v1/roles"), ("POST", "/v1/benchmarks/list"), ("GET", "/v1/benchmarks/{uri}"),
     ("POST", "/v1/artifacts/list"), ("GET", "/v1/artifacts/{uri}"), ("GET", "/v1/artifacts/{uri}/users"),
     ("POST", "/v1/episodes/list"), ("POST", "/v1/episodes/count"), ("POST", "/v1/tickets"),
-    ("POST", "/v1/query"), ("GET", "/v1/files/{name}"), ("HEAD", "/v1/files/{name}"), ("GET", "/v1/episodes/{uri}.rrd"),
+    ("POST", "/v1/query"), ("POST", "/v1/query/tickets"), ("GET", "/v1/manifest"), ("GET", "/v1/data"),
+    ("GET", "/v1/files/{name}"), ("HEAD", "/v1/files/{name}"), ("GET", "/v1/episodes/{uri}.rrd"),
     ("GET", "/access/users/list"), ("GET", "/access/groups/list"), ("GET", "/access/groups/read"),
     ("GET", "/access/roles/list"), ("GET", "/benchmarks/load"), ("POST", "/benchmarks/list"),
     ("GET", "/artifacts/download"), ("POST", "/artifacts/list"), ("POST", "/episodes/list"),
@@ -83,6 +84,7 @@ PARAMETERS = {
         ("benchmark_id", "artifact_id", "episode_id", "username", "group_name", "role_name"), "x"
     ),
     **dict.fromkeys(("group", "publish_in", "unpublish_from"), "global"),
+    "id": "x",
 }
 HEADERS = {
     "Artifact-Metadata": base64.b64encode(b'{"name": "x"}').decode(),

@@ -15,7 +15,7 @@ from tupli_mcap.page.routes import PAGES
 from tupli_mcap.server import pages
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages.session import shelf_of
-from tupli_mcap.server.routes import accounts, episodes, items, pytupli, query, recordings, viewers
+from tupli_mcap.server.routes import accounts, episodes, foxglove, items, pytupli, query, recordings, viewers
 from tupli_mcap.server.wire import Error, tell_errors, told
 
 __all__ = ["create_app"]
@@ -44,7 +44,7 @@ def create_app(library: Library) -> FastAPI:
     )
     app.state.library = library
     app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
-    for routes in (accounts, items, episodes, query, recordings, viewers, pytupli):
+    for routes in (accounts, items, episodes, query, recordings, viewers, foxglove, pytupli):
         app.include_router(routes.router, responses=_REFUSALS)  # type: ignore[arg-type]
     tell_errors(app)
     app.state.shelf_of, app.state.kept, app.state.told = shelf_of, OpenedRecordings(), told

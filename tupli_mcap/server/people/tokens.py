@@ -3,7 +3,7 @@
 access    short-lived, signed (JWT), void after a change of the password
 refresh   kept as a digest, used once for a new pair; used twice, the whole sign-in is ended
 API       kept as a digest, for machines: reading, or reading and writing
-ticket    signed, for one recording
+ticket    signed, for one recording or query
 """
 
 from __future__ import annotations
@@ -159,14 +159,14 @@ class Tokens:
 
     # --- tickets ---
 
-    def ticket(self, user: str, recording: str) -> str:
-        """What opens one recording, as this user may read it, for as long as the settings say."""
-        return self._signed("ticket", self._settings.ticket_seconds, sub=user, recording=recording)
+    def ticket(self, user: str, **what: Any) -> str:
+        """What opens a `recording`, or what a `query` means, as this user may read it, for a while."""
+        return self._signed("ticket", self._settings.ticket_seconds, sub=user, **what)
 
-    def of_ticket(self, ticket: str) -> tuple[str, str]:
-        """Who was given a ticket, and for which recording. Raises SignInError if it is none, or has expired."""
+    def of_ticket(self, ticket: str) -> tuple[str, dict[str, Any]]:
+        """Who was given a ticket, and what it opens. Raises SignInError if it is none, or has expired."""
         told = self._told(ticket, "ticket")
-        return str(told.get("sub")), str(told.get("recording"))
+        return str(told.get("sub")), told
 
     def _signed(self, kind: str, seconds: int, **told: Any) -> str:
         return jwt.encode(

@@ -7,5 +7,6 @@ episodes     episodes: listed, counted, published, deleted
 query        episodes of any recordings as one recording
 recordings   recordings: sent, fetched
 viewers      what viewers open
+foxglove     what Foxglove's remote data loader asks
 pytupli      PyTupli's own routes
 """

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import Depends, Query, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -65,14 +66,14 @@ Writer = Annotated[Caller, Depends(_writer)]
 
 
 class Holder(NamedTuple):
-    """Who reads what an address shows: somebody who is signed in, or was given a ticket for one `recording`."""
+    """Who reads what an address shows: somebody who is signed in, or was given a ticket, which says what it opens."""
 
     caller: Caller
-    recording: str | None
+    ticket: Mapping[str, Any] | None
 
     def of(self, recording: str) -> Caller:
-        """Who reads a recording. Raises SignInError if the ticket is for another one."""
-        if self.recording not in (None, recording):
+        """Who reads a recording. Raises SignInError if the ticket is for something else."""
+        if self.ticket is not None and self.ticket.get("recording") != recording:
             raise SignInError("the ticket is for another recording; open it again")
         return self.caller
 
@@ -82,12 +83,12 @@ def _holder(
 ) -> Holder:
     if ticket is None:
         return Holder(_reader(library, caller), None)
-    user, recording = library.tokens.of_ticket(ticket)
+    user, what = library.tokens.of_ticket(ticket)
     with library.database.reading() as connection:
         found = accounts.caller_named(connection, user) or accounts.guest(connection)
     if found.is_guest and not library.settings.guests:
         raise SignInError("the ticket is not valid any more")
-    return Holder(found, recording)
+    return Holder(found, what)
 
 
 TicketHolder = Annotated[Holder, Depends(_holder)]

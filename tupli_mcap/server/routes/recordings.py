@@ -30,6 +30,10 @@ __all__ = ["router"]
 router = APIRouter(prefix="/v1", tags=["recordings"])
 _TUS = {"Tus-Resumable": "1.0.0"}
 _MEDIA = "application/octet-stream"
+_FOR_VIEWERS = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
+}
 _PIECE = 1 << 20  # bytes that are written at once
 
 
@@ -170,7 +174,7 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
     """An address at which programs that cannot sign in may read a recording for a while."""
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, told.recording)
-    ticket = library.tokens.ticket(caller.name, found.name)
+    ticket = library.tokens.ticket(caller.name, recording=found.name)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
     return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
 
@@ -191,4 +195,7 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
     if not found.whole:
         return Response() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]
-    return body_of(library, request, found.place, digest=found.digest, file_name=file_name)
+    body = body_of(library, request, found.place, digest=found.digest, file_name=file_name)
+    if holder.ticket is not None:  # which is no secret of the page that has it
+        body.headers.update(_FOR_VIEWERS)
+    return body
