@@ -33,7 +33,8 @@ class Bucket:
 
     def names(self) -> list[str]:
         """The names of all objects."""
-        found = boto3.client("s3").list_objects_v2(Bucket=self.name)
+        with contextlib.closing(boto3.client("s3")) as client:
+            found = client.list_objects_v2(Bucket=self.name)
         return [each["Key"] for each in found.get("Contents", [])]
 
 
@@ -47,7 +48,8 @@ def bucket() -> Iterator[Bucket]:
             "AWS_ENDPOINT_URL": made.address, "AWS_ALLOW_HTTP": "true",
         }.items():  # fmt: skip
             patch.setenv(key, value)
-        boto3.client("s3").create_bucket(Bucket=made.name)
+        with contextlib.closing(boto3.client("s3")) as client:
+            client.create_bucket(Bucket=made.name)
         try:
             yield made
         finally:

@@ -12,19 +12,21 @@ import uvicorn
 
 from tupli_mcap.server.app import create_app
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.run import Listening, configured
 from tupli_mcap.server.settings import Settings
 
 PASSWORD = "correct horse battery staple"
 
 
 @contextlib.contextmanager
-def serving(settings: Settings) -> Iterator[str]:
+def serving(settings: Settings, listening: Listening | None = None) -> Iterator[str]:
     """Serves in a thread; gives the address. The admin's password is PASSWORD."""
     with pytest_environment("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD):
         library = Library(settings)
         library.first_password()
         library.adopt()
-    config = uvicorn.Config(create_app(library), host="127.0.0.1", port=0, log_level="warning")
+    config = configured(lambda: create_app(library), settings, listening or Listening())
+    config.port = 0
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

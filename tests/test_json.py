@@ -170,6 +170,8 @@ list-tokens: list-tokens
 delete-token: delete-token {token}
 delete-user: delete-user ann
 push: push --dry-run
+backup-server: backup-server served -o backup
+restore-server: restore-server backup again
 logout: logout
 """
 EMPTY = {

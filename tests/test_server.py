@@ -33,7 +33,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 
 FOR_ALL = {
-    ("GET", "/"), ("GET", "/health"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
+    ("GET", "/"), ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
     ("POST", "/v1/tokens/end"), ("POST", "/access/users/token"),
 }  # fmt: skip
 OTHERWISE = {
@@ -43,6 +43,7 @@ OTHERWISE = {
 }
 """What guests are told there: routes that ask for rights, or for a token of another kind."""
 READING = {
+    ("GET", "/metrics"),
     ("GET", "/v1/me"), ("GET", "/v1/users"), ("GET", "/v1/groups"), ("GET", "/v1/groups/{name}"),
     ("GET", "/v1/roles"), ("POST", "/v1/benchmarks/list"), ("GET", "/v1/benchmarks/{uri}"),
     ("POST", "/v1/artifacts/list"), ("GET", "/v1/artifacts/{uri}"), ("GET", "/v1/artifacts/{uri}/users"),
@@ -149,7 +150,8 @@ def call(url: str, method: str, path: str, headers: dict[str, str], **names: str
     if path == "/artifacts/upload":
         form: dict[str, Any] = {"files": {"data": b"x"}, "data": {"metadata": '{"name": "x"}'}}
         return httpx.post(target, headers=headers, **form)
-    return httpx.request(method, target, headers={**HEADERS, **headers}, json=body, params=PARAMETERS)
+    told: dict[str, Any] = {"headers": {**HEADERS, **headers}, "json": body, "params": PARAMETERS}
+    return httpx.request(method, target, **told, timeout=120)  # a viewer may be loaded first
 
 
 # --- every route ---

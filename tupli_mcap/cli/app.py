@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
-from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust
+from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust, upkeep
 from tupli_mcap.cli.terminal import (
     fail,
     flush,
@@ -265,6 +265,8 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "pull": exchange.pull,
         "publish": exchange.publish,
         "unpublish": exchange.unpublish,
+        "backup-server": upkeep.backup_server,
+        "restore-server": upkeep.restore_server,
     },
     "People": {
         "list-users": people.list_users,

@@ -10,6 +10,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from sqlalchemy import Connection, Engine, create_engine, delete, event, insert, select
 from sqlalchemy.exc import (
@@ -25,10 +26,23 @@ from tupli_mcap.errors import StorageError
 from tupli_mcap.server import migrations, tables
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["Database", "UnavailableError", "audience", "audit", "demand_pending", "pend", "pending", "settle"]
+__all__ = [
+    "Database",
+    "TooLongError",
+    "UnavailableError",
+    "audience",
+    "audit",
+    "demand_pending",
+    "pend",
+    "pending",
+    "settle",
+]
 
 _BUSY_MS = 30_000
-_WRITERS = 0x7475_706C  # the number of the lock that a writer holds on PostgreSQL
+_STEPS = 20_000  # of SQLite, between two looks at the clock
+_CANCELED = "57014"  # what PostgreSQL says of a statement that took too long
+# A writer on PostgreSQL holds this lock, and its statements may take their time.
+_ALONE = "SELECT set_config('statement_timeout', '0', true), pg_advisory_xact_lock(1953854572)"
 _MOST_GROUPS_BYTES = 2000  # PostgreSQL indexes no longer texts
 
 
@@ -36,15 +50,22 @@ class UnavailableError(StorageError):
     """What the server keeps things in does not answer, or is busy; asked again later, it may."""
 
 
+class TooLongError(StorageError):
+    """A question takes longer than it may."""
+
+
 class Database:
     """Transactions on the tables of a server, from any thread.
+
+    seconds: how long a question may take, also one in a transaction that writes; more is a TooLongError.
 
     Raises:
         StorageError: the database cannot be opened, or is of a later version.
     """
 
-    def __init__(self, url: str) -> None:
-        self._engine = _engine(url)
+    def __init__(self, url: str, seconds: float = 30.0) -> None:
+        self._seconds = seconds
+        self._engine = _engine(url, seconds)
         try:
             with self.writing() as connection:
                 migrations.upgrade(connection)
@@ -56,9 +77,11 @@ class Database:
     def reading(self) -> Iterator[Connection]:
         """A transaction that changes nothing."""
         with _translated(), self._engine.connect() as connection:
+            deadline = time.monotonic() + self._seconds
+            connection.execution_options(tupli_deadline=deadline)
             if connection.dialect.name == "postgresql":
                 connection.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
-            with connection.begin():
+            with connection.begin(), _interrupted(connection, deadline):
                 yield connection
 
     @contextlib.contextmanager
@@ -68,7 +91,8 @@ class Database:
             connection.execution_options(tupli_write=True)
             with connection.begin():
                 if connection.dialect.name == "postgresql":
-                    connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_WRITERS})")
+                    connection.exec_driver_sql(_ALONE)
+                connection.execution_options(tupli_deadline=time.monotonic() + self._seconds)
                 yield connection
 
     def close(self) -> None:
@@ -127,9 +151,9 @@ def demand_pending(connection: Connection, name: str) -> None:
         raise UnavailableError(f"{name} took too long to come; send it again")
 
 
-def _engine(url: str) -> Engine:
+def _engine(url: str, seconds: float) -> Engine:
     try:
-        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"))
+        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
     except (SQLAlchemyError, ImportError) as err:
         raise StorageError(
             f"the database cannot be used: {err}; give a URL such as postgresql+psycopg://…"
@@ -139,7 +163,10 @@ def _engine(url: str) -> Engine:
             f"expected a database of SQLite or PostgreSQL, found {engine.dialect.name}; "
             "give a URL such as postgresql+psycopg://…"
         )
-    (_prepare_sqlite if engine.dialect.name == "sqlite" else _prepare_postgresql)(engine)
+    if engine.dialect.name == "sqlite":
+        _prepare_sqlite(engine)
+    else:
+        _prepare_postgresql(engine, seconds)
     return engine
 
 
@@ -158,11 +185,26 @@ def _prepare_sqlite(engine: Engine) -> None:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
 
-def _prepare_postgresql(engine: Engine) -> None:
+def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     @event.listens_for(engine, "do_connect")
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
-        kwargs["options"] = f"{kwargs.get('options', '')} -c lock_timeout={_BUSY_MS}"
+        limits = f"-c lock_timeout={_BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
+        kwargs["options"] = f"{kwargs.get('options', '')} {limits}"
+
+
+@contextlib.contextmanager
+def _interrupted(connection: Connection, deadline: float) -> Iterator[None]:
+    """Ends statements of SQLite at a time; PostgreSQL does so by itself."""
+    driver: Any = connection.connection.dbapi_connection
+    if not isinstance(driver, sqlite3.Connection):
+        yield
+        return
+    driver.set_progress_handler(lambda: time.monotonic() > deadline, _STEPS)
+    try:
+        yield
+    finally:
+        driver.set_progress_handler(None, 0)
 
 
 @contextlib.contextmanager
@@ -174,6 +216,10 @@ def _translated() -> Iterator[None]:
     except IntegrityError as err:
         raise StorageError(f"this contradicts what is stored: {str(err.orig).partition(chr(10))[0]}") from err
     except (OperationalError, InterfaceError) as err:
+        if getattr(err.orig, "sqlstate", "") == _CANCELED or str(err.orig) == "interrupted":
+            raise TooLongError(
+                "this takes too long; narrow the filter, or declare the keys in it (`declare_key`)"
+            ) from err
         raise UnavailableError(f"the server's database cannot be used: {err.orig}") from err
     except DBAPIError as err:
         raise StorageError(f"the server's database cannot be used: {err.orig}") from err

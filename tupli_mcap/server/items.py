@@ -25,9 +25,9 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.schema.times import time_ns
-from tupli_mcap.server import quotas
 from tupli_mcap.server.database import audience, audit, pend
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, readable
+from tupli_mcap.server.people import quotas
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, left_alone, readable
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
@@ -153,6 +153,17 @@ class Items:
         self._delete(connection, caller, "artifact", uri)
 
     # --- both ---
+
+    def forget_unseen(self, connection: Connection) -> list[str]:
+        """Deletes what only users saw who are deleted; returns the names of files to forget."""
+        unseen = left_alone(ITEM.c.created_by, ITEM.c.published_in)
+        rows = connection.execute(select(ITEM.c.number, ITEM.c.kind, ITEM.c.id).where(unseen)).all()
+        for row in rows:
+            connection.execute(delete(ITEM).where(ITEM.c.number == row.number))
+        names = [artifact_key(row.id) for row in rows if row.kind == "artifact"]
+        for name in names:
+            pend(connection, name)
+        return names
 
     def publish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
         """Lets a group see the caller's own item; done twice, nothing changes."""

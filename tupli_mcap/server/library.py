@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import Connection, select
 
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
@@ -25,12 +25,21 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     EpisodeItem,
+    FilterEQ,
 )
-from tupli_mcap.server import episodes, quotas
+from tupli_mcap.server import arrivals, episodes
 from tupli_mcap.server.blobs import Blobs, BucketBlobs, DirectoryBlobs
-from tupli_mcap.server.database import Database, UnavailableError, demand_pending, pend, pending, settle
+from tupli_mcap.server.database import (
+    Database,
+    UnavailableError,
+    audit,
+    demand_pending,
+    pend,
+    pending,
+    settle,
+)
 from tupli_mcap.server.items import Items, artifact_key
-from tupli_mcap.server.people import accounts, throttle
+from tupli_mcap.server.people import accounts, quotas, throttle
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
@@ -61,7 +70,9 @@ class Library:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
-        self.database = Database(settings.database or f"sqlite:///{settings.own / 'server.sqlite'}")
+        self.database = Database(
+            settings.database or f"sqlite:///{settings.own / 'server.sqlite'}", settings.query_seconds
+        )
         self.blobs: Blobs = (
             BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory)
         )
@@ -124,7 +135,7 @@ class Library:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
                 deleted = Notes.read(path, self.settings.directory).about(recording.metadata).deleted
                 with self.database.writing() as connection:
-                    episodes.register(connection, admin, recording, name, digest, deleted=deleted)
+                    arrivals.register(connection, admin, recording, name, digest, deleted=deleted)
         except (TupliError, OSError) as err:
             warnings.warn(f"not served: {err}", stacklevel=3)
             return False
@@ -159,7 +170,7 @@ class Library:
             TooManyUploadsError: they have begun too many.
         """
         with self.database.writing() as connection:
-            known = episodes.stored_already(connection, caller, digest)
+            known = arrivals.stored_already(connection, caller, digest)
             if known is not None:
                 return known
             most = self.settings.max_uploads
@@ -178,7 +189,7 @@ class Library:
         try:
             incoming.verify()
             with self.database.reading() as connection:
-                known = episodes.stored_already(connection, caller, upload.digest)
+                known = arrivals.stored_already(connection, caller, upload.digest)
             name = known or self._keep(caller, upload.path, upload.digest, upload.sent_before)
         except UnavailableError:
             raise
@@ -228,14 +239,14 @@ class Library:
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
-            place = episodes.new_name(recording.benchmark_id)
+            place = arrivals.new_name(recording.benchmark_id)
             with self.database.writing() as connection:
                 pend(connection, place)
             try:
                 self.blobs.keep(place, path)
                 with self.database.writing() as connection:
                     demand_pending(connection, place)
-                    name, replaced = episodes.register(
+                    name, replaced = arrivals.register(
                         connection, caller, recording, place, digest, sent_before=sent_before
                     )
             except BaseException:
@@ -279,6 +290,16 @@ class Library:
         self.sweep(empty)
         return count
 
+    def delete_benchmark(self, caller: Caller, uri: str, *, with_episodes: bool) -> int:
+        """Deletes a benchmark, and the caller's episodes of it too if that is asked for; returns how many."""
+        own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=caller.name)
+        with self.database.writing() as connection:
+            self.items.delete_benchmark(connection, caller, uri)
+            found = episodes.delete_episodes(connection, caller, own) if with_episodes else (0, [])
+            count, empty = found
+        self.sweep(empty)
+        return count
+
     def store_artifact(self, caller: Caller, data: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
         """As `TupliStorage.store_artifact`."""
         key = artifact_key(sha256(data))
@@ -319,14 +340,38 @@ class Library:
                     self.blobs.delete(name)
                 settle(connection, name)
 
+    def delete_user(self, caller: Caller, name: str) -> None:
+        """Deletes a user, and what nobody can see then of what they made; nothing happens if there is none.
+
+        Raises:
+            DeniedError: it is somebody else, and the caller has not the right to.
+        """
+        caller.demand(Right.USER_DELETE, name)
+        with self.database.writing() as connection:
+            if accounts.delete_user(connection, name):
+                audit(connection, caller.name, "delete_user", name)
+            unseen = self._forget_unseen(connection)
+        self.sweep(unseen)
+
+    def _forget_unseen(self, connection: Connection) -> list[str]:
+        return [*self.items.forget_unseen(connection), *episodes.forget_unseen(connection)]
+
     def look_after(self) -> None:
-        """Deletes what nobody needs any more: files that nothing names, and uploads that nobody has gone on with. To be
-        called now and then."""
+        """Deletes what nobody needs any more: files that nothing names, uploads that nobody has gone on with, and what
+        only users saw who are deleted. To be called now and then."""
         with self.database.writing() as connection:
             self.uploads.forget_old(connection)
+            unseen = self._forget_unseen(connection)
+        self.sweep(unseen)
         with self.database.reading() as connection:
             old = pending(connection, seconds=self.settings.pending_seconds)
         self.sweep(old)
+
+    def reach(self) -> None:
+        """Raises UnavailableError if the database, or the bucket, does not answer."""
+        with self.database.reading() as connection:
+            connection.exec_driver_sql("SELECT 1")
+        self.blobs.size("artifacts/none")
 
     def close(self) -> None:
         """Close the database."""

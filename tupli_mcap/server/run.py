@@ -1,36 +1,114 @@
-"""The process of a server."""
+"""The processes of a server."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import os
+import shutil
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import uvicorn
+from fastapi import FastAPI
+from uvicorn.supervisors import Multiprocess
 
+from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.server.app import create_app
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.traffic import logs
+from tupli_mcap.server.traffic.patience import PatientProtocol
 
-__all__ = ["run"]
+__all__ = ["Listening", "configured", "run"]
+
+_KEEP_ALIVE_SECONDS = 30
+_STOP_SECONDS = 600  # for what has begun when the server is told to stop
+_START_SECONDS = 60
+_MOST_CONNECTIONS = 1000  # of a process
 
 
-def run(settings: Settings, host: str, port: int, tell: Callable[[str, str | None], None]) -> None:
-    """Serves a directory until the process is told to stop; requests that have begun are finished.
+@dataclass(frozen=True)
+class Listening:
+    """Where a server listens. workers: how many processes answer. certificate, key: files of TLS. proxies: the
+    addresses of those that are believed when they say for whom they ask."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    workers: int = 1
+    certificate: Path | None = None
+    key: Path | None = None
+    proxies: Sequence[str] = ()
+
+
+def run(settings: Settings, listening: Listening, tell: Callable[[str, str | None], None]) -> None:
+    """Serves until the process is told to stop; requests that have begun are finished.
 
     tell: called with the address and the admin's new password (None if there is no new one), once it is known.
 
     Raises:
-        StorageError: the directory or its database cannot be used.
+        StorageError: the directory, its database or the address cannot be used.
     """
-    library = Library(settings)
-    password = library.first_password()
-    library.adopt()
-    tell(f"http://{host}:{port}", password)
-    config = uvicorn.Config(
-        create_app(library),
-        host=host,
-        port=port,
-        log_level="warning",
-        server_header=False,
-        timeout_keep_alive=30,
+    with _bound(listening) as bound:
+        library = Library(settings)
+        try:
+            password = library.first_password()
+            library.adopt()
+        finally:
+            library.close()
+        scheme = "http" if listening.certificate is None else "https"
+        host = f"[{listening.host}]" if ":" in listening.host else listening.host
+        tell(f"{scheme}://{host}:{bound.getsockname()[1]}", password)
+        config = configured(functools.partial(_application, settings), settings, listening)
+        if listening.workers == 1:
+            uvicorn.Server(config).run([bound])
+            return
+        counts = settings.own / "metrics"
+        shutil.rmtree(counts, ignore_errors=True)
+        counts.mkdir()
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = str(counts)
+        Multiprocess(config, [bound]).run()
+
+
+def configured(
+    application: Callable[[], FastAPI], settings: Settings, listening: Listening
+) -> uvicorn.Config:
+    """How uvicorn serves what `application` makes."""
+    patient = functools.partial(
+        PatientProtocol, head_seconds=settings.head_seconds, stall_seconds=settings.stall_seconds
     )
-    uvicorn.Server(config).run()
+    return uvicorn.Config(
+        application,
+        factory=True,
+        workers=listening.workers,
+        http=patient,  # type: ignore[arg-type]
+        ws="none",
+        lifespan="on",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        proxy_headers=bool(listening.proxies),
+        forwarded_allow_ips=list(listening.proxies),
+        limit_concurrency=_MOST_CONNECTIONS,
+        timeout_keep_alive=_KEEP_ALIVE_SECONDS,
+        timeout_graceful_shutdown=_STOP_SECONDS,
+        timeout_worker_healthcheck=_START_SECONDS,
+        ssl_certfile=listening.certificate,
+        ssl_keyfile=listening.key,
+    )
+
+
+def _application(settings: Settings) -> FastAPI:
+    logs.set_up()
+    return create_app(Library(settings))
+
+
+def _bound(listening: Listening) -> socket.socket:
+    try:
+        family = socket.AF_INET6 if ":" in listening.host else socket.AF_INET
+        return socket.create_server((listening.host, listening.port), family=family, backlog=2048)
+    except OSError as err:
+        raise StorageError(
+            f"cannot listen at {listening.host}, port {listening.port}: {os_reason(err)}; choose another one"
+        ) from err

@@ -22,6 +22,7 @@ from tupli_mcap.server.blobs import Blobs
 from tupli_mcap.server.items import Items
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.tables import FILE
+from tupli_mcap.server.wire import AskedFilter
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["EpisodeQuery", "Selected", "opened", "select_episodes"]
@@ -37,8 +38,8 @@ class EpisodeQuery(BaseModel):
     fields: what of the steps: "states", "actions", "infos", "frames"; rewards, flags and times are always there.
     """
 
-    filter: BaseFilter | None = None
-    benchmark_filter: BaseFilter | None = None
+    filter: AskedFilter | None = None
+    benchmark_filter: AskedFilter | None = None
     recordings: list[str] | None = Field(default=None, max_length=10_000)
     episodes: list[int] | None = None
     fields: list[str] | None = None

@@ -16,9 +16,11 @@ class Settings:
 
     open_signup: whether everybody may make a user. guests: whether what is published in `global` is shown without a
     sign-in. access_seconds, refresh_seconds, ticket_seconds: how long tokens are valid, and addresses of recordings.
-    max_upload, max_body: bytes of a recording, and of any other request. max_page: items of a page. quota: bytes that
-    each user may keep, if that is limited. max_uploads: unfinished ones of a user. pending_seconds: by then, a file has
-    come or gone, or who moved it was killed.
+    max_upload, max_body, max_message: bytes of a recording, of a benchmark or an artifact, and of any other request.
+    max_page: items of a page. max_uploads: unfinished ones of a user. quota: bytes that each user may keep, if that is
+    limited. query_seconds: how long a question may take. head_seconds, stall_seconds: how long a client may keep the
+    server waiting, see `patience`. pending_seconds: by then, a file has come or gone, or who moved it was killed.
+    upkeep_seconds: between two times of looking after what nobody needs. open_metrics: whether everybody may see them.
     """
 
     directory: Path
@@ -33,10 +35,16 @@ class Settings:
     ticket_seconds: int = 24 * 3600
     max_upload: int = 1 << 40
     max_body: int = 256 << 20
+    max_message: int = 4 << 20
     max_page: int = 1000
     max_uploads: int = 100
     quota: int | None = None
+    query_seconds: float = 30
+    head_seconds: float = 20
+    stall_seconds: float = 60
     pending_seconds: float = 24 * 3600
+    upkeep_seconds: float = 3600
+    open_metrics: bool = False
 
     @property
     def own(self) -> Path:

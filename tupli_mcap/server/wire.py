@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Any, Final
+import re
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, Request, Response
+from fastapi.exception_handlers import request_validation_exception_handler
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import (
@@ -21,17 +24,21 @@ from tupli_mcap.errors import (
     StorageError,
     TupliError,
 )
-from tupli_mcap.schema import BaseFilter
+from tupli_mcap.schema import BaseFilter, FilterType
+from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.server.blobs import LostError
-from tupli_mcap.server.database import UnavailableError
+from tupli_mcap.server.database import TooLongError, UnavailableError
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.people.quotas import FullError
 from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.quotas import FullError
+from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
 
-__all__ = ["Error", "Found", "Listing", "answer", "listed", "tell_errors", "told"]
+__all__ = ["AskedFilter", "Error", "Found", "Listing", "answer", "listed", "paged", "tell_errors", "told"]
+
+_MOST_VALUES: Final = 20_000
 
 _STATUS: Final[dict[type[TupliError], int]] = {
     SignInError: 401,
@@ -45,6 +52,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     TooLargeError: 413,
     TooManyUploadsError: 429,
     UnavailableError: 503,
+    TooLongError: 400,
     RecordingError: 503,  # a file that is kept cannot be opened
     FullError: 507,
     LostError: 500,
@@ -69,10 +77,23 @@ class Error(BaseModel):
     error: str
 
 
+def _affordable(filter: BaseFilter) -> BaseFilter:
+    count = sum(len(part.value) if part.type is FilterType.IN else 1 for part in comparisons(filter))
+    if count > _MOST_VALUES:
+        raise ValueError(
+            f"expected a filter with at most {_MOST_VALUES} values, found {count}; ask in several parts"
+        )
+    return filter
+
+
+AskedFilter = Annotated[BaseFilter, AfterValidator(_affordable)]
+"""A filter that somebody asks with."""
+
+
 class Listing(BaseModel):
     """What to list: a filter, and which page of what it is true of. `cursor` is the `next` of the page before."""
 
-    filter: BaseFilter | None = None
+    filter: AskedFilter | None = None
     limit: int | None = Field(default=None, ge=0)
     offset: int = Field(default=0, ge=0)
     cursor: str | None = None
@@ -95,6 +116,15 @@ def listed(items: Iterable[BaseModel], following: str | None = None) -> Response
     return answer({"items": list(items), "next": following})
 
 
+def paged(items: Sequence[BaseModel], told: Listing, most: int) -> Response:
+    """A page of items that are all known."""
+    if told.cursor is not None and not re.fullmatch("[0-9]{1,18}", told.cursor):
+        raise StorageError("expected the cursor of the page before; list from the beginning")
+    start = told.offset + int(told.cursor or 0)
+    stop = start + (most if told.limit is None else min(told.limit, most))
+    return listed(items[start:stop], str(stop) if start < stop < len(items) else None)
+
+
 def _as_json(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump()
@@ -104,13 +134,24 @@ def _as_json(value: Any) -> Any:
 
 
 def told(err: TupliError) -> tuple[int, str]:
-    """The status of an error, and what is said of it."""
+    """The status of an error, and what is said of it; the log is told of failures of the server."""
     status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
+    if status >= 500 and status != _STATUS[FullError]:
+        LOG.error("refused", extra={"status": status}, exc_info=err)
     return status, _FAILED.get(status, str(err))
 
 
 def tell_errors(app: FastAPI) -> None:
-    """Makes answers of the errors of this package."""
+    """Makes answers of the errors of this package, and of requests that are none."""
+
+    @app.exception_handler(RequestValidationError)
+    async def _tell_defect(request: Request, err: RequestValidationError) -> JSONResponse:
+        if not request.url.path.startswith("/v1/"):  # as PyTupli's server answers
+            return await request_validation_exception_handler(request, err)
+        first = err.errors()[0]
+        where = ".".join(str(part) for part in first["loc"][1:])
+        detail = f"expected another request: {where or 'its body'}: {first['msg']}"
+        return JSONResponse({"detail": detail, "error": "StorageError"}, 400)
 
     @app.exception_handler(TupliError)
     def _tell(request: Request, err: TupliError) -> JSONResponse:

@@ -6,5 +6,6 @@ account    login, logout, whoami, signup, password
 people     users, groups, roles, tokens for machines
 browse     a page of recordings on this machine
 serve      the server
+upkeep     backup-server, restore-server
 trust      whose code may run
 """

@@ -10,39 +10,71 @@ import typer
 from tupli_mcap.cli.terminal import say
 from tupli_mcap.errors import missing_extra
 
-__all__ = ["serve"]
+__all__ = ["Blobs", "Database", "Served", "serve"]
+
+Served = Annotated[Path, typer.Argument(metavar="DIR", help="Where the server keeps everything.")]
+Database = Annotated[
+    str,
+    typer.Option(
+        envvar="TUPLI_MCAP_DATABASE",
+        metavar="URL",
+        help="A database's URL, such as postgresql+psycopg://…; by default SQLite in DIR.",
+    ),
+]
+Blobs = Annotated[
+    str,
+    typer.Option(
+        envvar="TUPLI_MCAP_BLOBS",
+        metavar="URL",
+        help="A bucket for recordings and artifacts, such as s3://lab/server; DIR by default.",
+    ),
+]
+_Presigned = Annotated[
+    bool, typer.Option("--presigned", help="Send clients to the bucket, which they must reach.")
+]
+_Host = Annotated[str, typer.Option(help="The address to listen at; 0.0.0.0 is all of them.")]
+_Port = Annotated[int, typer.Option(min=0, max=65535)]
+_Signup = Annotated[bool, typer.Option("--open-signup", help="Let everybody sign up.")]
+_Guests = Annotated[
+    bool, typer.Option("--guests", help="Show what is published in 'global' to everybody, without a sign-in.")
+]
+_Workers = Annotated[int, typer.Option(min=1, max=256, help="How many processes answer.")]
+_Quota = Annotated[float | None, typer.Option(min=0, metavar="GB", help="What each user may keep.")]
+_Seconds = Annotated[float, typer.Option(min=1, help="How long a question may take.")]
+_Metrics = Annotated[bool, typer.Option("--open-metrics", help="Show /metrics to everybody.")]
+_Certificate = Annotated[
+    Path | None, typer.Option(exists=True, dir_okay=False, help="For TLS: a file in PEM, with --key.")
+]
+_Key = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="The key, in PEM.")]
+_Proxies = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ADDRESS", help="A proxy that is believed when it says for whom it asks. Repeatable."
+    ),
+]
+_Accel = Annotated[
+    str,
+    typer.Option(metavar="PREFIX", help="Let nginx send files: where it has DIR, as an internal location."),
+]
 
 
 def serve(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Where the server keeps everything.")],
-    host: Annotated[
-        str, typer.Option(help="The address to listen at; 0.0.0.0 is all of them.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
-    open_signup: Annotated[bool, typer.Option("--open-signup", help="Let everybody sign up.")] = False,
-    guests: Annotated[
-        bool,
-        typer.Option("--guests", help="Show what is published in 'global' to everybody, without a sign-in."),
-    ] = False,
-    database: Annotated[
-        str,
-        typer.Option(
-            envvar="TUPLI_MCAP_DATABASE",
-            metavar="URL",
-            help="A database's URL, such as postgresql+psycopg://…; by default SQLite in DIR.",
-        ),
-    ] = "",
-    blobs: Annotated[
-        str,
-        typer.Option(
-            envvar="TUPLI_MCAP_BLOBS",
-            metavar="URL",
-            help="A bucket for recordings and artifacts, such as s3://lab/server; DIR by default.",
-        ),
-    ] = "",
-    presigned: Annotated[
-        bool, typer.Option("--presigned", help="Send clients to the bucket, which they must reach.")
-    ] = False,
+    directory: Served,
+    host: _Host = "127.0.0.1",
+    port: _Port = 8080,
+    open_signup: _Signup = False,
+    guests: _Guests = False,
+    workers: _Workers = 1,
+    database: Database = "",
+    blobs: Blobs = "",
+    presigned: _Presigned = False,
+    quota: _Quota = None,
+    query_seconds: _Seconds = 30,
+    open_metrics: _Metrics = False,
+    certificate: _Certificate = None,
+    key: _Key = None,
+    trusted_proxy: _Proxies = None,
+    accel: _Accel = "",
 ) -> None:
     """Share benchmarks and recordings with others over HTTP.
 
@@ -50,10 +82,12 @@ def serve(
     one. Ctrl-C ends the server after the requests that have begun.
     """
     try:
-        from tupli_mcap.server.run import run
+        from tupli_mcap.server.run import Listening, run
+        from tupli_mcap.server.settings import Settings
     except ImportError as err:
         raise missing_extra("`tupli-mcap serve` needs FastAPI and uvicorn", "server") from err
-    from tupli_mcap.server.settings import Settings
+    if (certificate is None) != (key is None):
+        raise typer.BadParameter("expected --certificate and --key, found one of them")
 
     def tell(address: str, password: str | None) -> None:
         if password is not None:
@@ -65,7 +99,11 @@ def serve(
         database=database,
         blobs=blobs,
         presigned=presigned,
+        accel=accel,
         open_signup=open_signup,
         guests=guests,
+        quota=None if quota is None else int(quota * 1e9),
+        query_seconds=query_seconds,
+        open_metrics=open_metrics,
     )
-    run(settings, host, port, tell)
+    run(settings, Listening(host, port, workers, certificate, key, trusted_proxy or ()), tell)

@@ -40,13 +40,10 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
 
 @router.post("/users/delete")
 def delete_user(request: Request, visit: Code, username: _Text = "") -> Response:
-    """Deletes a user; the name stays taken, and what they made stays."""
+    """Deletes a user, and what nobody else sees of what they made; the name stays taken."""
 
     def change() -> None:
-        visit.caller.demand(Right.USER_DELETE, username)
-        with visit.library.database.writing() as connection:
-            accounts.delete_user(connection, username)
-            audit(connection, visit.caller.name, "delete_user", username)
+        visit.library.delete_user(visit.caller, username)
 
     return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")
 

@@ -46,6 +46,7 @@ def _visit(request: Request) -> Visit:
         caller = library.tokens.of_session(connection, session) if session else None
         if caller is None:
             return Visit(library, accounts.guest(connection), "", "")
+    request.state.user = caller.name  # for the log
     return Visit(library, caller, session, library.tokens.form_code(session))
 
 

@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import or_, select
+from sqlalchemy import and_, or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.schema import Right
-from tupli_mcap.server.tables import AUDIENCE
+from tupli_mcap.server.tables import AUDIENCE, GROUP, USER
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["DEFAULT_ROLES", "GLOBAL", "GUEST", "Caller", "DeniedError", "Right", "readable"]
+__all__ = ["DEFAULT_ROLES", "GLOBAL", "GUEST", "Caller", "DeniedError", "Right", "left_alone", "readable"]
 
 GLOBAL: Final = "global"
 """The group of everybody who is signed in."""
@@ -87,3 +87,16 @@ def readable(
     groups = [escape_text(group) for group in caller.groups_with(right)]
     seen = select(AUDIENCE.c.published_in).where(AUDIENCE.c.team.in_(groups))
     return or_(created_by == escape_text(caller.name), published_in.in_(seen))
+
+
+def left_alone(created_by: ColumnElement[Any], published_in: ColumnElement[Any]) -> ColumnElement[bool]:
+    """What a deleted user has left, and nobody can see any more.
+
+    created_by, published_in: columns of the table that is asked.
+    """
+    users = select(USER.c.name)
+    there = or_(
+        AUDIENCE.c.team == GLOBAL, AUDIENCE.c.team.in_(users), AUDIENCE.c.team.in_(select(GROUP.c.name))
+    )
+    seen = select(AUDIENCE.c.published_in).where(there)
+    return and_(created_by.not_in(users), published_in.not_in(seen))

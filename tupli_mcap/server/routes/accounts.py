@@ -8,7 +8,7 @@ from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
 from tupli_mcap.server.database import audit
-from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people import accounts, quotas
 from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, Writer
@@ -45,6 +45,19 @@ class User(BaseModel):
 
     username: str
     memberships: dict[str, list[str]]
+
+
+class Me(User):
+    """The caller, with the bytes that they keep, and may keep (None: as many as they like)."""
+
+    used: int = 0
+    quota: int | None = None
+
+
+class Quota(BaseModel):
+    """How many bytes a user may keep; None is what everybody may."""
+
+    bytes: int | None = Field(ge=0, le=1 << 60)
 
 
 class Password(BaseModel):
@@ -114,12 +127,17 @@ def sign_out(library: Served, told: Refresh) -> None:
 
 
 @router.get("/me")
-def who_am_i(library: Served, caller: Reader) -> User:
+def who_am_i(library: Served, caller: Reader) -> Me:
     """The caller."""
     if caller.is_guest:
-        return User(username=caller.name, memberships={"global": ["guest"]})
+        return Me(username=caller.name, memberships={"global": ["guest"]})
     with library.database.reading() as connection:
-        return User(username=caller.name, memberships=accounts.memberships_of(connection, caller.name))
+        return Me(
+            username=caller.name,
+            memberships=accounts.memberships_of(connection, caller.name),
+            used=quotas.used_by(connection, caller.name),
+            quota=quotas.quota_of(connection, library.settings, caller.name),
+        )
 
 
 @router.post("/users")
@@ -146,11 +164,17 @@ def list_users(library: Served, caller: Reader) -> list[User]:
 
 @router.delete("/users/{username}")
 def delete_user(library: Served, caller: Writer, username: str) -> None:
-    """Deletes a user; the name stays taken, and what they made stays."""
-    caller.demand(Right.USER_DELETE, username)
+    """Deletes a user, and what nobody else sees of what they made; the name stays taken."""
+    library.delete_user(caller, username)
+
+
+@router.put("/users/{username}/quota")
+def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> None:
+    """Says how much a user may keep."""
+    caller.demand(Right.USER_UPDATE)
     with library.database.writing() as connection:
-        accounts.delete_user(connection, username)
-        audit(connection, caller.name, "delete_user", username)
+        quotas.set_quota(connection, username, told.bytes)
+        audit(connection, caller.name, "set_quota", f"{username}: {told.bytes}")
 
 
 @router.put("/users/{username}/password")

@@ -34,12 +34,14 @@ Address = Annotated[str, Depends(_address)]
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 
-def _any_caller(library: Served, credentials: _Credentials) -> Caller:
+def _any_caller(library: Served, credentials: _Credentials, request: Request) -> Caller:
     """Whoever it is: a user, or a guest. A token that is given must be valid."""
     with library.database.reading() as connection:
         if credentials is None:
             return accounts.guest(connection)
-        return library.tokens.caller(connection, credentials.credentials)
+        caller = library.tokens.caller(connection, credentials.credentials)
+    request.state.user = caller.name  # for the log
+    return caller
 
 
 AnyCaller = Annotated[Caller, Depends(_any_caller)]
@@ -79,7 +81,10 @@ class Holder(NamedTuple):
 
 
 def _holder(
-    library: Served, caller: AnyCaller, ticket: Annotated[str | None, Query(max_length=4096)] = None
+    library: Served,
+    caller: AnyCaller,
+    request: Request,
+    ticket: Annotated[str | None, Query(max_length=4096)] = None,
 ) -> Holder:
     if ticket is None:
         return Holder(_reader(library, caller), None)
@@ -88,6 +93,7 @@ def _holder(
         found = accounts.caller_named(connection, user) or accounts.guest(connection)
     if found.is_guest and not library.settings.guests:
         raise SignInError("the ticket is not valid any more")
+    request.state.user = found.name
     return Holder(found, what)
 
 

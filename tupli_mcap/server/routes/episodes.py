@@ -10,10 +10,10 @@ from fastapi import APIRouter, Body, Response
 from pydantic import BaseModel
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.schema import BaseFilter, FilterEQ
+from tupli_mcap.schema import FilterEQ
 from tupli_mcap.server import episodes
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
-from tupli_mcap.server.wire import Found, Listing, answer, listed
+from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.queries import After
 
@@ -25,7 +25,7 @@ router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
 class Chosen(BaseModel):
     """What to count or delete: all that a filter is true of."""
 
-    filter: BaseFilter | None = None
+    filter: AskedFilter | None = None
 
 
 class Shown(Chosen):

@@ -11,11 +11,11 @@ from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
-from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery, FilterEQ
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.items import artifact_key
 from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
-from tupli_mcap.server.wire import Found, Listing, answer, listed
+from tupli_mcap.server.wire import Found, Listing, answer, paged
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
@@ -38,8 +38,7 @@ def list_benchmarks(library: Served, caller: Reader, told: Annotated[Listing, Bo
     """The benchmarks that a filter is true of, oldest first."""
     with library.database.reading() as connection:
         found = library.items.list_benchmarks(connection, caller, told.filter)
-    stop = None if told.limit is None else told.offset + told.limit
-    return listed(found[told.offset : stop])
+    return paged(found, told, library.settings.max_page)
 
 
 @router.get("/benchmarks/{uri}")
@@ -52,13 +51,7 @@ def load_benchmark(library: Served, caller: Reader, uri: str) -> Response:
 @router.delete("/benchmarks/{uri}")
 def delete_benchmark(library: Served, caller: Writer, uri: str, episodes: bool = False) -> Response:
     """Deletes a benchmark, and with `episodes` the caller's episodes of it too; `{"episodes": how many}`."""
-    with library.database.writing() as connection:
-        library.items.delete_benchmark(connection, caller, uri)
-    count = 0
-    if episodes:
-        own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=caller.name)
-        count = library.delete_episodes(caller, own)
-    return answer({"episodes": count})
+    return answer({"episodes": library.delete_benchmark(caller, uri, with_episodes=episodes)})
 
 
 @router.put("/benchmarks/{uri}/published")
@@ -98,8 +91,7 @@ def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Bod
     """The artifacts that a filter is true of, oldest first."""
     with library.database.reading() as connection:
         found = library.items.list_artifacts(connection, caller, told.filter)
-    stop = None if told.limit is None else told.offset + told.limit
-    return listed(found[told.offset : stop])
+    return paged(found, told, library.settings.max_page)
 
 
 @router.get("/artifacts/{uri}")

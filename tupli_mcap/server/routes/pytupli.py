@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
@@ -35,7 +35,7 @@ from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
-from tupli_mcap.server.wire import answer
+from tupli_mcap.server.wire import AskedFilter, answer
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]
@@ -43,6 +43,7 @@ __all__ = ["router"]
 router = APIRouter(tags=["PyTupli's routes"])
 _DENIED = "You do not have sufficient permissions for this operation."
 _BEARER = HTTPBearer(auto_error=False)
+_FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)
 _Filter = Annotated[dict[str, Any] | None, Body()]
 
 
@@ -137,9 +138,7 @@ def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
 @router.delete("/access/users/delete")
 def delete_user(library: Served, caller: Changing, username: str) -> None:
     """Deletes a user; nothing happens if there is none."""
-    caller.demand(Right.USER_DELETE, username)
-    with library.database.writing() as connection:
-        accounts.delete_user(connection, username)
+    library.delete_user(caller, username)
 
 
 @router.put("/access/users/change-password")
@@ -413,7 +412,7 @@ def _filter(told: dict[str, Any] | None) -> BaseFilter | None:
     if not told or (told.get("key") is None and not told.get("filters")):
         return None
     try:
-        return BaseFilter.model_validate(_known(told, 0))
+        return _FILTER.validate_python(_known(told, 0))
     except ValidationError as err:
         raise FilterError(f"expected a filter: {first_defect(err)}") from err
 

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import sys
+import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, select, true
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap import jsonvalue
@@ -51,6 +54,7 @@ __all__ = [
     "declare_key",
     "declared_keys",
     "find_episodes",
+    "insert_all",
     "plan_of",
     "put_recording",
     "remove_recording",
@@ -80,7 +84,7 @@ def put_recording(
     indexed = _indexed(connection)
     remaining = iter(rows)
     while chunk := [store_row(number, row) for row in itertools.islice(remaining, _ROWS_AT_ONCE)]:
-        _insert_all(connection, EPISODE, StoredRow._fields, chunk)
+        insert_all(connection, EPISODE, StoredRow._fields, chunk)
         _index(connection, chunk, indexed)
     tally(connection, number)
 
@@ -219,7 +223,11 @@ def _headers(
     limit: int | None,
     offset: int,
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds."""
+    """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds.
+
+    Raises:
+        FilterError: the connection has the option `tupli_deadline`, and that has passed.
+    """
     by = [value.desc() if descending else value for value, descending in order]
     query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
     if limit is None:
@@ -231,9 +239,12 @@ def _headers(
         rows = connection.execute(query.where(EPISODE.c.id.in_(few)))
     matches = None if filter is None or found.exact else bound_predicate(filter)
     width = len(_COLUMNS)
+    deadline = connection.get_execution_options().get("tupli_deadline", math.inf)
     runs: dict[int, list[dict[str, Any]]] = {}
     with contextlib.closing(rows):
         for page in rows.partitions(_ROWS_OF_ANSWER):
+            if time.monotonic() > deadline:
+                raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
             stored = [StoredRow(*row[:width]) for row in page]
             _add_runs(connection, runs, {row.recording_id for row in stored})
             for row, (*_, uuid, benchmark_id, path) in zip(stored, page, strict=True):
@@ -269,7 +280,7 @@ def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[t
             if value is not None:
                 values.append((row.id, number, *value))
     if values:
-        _insert_all(connection, VALUE, ("episode_id", "key", "number", "text"), values)
+        insert_all(connection, VALUE, ("episode_id", "key", "number", "text"), values)
 
 
 def _add_recording(
@@ -296,12 +307,28 @@ def _environment(runs: str) -> str:
     return named if isinstance(named, str) else ""
 
 
-def _insert_all(
+def insert_all(
     connection: Connection, table: Table, fields: Sequence[str], rows: Sequence[tuple[Any, ...]]
 ) -> None:
     """Inserts rows as the driver takes them: SQLAlchemy would prepare each value of each row."""
+    if connection.dialect.name == "postgresql":
+        _copy(connection, table, fields, rows)
+        return
     compiled = insert(table).compile(dialect=connection.dialect, column_keys=fields)
-    if compiled.positional:
-        connection.exec_driver_sql(str(compiled), list(rows))
-    else:
-        connection.exec_driver_sql(str(compiled), [dict(zip(fields, row, strict=True)) for row in rows])
+    connection.exec_driver_sql(str(compiled), list(rows))
+
+
+def _copy(
+    connection: Connection, table: Table, fields: Sequence[str], rows: Sequence[tuple[Any, ...]]
+) -> None:
+    """Inserts rows by PostgreSQL's COPY, of which SQLAlchemy knows nothing."""
+    named = connection.dialect.identifier_preparer.quote
+    statement = f"COPY {named(table.name)} ({', '.join(map(named, fields))}) FROM STDIN"
+    driver: Any = connection.connection.dbapi_connection
+    kinds = connection.dialect.loaded_dbapi.Error
+    try:
+        with driver.cursor() as cursor, cursor.copy(statement) as copy:
+            for row in rows:
+                copy.write_row(row)
+    except kinds as err:
+        raise DBAPIError.instance(statement, None, err, kinds, dialect=connection.dialect) from err

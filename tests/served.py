@@ -1,0 +1,82 @@
+"""Real processes of `tupli-mcap serve`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+from serving import PASSWORD
+
+COMMAND = str(Path(sys.executable).with_name("tupli-mcap"))
+
+
+class Process:
+    """A server in processes of its own."""
+
+    def __init__(self, directory: Path, log: Path, *options: str, port: int = 0) -> None:
+        self._command = [COMMAND, "serve", str(directory), *options]
+        self.log_file = log
+        self.port = port
+        self.start()
+
+    def start(self) -> None:
+        """Starts it, on the same port as before, and waits until it is ready."""
+        out = self.log_file.with_suffix(".out")
+        with out.open("wb") as stdout, self.log_file.open("ab") as stderr:
+            self._process = subprocess.Popen(
+                [*self._command, "--port", str(self.port)],
+                stdout=stdout,
+                stderr=stderr,
+                env={**os.environ, "TUPLI_MCAP_ADMIN_PASSWORD": PASSWORD},
+                start_new_session=True,
+            )
+        while not (found := re.search(r"at (https?://\S+)", out.read_text())):
+            assert self._process.poll() is None, self.log_file.read_text()
+            time.sleep(0.02)
+        self.url = found[1]
+        self.port = int(self.url.rpartition(":")[2])
+        while not self._is_ready():
+            assert self._process.poll() is None, self.log_file.read_text()
+            time.sleep(0.02)
+
+    def _is_ready(self) -> bool:
+        with contextlib.suppress(httpx.TransportError):
+            return httpx.get(f"{self.url}/ready", verify=False, timeout=60).status_code in (200, 503)
+        return False
+
+    def kill(self) -> None:
+        """Kills all of its processes at once."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait(60)
+
+    def stop(self) -> None:
+        """Tells it to stop."""
+        self._process.terminate()
+
+    def wait(self) -> int:
+        return self._process.wait(120)
+
+    def log(self) -> list[dict[str, Any]]:
+        """The lines of its log."""
+        return [json.loads(line) for line in self.log_file.read_text().splitlines()]
+
+
+@contextlib.contextmanager
+def served(directory: Path, *options: str, port: int = 0) -> Iterator[Process]:
+    """A server for the length of a block."""
+    process = Process(directory, directory.with_name(f"{directory.name}.log"), *options, port=port)
+    try:
+        yield process
+    finally:
+        process.kill()

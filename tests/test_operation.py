@@ -1,0 +1,151 @@
+"""A server as those who run it have it: processes that are started, watched and stopped."""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import hashlib
+import ipaddress
+import signal
+import ssl
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from served import COMMAND, Process, served
+from serving import PASSWORD
+
+from tupli_mcap.storage import TupliAPIClient
+from tupli_mcap.wrappers.rollout import record_rollouts
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    record_rollouts("CartPole-v1", path, steps=1000, seed=1)
+    return path.read_bytes()
+
+
+def certificate(folder: Path) -> tuple[Path, Path]:
+    """A certificate of 127.0.0.1, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
+    now = datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
+        )
+        .sign(key, hashes.SHA256())
+    )
+    paths = folder / "certificate.pem", folder / "key.pem"
+    paths[0].write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    paths[1].write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+    return paths
+
+
+def sign_in(server: Process, client: httpx.Client) -> dict[str, str]:
+    answer = client.post("/v1/tokens", json={"username": "admin", "password": PASSWORD})
+    return {"Authorization": f"Bearer {answer.json()['access_token']}"}
+
+
+def begin(client: httpx.Client, token: dict[str, str], data: bytes) -> str:
+    digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
+    headers = {"Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}", **token}
+    return client.post("/v1/uploads", headers=headers).headers["Location"]
+
+
+def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) -> None:
+    cert, key = certificate(tmp_path)
+    options = ("--workers", "2", "--certificate", str(cert), "--key", str(key))
+    with served(tmp_path / "served", *options) as server:
+        assert server.url.startswith("https://")
+        context = ssl.create_default_context(cafile=str(cert))
+        secrets = [PASSWORD]
+        for _ in range(4):  # each connection may reach another process
+            with httpx.Client(base_url=server.url, verify=context, timeout=60) as client:
+                token = sign_in(server, client)
+                secrets.append(token["Authorization"].partition(" ")[2])
+                place = begin(client, token, recording)
+                offset = int(client.head(place, headers=token).headers["Upload-Offset"])
+                part = recording[offset : offset + len(recording) // 3]
+                client.patch(place, headers={"Upload-Offset": str(offset), **token}, content=part)
+        with httpx.Client(base_url=server.url, verify=context, timeout=60) as client:
+            listed = client.post("/v1/episodes/list", json={"limit": 1}, headers=token).json()["items"]
+            ticket = client.post(
+                "/v1/tickets", json={"recording": listed[0]["recording"]}, headers=token
+            ).json()
+            secrets.append(ticket["path"].partition("ticket=")[2])
+            assert client.get(ticket["path"]).content == recording
+            client.get("/v1/me", headers={"Authorization": "Bearer forged-token-of-somebody"})
+            metrics = client.get("/metrics", headers=token).text
+            assert 'tupli_mcap_requests_total{method="POST",route="/v1/tokens",status="200"} 4.0' in metrics
+            assert f"tupli_mcap_recording_bytes {float(len(recording))}" in metrics
+            assert client.get("/metrics").status_code == 401
+        server.stop()
+        assert server.wait() == 0
+        log, text = server.log(), server.log_file.read_text()
+    assert not [secret for secret in (*secrets, "forged-token") if secret in text]
+    requests = [line for line in log if line["event"] == "request"]
+    patched = [line for line in requests if line["method"] == "PATCH"]
+    assert {line["user"] for line in patched} == {"admin"}
+    assert sum(line["received"] for line in patched) == len(recording)
+    assert {line["route"] for line in patched} == {"/v1/uploads/{upload_id}"}
+    assert len({line["id"] for line in requests}) == len(requests)
+    (fetched,) = [line for line in requests if line["route"] == "/v1/files/{name:path}"]
+    assert (fetched["status"], fetched["sent"], fetched["user"]) == (200, len(recording), "admin")
+
+
+def test_who_is_sending_may_finish_when_the_server_stops(tmp_path: Path, recording: bytes) -> None:
+    with served(tmp_path / "served") as server:
+        with httpx.Client(base_url=server.url, timeout=120) as client:
+            token = sign_in(server, client)
+            place = begin(client, token, recording)
+            stopping = threading.Event()
+
+            def slowly() -> Iterator[bytes]:
+                yield recording[:1000]
+                server.stop()
+                stopping.set()
+                while True:  # until nobody new is let in
+                    try:
+                        httpx.get(f"{server.url}/health", timeout=60)
+                    except httpx.TransportError:
+                        break
+                    time.sleep(0.05)
+                yield recording[1000:]
+
+            headers = {"Upload-Offset": "0", "Content-Length": str(len(recording)), **token}
+            sent = client.patch(place, headers=headers, content=slowly())
+            assert stopping.is_set() and sent.status_code == 204, sent.text
+            name = sent.headers["Recording"]
+        assert server.wait() == -signal.SIGTERM
+        server.start()
+        with TupliAPIClient(server.url) as admin:
+            admin.login("admin", PASSWORD)
+            assert {header.recording for header in admin.list_episodes()} == {name}
+
+
+def test_an_address_that_is_taken(tmp_path: Path) -> None:
+    with served(tmp_path / "served") as server:
+        command = [COMMAND, "serve", str(tmp_path / "b"), "--port", str(server.port)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert f"error: cannot listen at 127.0.0.1, port {server.port}: Address already in use" in done.stderr

@@ -1,0 +1,159 @@
+"""Backups of servers are whole, and come back anywhere."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import buckets
+import pytest
+from postgres import Cluster
+from serving import PASSWORD, serving
+from test_storage import episode, query
+
+from tupli_mcap.cli import app
+from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.recording import verify_recording
+from tupli_mcap.schema import ArtifactMetadata, F, Group
+from tupli_mcap.server.backup import back_up, restore
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage import TupliAPIClient
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
+KINDS = ("sqlite and a directory", "postgresql and s3")
+
+
+@contextlib.contextmanager
+def place(kind: str, directory: Path, postgres: Cluster) -> Iterator[Settings]:
+    """Where a server may keep things; nothing is there."""
+    settings = Settings(directory)
+    with contextlib.ExitStack() as stack:
+        if "postgresql" in kind:
+            database = stack.enter_context(postgres.database())
+            bucket = stack.enter_context(buckets.bucket())
+            settings = replace(settings, database=database, blobs=f"{bucket.url}/x")
+        yield settings
+
+
+@contextlib.contextmanager
+def signed_in(settings: Settings) -> Iterator[TupliAPIClient]:
+    with serving(settings) as url, TupliAPIClient(url) as admin:
+        admin.login("admin", PASSWORD)
+        yield admin
+
+
+def contents(admin: TupliAPIClient) -> dict[str, Any]:
+    """All that a server shows its admin."""
+    items = admin.list_episodes(include_tuples=True)
+    return {
+        "benchmarks": [admin.load_benchmark(header.id) for header in admin.list_benchmarks()],
+        "artifacts": {item.id: admin.load_artifact(item.id) for item in admin.list_artifacts()},
+        "episodes": repr([item.model_dump() for item in items]),
+        "users": admin.list_users(),
+        "groups": admin.list_groups(),
+    }
+
+
+def fill(admin: TupliAPIClient) -> None:
+    admin.create_group(Group(name="lab"))
+    admin.declare_key("metadata.score")
+    artifact = admin.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+    benchmark = admin.store_benchmark(query(artifacts=(artifact,))).id
+    made = admin.record_episodes([episode(benchmark, 3 + i, float(i)) for i in range(3)])
+    admin.record_episodes([episode(benchmark, 9, 7.5)])
+    admin.publish_episode(made[0].id, "lab")
+    admin.delete_episode(made[1].id)
+
+
+@pytest.mark.parametrize(("here", "there"), [KINDS, KINDS[::-1]])
+def test_a_backup_comes_back_anywhere(
+    here: str, there: str, tmp_path: Path, postgres: Cluster, capsys: pytest.CaptureFixture[str]
+) -> None:
+    backup = tmp_path / "backup"
+    with place(here, tmp_path / "here", postgres) as settings, signed_in(settings) as admin:
+        fill(admin)
+        before = contents(admin)
+        first = back_up(settings, backup)
+        assert first[:3] == (1, 2, 1) and first.copied == 3
+        assert back_up(settings, backup) == first._replace(copied=0)
+    with place(there, tmp_path / "there", postgres) as settings:
+        options = [f"--database={settings.database}", f"--blobs={settings.blobs}"] if settings.blobs else []
+        for _ in range(2):
+            code = app(
+                ["restore-server", str(backup), str(settings.directory), *options], standalone_mode=False
+            )
+            said = capsys.readouterr()
+            if code:
+                assert "there is a server's data already; restore into an empty place" in said.err
+            else:
+                assert "restored 1 user, 2 recordings, 1 artifact" in said.out
+        with signed_in(settings) as admin:
+            assert contents(admin) == before
+            assert admin.count_episodes(F("metadata.score") == 7.5) == 1
+            fill_more = admin.record_episodes([episode(before["benchmarks"][0].id)])
+            assert admin.count_episodes(F("id") == fill_more[0].id) == 1
+    with signed_in(Settings(backup)) as admin:  # as it is
+        assert contents(admin) == before
+
+
+def test_what_is_gone_is_not_in_the_next_backup(tmp_path: Path) -> None:
+    settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
+    with signed_in(settings) as admin:
+        fill(admin)
+        back_up(settings, backup)
+        admin.delete_episodes(F("steps") == 9)
+        told = back_up(settings, backup)
+        assert (told.recordings, told.copied) == (1, 0)
+    assert len(list(backup.rglob("*.mcap"))) == 1
+
+
+def test_a_backup_while_much_comes_and_goes(tmp_path: Path) -> None:
+    settings, stop = Settings(tmp_path / "served"), threading.Event()
+    with signed_in(settings) as admin:
+        benchmark = admin.store_benchmark(query()).id
+
+        def come_and_go() -> None:
+            with TupliAPIClient(admin.url) as client:
+                while not stop.is_set():
+                    made = client.record_episodes([episode(benchmark)])
+                    client.delete_episodes(F("recording") == made[0].recording)
+                    client.record_episodes([episode(benchmark)])
+
+        thread = threading.Thread(target=come_and_go)
+        thread.start()
+        try:
+            for i in range(5):
+                back_up(settings, tmp_path / f"backup{i}")
+        finally:
+            stop.set()
+            thread.join()
+    for i in range(5):
+        with signed_in(Settings(tmp_path / f"backup{i}")) as admin:
+            headers = admin.list_episodes()
+            for name in {header.recording for header in headers}:
+                assert verify_recording(tmp_path / f"backup{i}" / name).ok
+            assert len(list((tmp_path / f"backup{i}").rglob("*.mcap"))) == len(headers)
+
+
+def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
+    settings = Settings(tmp_path / "served")
+    with pytest.raises(StorageError, match="holds no server's data"):
+        back_up(settings, tmp_path / "backup")
+    with signed_in(settings) as admin:
+        fill(admin)
+        (tmp_path / "thesis").mkdir()
+        (tmp_path / "thesis" / "thesis.tex").touch()
+        with pytest.raises(StorageError, match="holds something else than a backup"):
+            back_up(settings, tmp_path / "thesis")
+        with pytest.raises(StorageError, match="holds no backup of a server"):
+            restore(tmp_path / "thesis", Settings(tmp_path / "new"))
+        damaged = next((tmp_path / "served" / "recordings").rglob("*.mcap"))
+        data = bytearray(damaged.read_bytes())
+        data[100] ^= 1
+        damaged.write_bytes(data)
+        with pytest.raises(FormatError, match=r"recordings/.*mcap is damaged: expected the SHA-256"):
+            back_up(settings, tmp_path / "backup")

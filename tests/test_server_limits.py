@@ -1,0 +1,276 @@
+"""What one user, one request or one connection may take of a server."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import hashlib
+import json
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+from postgres import Cluster
+from serving import PASSWORD, serving
+from test_storage import episode, query
+
+from tupli_mcap.errors import FilterError, NotFoundError, StorageError
+from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT
+from tupli_mcap.server.database import Database, TooLongError
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.storage import TupliAPIClient
+from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.rows import EpisodeRow
+from tupli_mcap.storage.listing import RecordingStamp
+
+
+@contextlib.contextmanager
+def server_with(directory: Path, **limits: Any) -> Iterator[TupliAPIClient]:
+    """The admin of a server."""
+    with serving(Settings(directory, **limits)) as url, TupliAPIClient(url) as admin:
+        admin.login("admin", PASSWORD)
+        yield admin
+
+
+def token_of(user: TupliAPIClient) -> dict[str, str]:
+    return {"Authorization": f"Bearer {user._session._token()}"}
+
+
+def begin(user: TupliAPIClient, data: bytes) -> httpx.Response:
+    digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
+    headers = {"Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}", **token_of(user)}
+    return httpx.post(f"{user.url}/v1/uploads", headers=headers)
+
+
+@pytest.fixture
+def another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Makes users, each on a machine of their own."""
+    with contextlib.ExitStack() as stack:
+
+        def made(admin: TupliAPIClient, name: str) -> TupliAPIClient:
+            admin.signup(name, "password")
+            monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / name))
+            user = stack.enter_context(TupliAPIClient(admin.url))
+            user.login(name, "password")
+            return user
+
+        yield made
+
+
+# --- requests ---
+
+
+def test_bodies_are_of_a_size_that_is_said_before(tmp_path: Path) -> None:
+    with server_with(tmp_path / "served", max_message=1000, max_body=5000) as admin:
+        headers = token_of(admin)
+        for path, size in (("/v1/episodes/list", 1001), ("/v1/artifacts", 5001), ("/v1/tokens", 2000)):
+            refused = httpx.post(admin.url + path, content=b"x" * size, headers=headers)
+            assert refused.status_code == 413, path
+            assert "expected a body of at most" in refused.json()["detail"]
+        unsaid = httpx.post(f"{admin.url}/v1/episodes/list", content=iter([b"{}"]), headers=headers)
+        assert unsaid.status_code == 413
+        assert admin.store_artifact(b"x" * 5000, ArtifactMetadata(name="x")).id
+
+
+@pytest.mark.parametrize(
+    ("filter", "message"),
+    [
+        ({"type": "IN", "key": "steps", "value": list(range(20_001))}, "at most 20000 values, found 20001"),
+        ({"type": "OR", "filters": [{"type": "EQ", "key": "steps", "value": 1}] * 20_001}, "found 20001"),
+        ({"type": "EQ", "key": "steps"}, "needs a key and a value"),
+        (3, "filter"),
+    ],
+)
+def test_filters_that_cost_too_much_are_refused(tmp_path: Path, filter: Any, message: str) -> None:
+    with server_with(tmp_path / "served") as admin:
+        for path in ("/v1/episodes/list", "/v1/episodes/count", "/v1/episodes/delete", "/v1/benchmarks/list"):
+            refused = httpx.post(
+                admin.url + path, json={"filter": filter}, headers=token_of(admin), timeout=60
+            )
+            assert refused.status_code == 400, path
+            assert message in refused.json()["detail"], path
+
+
+def test_filters_that_are_too_deep_are_refused(tmp_path: Path) -> None:
+    deep: Any = {"type": "EQ", "key": "steps", "value": 1}
+    for _ in range(33):
+        deep = {"type": "NOT", "filters": [deep]}
+    with server_with(tmp_path / "served") as admin:
+        deeper = "[" * 100_000
+        for body in (json.dumps({"filter": deep}), f'{{"filter": {deeper}'):
+            headers = {**token_of(admin), "Content-Type": "application/json"}
+            refused = httpx.post(f"{admin.url}/v1/episodes/list", content=body, headers=headers)
+            assert refused.status_code == 400, refused.text[:200]
+
+
+@pytest.mark.parametrize("of", ["sqlite", "postgresql"])
+def test_questions_that_take_too_long_are_given_up(of: str, tmp_path: Path, request: Any) -> None:
+    with contextlib.ExitStack() as stack:
+        url = f"sqlite:///{tmp_path / 'server.sqlite'}"
+        if of == "postgresql":
+            postgres: Cluster = request.getfixturevalue("postgres")
+            url = stack.enter_context(postgres.database())
+        rows = [
+            EpisodeRow(i, 0, i, "terminal", 1.0, None, 0, "me", '["me"]', '{"x": 1}') for i in range(50_000)
+        ]
+        with contextlib.closing(Database(url, 0.005)) as database:
+            with database.writing() as connection:  # which takes longer
+                told: dict[str, Any] = {"uuid": "u", "benchmark_id": "", "rows": rows, "runs": "[{}]"}
+                queries.put_recording(connection, "a.mcap", RecordingStamp(1, 2, 3), **told)
+            for asked in (F("metadata.x") > 5, F("metadata.x") != 5, FilterNOT(filters=[F("steps") < 0])):
+                with pytest.raises(
+                    (TooLongError, FilterError), match="this takes too long; narrow the filter"
+                ):
+                    with database.reading() as connection:
+                        list(queries.find_episodes(connection, asked))
+        with contextlib.closing(Database(url)) as database, database.reading() as connection:
+            assert queries.count_episodes(connection, F("metadata.x") != 5) == 50_000
+
+
+def test_lists_come_in_pages(tmp_path: Path) -> None:
+    with server_with(tmp_path / "served", max_page=3) as admin:
+        benchmarks = [admin.store_benchmark(query(name=f"b{i}")).id for i in range(7)]
+        for i in range(4):
+            admin.store_artifact(b"%d" % i, ArtifactMetadata(name=f"a{i}"))
+        admin.record_episodes([episode(benchmarks[0]) for _ in range(4)])
+        assert [header.id for header in admin.list_benchmarks()] == benchmarks
+        assert [item.name for item in admin.list_artifacts()] == [f"a{i}" for i in range(4)]
+        assert len(admin.list_episodes()) == 4
+
+        def page(told: dict[str, Any]) -> Any:
+            answer = httpx.post(f"{admin.url}/v1/benchmarks/list", json=told, headers=token_of(admin)).json()
+            return [benchmarks.index(item["id"]) for item in answer["items"]], answer["next"]
+
+        assert page({}) == ([0, 1, 2], "3")
+        assert page({"cursor": "3", "limit": 2}) == ([3, 4], "5")
+        assert page({"cursor": "6", "limit": 1000}) == ([6], None)
+        assert page({"offset": 2, "limit": 0}) == ([], None)
+
+
+# --- users ---
+
+
+def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
+    with server_with(tmp_path / "served", quota=20_000) as admin:
+        ann = another(admin, "ann")
+        ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))
+        ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
+        with pytest.raises(
+            StorageError, match="ann may keep 20000 bytes, uses 15000, and these are 9000 more"
+        ):
+            ann.store_artifact(b"y" * 9000, ArtifactMetadata(name="y"))
+        assert begin(ann, b"z" * 5000).status_code == 201
+        full = begin(ann, b"z" * 5001)
+        assert (full.status_code, full.json()["error"]) == (507, "StorageError")
+        assert begin(ann, b"z" * 5000).status_code == 201  # the same one
+        told = ann._session.ask("GET", "/v1/me")
+        assert (told["used"], told["quota"]) == (20_000, 20_000)
+
+        with pytest.raises(StorageError, match="Insufficient permissions"):
+            ann._session.ask("PUT", "/v1/users/ann/quota", {"bytes": 10**9})
+        admin._session.ask("PUT", "/v1/users/ann/quota", {"bytes": 60_000})
+        benchmark = ann.store_benchmark(query()).id
+        ann.record_episodes([episode(benchmark)])
+        used = ann._session.ask("GET", "/v1/me")["used"]
+        with pytest.raises(StorageError, match=f"may keep 60000 bytes, uses {used}"):
+            ann.store_artifact(b"y" * 60_000, ArtifactMetadata(name="y"))
+        ann.delete_episodes(F("steps") > 0)
+        ann.delete_benchmark(benchmark)
+        assert ann._session.ask("GET", "/v1/me")["used"] == 20_000
+        admin._session.ask("PUT", "/v1/users/ann/quota", {"bytes": None})
+        assert ann._session.ask("GET", "/v1/me")["quota"] == 20_000
+        with pytest.raises(NotFoundError, match="User does not exist"):
+            admin._session.ask("PUT", "/v1/users/nobody/quota", {"bytes": 1})
+
+
+def test_a_user_begins_so_many_uploads(tmp_path: Path, another: Any) -> None:
+    with server_with(tmp_path / "served", max_uploads=2) as admin:
+        first = begin(admin, b"a")
+        assert [begin(admin, data).status_code for data in (b"b", b"c", b"a")] == [201, 429, 201]
+        assert begin(another(admin, "ann"), b"c").status_code == 201
+        httpx.delete(admin.url + first.headers["Location"], headers=token_of(admin))
+        assert begin(admin, b"c").status_code == 201
+
+
+def test_what_a_deleted_user_kept_for_themselves_goes(tmp_path: Path, another: Any) -> None:
+    with server_with(tmp_path / "served") as admin:
+        ann = another(admin, "ann")
+        artifacts = [ann.store_artifact(data, ArtifactMetadata(name="x")).id for data in (b"a", b"b")]
+        benchmark = ann.store_benchmark(query(artifacts=(artifacts[0],))).id
+        made = ann.record_episodes([episode(benchmark), episode(benchmark)])
+        alone = ann.record_episodes([episode(benchmark, 5)])
+        ann.publish_benchmark(benchmark)
+        ann.publish_artifact(artifacts[0])
+        ann.publish_episode(made[0].id)
+        with pytest.raises(StorageError, match="Insufficient permissions"):
+            another(admin, "eve").delete_user("ann")
+        admin.delete_user("ann")
+        assert [header.id for header in admin.list_benchmarks()] == [benchmark]
+        assert [item.id for item in admin.list_artifacts()] == [artifacts[0]]
+        assert [header.id for header in admin.list_episodes()] == [made[0].id]
+        kept = [
+            path.name for path in (tmp_path / "served").glob("*/**/*") if path.parent.parent.name != "server"
+        ]
+        assert artifacts[0] in kept and artifacts[1] not in kept
+        assert made[0].recording.rpartition("/")[2] in kept
+        assert alone[0].recording.rpartition("/")[2] not in kept
+
+
+# --- connections ---
+
+
+@pytest.fixture
+def impatient(tmp_path: Path) -> Iterator[tuple[str, int]]:
+    with serving(Settings(tmp_path / "served", head_seconds=0.5, stall_seconds=0.5)) as url:
+        yield "127.0.0.1", urlsplit(url).port or 0
+
+
+def ended(connection: socket.socket) -> bytes:
+    """What a server has sent when it ends a connection."""
+    connection.settimeout(60)
+    found = bytearray()
+    with contextlib.suppress(ConnectionResetError):
+        while data := connection.recv(1 << 16):
+            found += data
+    return bytes(found)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        b"GET / HTTP/1.1\r\nHost: x\r\n",
+        b"POST /v1/tokens HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\n{",
+    ],
+)
+def test_who_does_not_finish_a_request_is_cut_off(impatient: tuple[str, int], sent: bytes) -> None:
+    with socket.create_connection(impatient) as connection:
+        connection.sendall(sent)
+        assert ended(connection) == b""
+
+
+def test_who_sends_a_head_bit_by_bit_is_cut_off(impatient: tuple[str, int]) -> None:
+    with socket.create_connection(impatient) as connection:
+        with pytest.raises(OSError, match="reset|pipe"):
+            for _ in range(600):
+                connection.sendall(b"X")
+                time.sleep(0.1)
+
+
+def test_who_does_not_take_the_answer_is_cut_off(tmp_path: Path) -> None:
+    with server_with(tmp_path / "served", stall_seconds=0.5) as admin:
+        uri = admin.store_artifact(b"\0" * (64 << 20), ArtifactMetadata(name="large")).id
+        with socket.create_connection(("127.0.0.1", urlsplit(admin.url).port or 0)) as connection:
+            head = "".join(f"{key}: {value}\r\n" for key, value in token_of(admin).items())
+            connection.sendall(f"GET /v1/artifacts/{uri} HTTP/1.1\r\nHost: x\r\n{head}\r\n".encode())
+            connection.recv(1000)
+            metrics = httpx.get(f"{admin.url}/metrics", headers=token_of(admin))
+            while "tupli_mcap_requests_running 2.0" in metrics.text:  # that one, and this question
+                time.sleep(0.1)
+                metrics = httpx.get(f"{admin.url}/metrics", headers=token_of(admin))
+            assert len(ended(connection)) < 64 << 20

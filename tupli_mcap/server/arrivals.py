@@ -1,0 +1,155 @@
+"""Recordings that come to a server: new ones, those that go on in parts, and wholes that take the place of their parts.
+Every function works in a transaction of its caller's.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import secrets
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
+
+from sqlalchemy import Connection, insert, select
+
+from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.server.database import audience, audit, settle
+from tupli_mcap.server.episodes import forget, whole_name
+from tupli_mcap.server.people.access import Caller, Right, readable
+from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.tables import FILE, ITEM
+from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.entries import rows_of, runs_of
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
+from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
+
+__all__ = ["new_name", "register", "stored_already"]
+
+_PLAIN: Final = "plain"  # where recordings without a benchmark lie
+
+
+def new_name(benchmark_id: str) -> str:
+    """A name for a recording that nothing has yet: time (UTC) and random digits."""
+    now = datetime.datetime.now(datetime.UTC)
+    return f"recordings/{benchmark_id or _PLAIN}/{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
+
+
+def stored_already(connection: Connection, caller: Caller, digest: str) -> str | None:
+    """The name of the caller's recording with these bytes; None if there is none."""
+    own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.digest == digest)
+    found: str | None = connection.execute(own).scalar()
+    return found
+
+
+def register(
+    connection: Connection,
+    caller: Caller,
+    recording: Recording,
+    place: str,
+    digest: str,
+    *,
+    deleted: Collection[int] = (),
+    sent_before: int = 0,
+) -> tuple[str, list[str]]:
+    """Lists the episodes of a recording whose file is kept at `place`, but those that are `deleted`; returns the
+    name of the recording, and the places of files to forget.
+
+    A recording that goes on may come in parts: files with some of its episodes, each in one of them. A file that has
+    all episodes of earlier ones takes their place: what was published stays published, and what was deleted deleted.
+    Deleted are, too, those with numbers below `sent_before` that are not there any more: the caller has sent them.
+
+    Raises:
+        NotFoundError: its benchmark is not stored, or the caller may not read it.
+        ConflictError: it has some episodes of a file that is stored, but lacks others.
+        StorageError: it has no episodes.
+    """
+    caller.demand(Right.EPISODE_CREATE, caller.name)
+    numbers = {int(number) for number in recording.index["episode"]}
+    if not numbers:
+        raise StorageError("expected a recording with episodes, found one without any")
+    _demand_benchmark(connection, caller, recording.benchmark_id)
+    earlier = _parts(connection, caller, recording.uuid)
+    replaced = [part for part in earlier if part.seen_by.keys() <= numbers]
+    sidecar = Sidecar(uuid=recording.uuid)
+    for part in earlier:
+        if part in replaced:
+            sidecar.published_in |= part.seen_by
+        elif numbers & part.seen_by.keys():
+            raise ConflictError(
+                f"the recording {recording.uuid} is stored with episode {min(part.seen_by.keys() - numbers)}, which "
+                "this file lacks; delete what is stored first"
+            )
+    stored = {number for part in earlier for number in part.seen_by}
+    gone_since = {number for number in numbers - stored if number < sent_before}
+    sidecar.deleted = gone_since.union(deleted, *(part.deleted for part in earlier))
+    gone = [forget(connection, part.name) for part in replaced]
+    name = _name_of(place, min(numbers), [part.name for part in earlier], [part.name for part in replaced])
+    if numbers <= sidecar.deleted:
+        return name, [*gone, place]
+    settle(connection, place)
+    _put(connection, caller, recording, name, sidecar)
+    told = {"path": escape_text(name), "place": escape_text(place), "created_by": caller.name}
+    told |= {"uuid": recording.uuid, "digest": digest, "deleted": json.dumps(sorted(sidecar.deleted))}
+    connection.execute(insert(FILE).values(**told, size=recording.size, episodes=len(numbers)))
+    audit(connection, caller.name, "store_recording", name)
+    return name, [each for each in gone if each != place]
+
+
+class _Part(NamedTuple):
+    """A file that is stored of a recording: who sees each of its episodes, and which of them were deleted."""
+
+    name: str
+    seen_by: dict[int, list[str]]
+    deleted: set[int]
+
+
+def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_Part]:
+    own = select(FILE.c.path, FILE.c.deleted).where(FILE.c.created_by == caller.name, FILE.c.uuid == uuid)
+    listed = select(EPISODE.c.episode, EPISODE.c.published_in).join(
+        RECORDING, RECORDING.c.id == EPISODE.c.recording_id
+    )
+    parts = []
+    for path, deleted in connection.execute(own.order_by(FILE.c.path)).all():
+        found = connection.execute(listed.where(RECORDING.c.path == path))
+        seen_by = {number: json.loads(groups) for number, groups in found}
+        parts.append(_Part(unescape_text(path), seen_by, set(json.loads(deleted))))
+    return parts
+
+
+def _name_of(place: str, first: int, earlier: Sequence[str], replaced: Sequence[str]) -> str:
+    """The name of a file, with episodes from `first` on, among those of its recording: that of the whole where it is
+    free, so that who has listed a part opens what has taken its place."""
+    if not earlier:
+        return place
+    whole = whole_name(earlier[0])
+    if whole in replaced or whole not in earlier:
+        return whole
+    return replaced[0] if replaced else f"{whole}/{first:010}-{secrets.token_hex(6)}.mcap"
+
+
+def _put(connection: Connection, caller: Caller, recording: Recording, name: str, sidecar: Sidecar) -> None:
+    """Lists a recording in the catalog."""
+    audience(connection, [caller.name])
+    queries.put_recording(
+        connection,
+        name,
+        RecordingStamp(recording.size, 0, 0),
+        uuid=recording.uuid,
+        benchmark_id=recording.benchmark_id,
+        rows=rows_of(recording, sidecar, created_by=caller.name),
+        runs=runs_of(recording),
+    )
+
+
+def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
+    if not benchmark_id:
+        return
+    seen = readable(caller, Right.BENCHMARK_READ, ITEM.c.created_by, ITEM.c.published_in)
+    there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
+    if not is_hash(benchmark_id) or not connection.execute(there).first():
+        raise NotFoundError(
+            f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
+        )

@@ -1,0 +1,218 @@
+"""Copies of all that a server keeps, made while it runs.
+
+A backup is a directory as a server with SQLite has it: `tupli-mcap serve` serves it as it is. It is made and restored
+by the same steps, whichever database and bucket there are on either side:
+
+1. The tables are copied as they are at one moment. What comes and goes meanwhile does not wait.
+2. The files that they name are copied, but those that are there already: a name never changes its content. Each is
+   compared with the SHA-256 that the tables have.
+3. A file may have been deleted since the first step. Then all is done again, which takes as long as there is news.
+4. The new tables take the place of the old ones, at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from sqlalchemy import Connection, func, inspect, select, text
+
+from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.progress import Progress, progress
+from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, DirectoryBlobs, LostError
+from tupli_mcap.server.database import Database
+from tupli_mcap.server.items import artifact_key
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.tables import FAILURE, FILE, ITEM, METADATA, PENDING, UPLOAD, USER
+from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
+from tupli_mcap.storage.texts import unescape_text
+
+__all__ = ["Copied", "back_up", "restore"]
+
+_PASSING: Final = (FAILURE, PENDING, UPLOAD)  # of no use elsewhere
+_ATTEMPTS: Final = 20
+_UNLIMITED: Final = 7 * 24 * 3600.0
+_ROWS: Final = 5000
+
+
+class Copied(NamedTuple):
+    """What a backup holds: how many users, recordings and artifacts, the bytes of those, and how many files were copied
+    now."""
+
+    users: int
+    recordings: int
+    artifacts: int
+    bytes: int
+    copied: int
+
+
+def back_up(settings: Settings, target: Path) -> Copied:
+    """Copies what a server keeps into a directory, which is empty or holds an earlier backup; the server may run.
+
+    Raises:
+        StorageError: there is no server's data, the directory holds something else, or something of it cannot be read.
+        FormatError: a file is not what the database says.
+    """
+    place, kept = _place_of(settings), _place_of(Settings(target))
+    if not settings.database and not place.sqlite.exists():
+        raise StorageError(f"{str(settings.directory)!r} holds no server's data; serve it first")
+    if target.exists() and any(target.iterdir()) and not kept.sqlite.exists():
+        raise StorageError(f"{str(target)!r} holds something else than a backup; choose another directory")
+    kept.sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    new = kept.sqlite.with_name("server.sqlite.new")
+    with contextlib.closing(Database(place.database, _UNLIMITED)) as source:
+        for attempt in range(_ATTEMPTS):
+            _remove(new)
+            with contextlib.closing(Database(f"sqlite:///{new}", _UNLIMITED)) as made:
+                _copy_tables(source, made)
+                contents = _contents(made)
+            try:
+                copied = _copy_files(contents, place.blobs, kept.blobs, kept.sqlite.parent)
+                break
+            except LostError:
+                if attempt == _ATTEMPTS - 1:
+                    raise
+    for suffix in ("-wal", "-shm"):
+        kept.sqlite.with_name(kept.sqlite.name + suffix).unlink(missing_ok=True)
+    new.replace(kept.sqlite)
+    known = {target / file.name for file in contents.files}
+    for path in [*(target / "artifacts").rglob("*"), *(target / "recordings").rglob("*")]:
+        if path.is_file() and path not in known:
+            path.unlink()  # of an earlier backup
+    return copied
+
+
+def restore(backup: Path, settings: Settings) -> Copied:
+    """Puts a backup where a server is to keep things, where there is nothing. Broken off, it is begun again.
+
+    Raises:
+        StorageError: there is no backup, or something is there already.
+        FormatError: a file of the backup is damaged.
+    """
+    kept, place = _place_of(Settings(backup)), _place_of(settings)
+    if not kept.sqlite.exists():
+        raise StorageError(f"{str(backup)!r} holds no backup of a server")
+    settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))
+        copy = folder / "server.sqlite"  # that of an earlier version is brought up to date
+        shutil.copyfile(kept.sqlite, copy)
+        source = stack.enter_context(contextlib.closing(Database(f"sqlite:///{copy}", _UNLIMITED)))
+        target = stack.enter_context(contextlib.closing(Database(place.database, _UNLIMITED)))
+        with target.reading() as connection:
+            if connection.execute(select(USER.c.name)).first():
+                raise StorageError("there is a server's data already; restore into an empty place")
+        copied = _copy_files(_contents(source), kept.blobs, place.blobs, folder)
+        _copy_tables(source, target)
+    return copied
+
+
+class _Place(NamedTuple):
+    database: str
+    sqlite: Path
+    blobs: Blobs
+
+
+def _place_of(settings: Settings) -> _Place:
+    sqlite = settings.own / "server.sqlite"
+    blobs: Blobs = BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory)
+    return _Place(settings.database or f"sqlite:///{sqlite}", sqlite, blobs)
+
+
+# --- tables ---
+
+
+def _copy_tables(source: Database, target: Database) -> None:
+    tables = [each for each in (*CATALOG.sorted_tables, *METADATA.sorted_tables) if each not in _PASSING]
+    with source.reading() as reading, target.writing() as writing:
+        for table in reversed(tables):
+            writing.execute(table.delete())  # what a new database has by itself
+        for table in tables:
+            names = [column.name for column in table.columns]
+            rows = reading.execute(select(table), execution_options={"yield_per": _ROWS})
+            for page in rows.partitions():
+                queries.insert_all(writing, table, names, [tuple(row) for row in page])
+        if writing.dialect.name == "postgresql":
+            for table in tables:
+                _go_on_counting(writing, table.name)
+
+
+def _go_on_counting(connection: Connection, table: str) -> None:
+    """Rows that PostgreSQL numbers get numbers that none has."""
+    for column in inspect(connection).get_columns(table):
+        if "nextval" in str(column["default"] or ""):
+            name = column["name"]
+            last = f'(SELECT coalesce(max("{name}"), 0) FROM "{table}")'
+            sequence = f"pg_get_serial_sequence('{table}', '{name}')"
+            connection.execute(text(f"SELECT setval({sequence}, 1 + {last}, false)"))
+
+
+# --- files ---
+
+
+class _File(NamedTuple):
+    name: str
+    digest: str
+
+
+class _Contents(NamedTuple):
+    users: int
+    files: list[_File]
+    recordings: int
+    bytes: int
+
+
+def _contents(database: Database) -> _Contents:
+    with database.reading() as connection:
+        users = connection.execute(select(func.count()).select_from(USER)).scalar_one()
+        places = connection.execute(select(FILE.c.place, FILE.c.digest).order_by(FILE.c.place))
+        files = [_File(unescape_text(place), digest) for place, digest in places]
+        ids = select(ITEM.c.id).where(ITEM.c.kind == "artifact").distinct().order_by(ITEM.c.id)
+        artifacts = [_File(artifact_key(uri), uri) for uri in connection.execute(ids).scalars()]
+        size = sum(
+            int(connection.execute(select(func.coalesce(func.sum(column), 0))).scalar_one())
+            for column in (FILE.c.size, ITEM.c.size)
+        )
+    return _Contents(users, [*files, *artifacts], len(files), size)
+
+
+def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path) -> Copied:
+    """Copies the files that are not there. LostError if one is gone."""
+    total = copied = 0
+    with progress(contents.bytes, "copying", in_bytes=True) as bar:
+        for name, digest in contents.files:
+            size = source.size(name)
+            if size is None:
+                raise LostError(f"{name} is gone, and the database names it")
+            total += size
+            if target.size(name) != size:
+                _copy_file(name, digest, size, source, target, folder, bar)
+                copied += 1
+    artifacts = len(contents.files) - contents.recordings
+    return Copied(contents.users, contents.recordings, artifacts, total, copied)
+
+
+def _copy_file(
+    name: str, digest: str, size: int, source: Blobs, target: Blobs, folder: Path, bar: Progress
+) -> None:
+    with tempfile.NamedTemporaryFile(dir=folder) as file:
+        found = hashlib.sha256()
+        for start in range(0, size, PIECE):
+            piece = source.piece(name, start, min(start + PIECE, size))
+            found.update(piece)
+            file.write(piece)
+            bar.advance(len(piece))
+        file.flush()
+        if found.hexdigest() != digest:
+            raise FormatError(f"{name} is damaged: expected the SHA-256 {digest}, found {found.hexdigest()}")
+        target.keep(name, Path(file.name))
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)

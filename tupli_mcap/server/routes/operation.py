@@ -1,0 +1,40 @@
+"""How the server is: for those who run it, and for what starts and stops it."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+
+from tupli_mcap.server.people.access import Right
+from tupli_mcap.server.people.tokens import SignInError
+from tupli_mcap.server.routes.callers import AnyCaller, Served
+from tupli_mcap.server.traffic.metrics import Metrics
+
+__all__ = ["router"]
+
+router = APIRouter(tags=["operation"])
+
+
+@router.get("/health")
+def health() -> dict[str, str]:
+    """Whether the server answers; if not, it is to be started anew."""
+    return {"status": "ok"}
+
+
+@router.get("/ready")
+def ready(library: Served) -> dict[str, str]:
+    """Whether the server reaches its database, and where it keeps recordings; if not (503), requests are to wait."""
+    library.reach()
+    return {"status": "ok"}
+
+
+@router.get("/metrics", response_class=Response)
+def metrics(library: Served, caller: AnyCaller, request: Request) -> Response:
+    """Numbers for Prometheus, whose token must be of somebody who may manage roles, unless everybody may see them."""
+    if not library.settings.open_metrics:
+        if caller.is_guest:
+            raise SignInError("guests are shown no metrics")
+        caller.demand(Right.ROLE_MANAGEMENT)
+    counted: Metrics = request.app.state.metrics
+    with library.database.reading() as connection:
+        return Response(counted.text(connection), media_type=CONTENT_TYPE_LATEST)

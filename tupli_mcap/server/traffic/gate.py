@@ -1,0 +1,125 @@
+"""What every request goes through: it gets an id, its body is not too large, it is counted and logged, and what fails
+in it is told to the log alone."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from typing import Any, Final
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from structlog.contextvars import bind_contextvars, clear_contextvars
+
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.traffic.logs import LOG
+from tupli_mcap.server.traffic.metrics import Metrics
+
+__all__ = ["Gate"]
+
+_CONTENT: Final = frozenset(
+    ("/v1/benchmarks", "/v1/artifacts", "/benchmarks/create", "/artifacts/upload", "/episodes/record")
+)
+_METHODS: Final = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
+_QUIET: Final = frozenset(("/health", "/ready", "/metrics"))
+
+
+class Gate:
+    """An ASGI application around the server's."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
+        self._app, self._settings, self._metrics = app, settings, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        passing = _Passing(scope, receive, send)
+        clear_contextvars()
+        bind_contextvars(id=passing.id)  # which is in every line of the log from here on
+        with self._metrics.running.track_inprogress():
+            try:
+                if (refusal := self._refusal(scope)) is not None:
+                    await passing.answer(413, refusal)
+                else:
+                    await self._app(scope, passing.receive, passing.send)
+            except Exception:
+                LOG.exception("failed", extra={"route": _route(scope)})
+                if not passing.status:
+                    await passing.answer(500, "the server has failed; its log says more")
+                else:
+                    raise  # the connection is broken off, so that nobody takes the answer for a whole one
+            finally:
+                self._note(scope, passing)
+
+    def _refusal(self, scope: Scope) -> str | None:
+        """Why a body is not read."""
+        headers = dict(scope["headers"])
+        if scope["method"] == "PATCH":  # whose body is measured as it comes
+            return None
+        most = self._settings.max_body if scope["path"] in _CONTENT else self._settings.max_message
+        said = headers.get(b"content-length", b"0")
+        if b"transfer-encoding" not in headers and said.isdigit() and len(said) < 20 and int(said) <= most:
+            return None
+        return f"expected a body of at most {most} bytes, with its Content-Length"
+
+    def _note(self, scope: Scope, passing: _Passing) -> None:
+        method = scope["method"] if scope["method"] in _METHODS else "-"
+        route, seconds = _route(scope), time.monotonic() - passing.begun
+        status = passing.status or 499  # nobody was there any more
+        self._metrics.requests.labels(method, route, str(status)).inc()
+        self._metrics.seconds.labels(method, route).observe(seconds)
+        self._metrics.received.inc(passing.received)
+        self._metrics.sent.inc(passing.sent)
+        if route in _QUIET and status < 400:
+            return
+        client = scope.get("client")
+        told = {
+            "user": scope.get("state", {}).get("user"),
+            "address": client[0] if client else None,
+            "method": method,
+            "route": route,
+            "status": status,
+            "seconds": round(seconds, 4),
+            "received": passing.received,
+            "sent": passing.sent,
+        }
+        LOG.info("request", extra=told)
+
+
+class _Passing:
+    """A request on its way through."""
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self.id = secrets.token_hex(8)
+        self.begun = time.monotonic()
+        self.status = self.received = self.sent = 0
+        self._receive, self._send = receive, send
+        scope.setdefault("state", {})
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self.received += len(message.get("body", b""))
+        return message
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self.status = message["status"]
+            headers = {b"x-content-type-options": b"nosniff", b"x-request-id": self.id.encode()}
+            known = {key for key, _ in message.get("headers", ())}
+            added = [(key, value) for key, value in headers.items() if key not in known]
+            message = {**message, "headers": [*message.get("headers", ()), *added]}
+        self.sent += len(message.get("body", b""))
+        await self._send(message)
+
+    async def answer(self, status: int, detail: str) -> None:
+        body = json.dumps({"detail": detail, "error": "StorageError"}).encode()
+        headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
+        await self.send({"type": "http.response.start", "status": status, "headers": headers})
+        await self.send({"type": "http.response.body", "body": body})
+
+
+def _route(scope: Scope) -> str:
+    """The path of a route, with the names of its parameters for their values."""
+    found: Any = getattr(scope.get("route"), "path", None)
+    return str(found) if found else "-"
