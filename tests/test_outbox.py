@@ -141,7 +141,8 @@ client = TupliAPIClient(sys.argv[1])
 if "boot" in sys.argv:
     tupli_mcap.recording.write.writer.boot_id = lambda: "one boot"
 chunk_size = 3000 if "chunks" in sys.argv else 1 << 18
-env = TupliEnvWrapper(gym.make("CartPole-v1"), client, chunk_size=chunk_size)
+durability = "step" if "sealed" in sys.argv else "os"
+env = TupliEnvWrapper(gym.make("CartPole-v1"), client, chunk_size=chunk_size, durability=durability)
 env.store(name="cart")
 for seed in range(30 if "chunks" in sys.argv else 3):
     env.reset(seed=seed)
@@ -220,7 +221,7 @@ def test_damaged_recordings_are_saved_as_far_as_they_can_be(proxy: Between, admi
 def test_what_was_recorded_before_the_machine_was_started_anew_is_sent(
     admin: TupliAPIClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kill(records(admin.url, "chunks", "boot"))
+    kill(records(admin.url, "chunks", "boot", "sealed"))
     monkeypatch.setattr("tupli_mcap.journal.file.boot_id", lambda: "another boot")
     admin._outbox.flush(everything=True)
     assert waiting(admin) == 0
