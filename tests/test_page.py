@@ -5,6 +5,9 @@ from __future__ import annotations
 import html
 import re
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -442,3 +445,45 @@ def test_every_kind_of_recording(tmp_path: Path) -> None:
             for camera, _ in enumerate(facts["cameras"]):
                 assert client.get(f"/episode/{uri}/picture/{camera}/0").status_code == 200, name
         client.get("/sparks", params={"episode": [uris[0] for uris in seen.values()]}).raise_for_status()
+
+
+class TestCommand:
+    @pytest.mark.parametrize(
+        ("argument", "said"),
+        [
+            ("nope", "nope does not exist; give a recording"),
+            ("bad.mcap", "expected an MCAP file"),
+            ("https://lab.example/x.mcap", "expected a path, found https://lab.example/x.mcap"),
+        ],
+    )
+    def test_what_it_cannot_show(self, tmp_path: Path, argument: str, said: str) -> None:
+        (tmp_path / "bad.mcap").write_bytes(b"no recording")
+        command = [*COMMAND, argument, "--no-open"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode in (1, 2)
+        assert said in done.stderr
+
+    def test_it_shows_the_directory_it_is_in_until_it_is_interrupted(self, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=1)
+        process = subprocess.Popen(
+            [*COMMAND, "--no-open"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        address = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline())
+        assert address
+        assert told_at(address[0])["datasets"][0]["key"] == "CartPole-v1"
+        port = address[0].rpartition(":")[2]
+        second = [*COMMAND, "--no-open", "--port", port]
+        other = subprocess.run(second, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+        assert (other.returncode, f"port {port} cannot be used" in other.stderr) == (1, True)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+        assert (process.returncode, errors) == (0, "")
+
+
+COMMAND = [sys.executable, "-c", "from tupli_mcap.cli import main; main()", "browse"]
+
+
+def told_at(address: str) -> Any:
+    with httpx.Client(base_url=address, timeout=60) as client:
+        return told(client, "/")

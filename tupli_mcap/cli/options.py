@@ -21,9 +21,9 @@ __all__ = [
 ]  # fmt: skip
 
 
-def local_path(text: str) -> Path:
-    """A path; BadParameter for a URL, which this command neither changes nor lists."""
-    if is_url(text):
+def local_path(text: str | Path) -> Path:
+    """A path, also a default one; BadParameter for a URL, which this command neither changes nor lists."""
+    if isinstance(text, str) and is_url(text):
         raise typer.BadParameter(
             f"expected a path, found {shown(text)}; download the file, or save what you need of it: "
             "tupli_mcap.open(url).save(path)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import socket
 import webbrowser
@@ -14,7 +15,7 @@ from fastapi.responses import FileResponse
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from tupli_mcap.errors import StorageError, os_reason
+from tupli_mcap.errors import StorageError
 from tupli_mcap.page.answers import error_page
 from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
@@ -73,7 +74,8 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
     if show and has_display():  # else a browser may take over the terminal
         webbrowser.open(address)
     config = uvicorn.Config(app, log_level="warning", server_header=False, timeout_graceful_shutdown=2)
-    uvicorn.Server(config).run([listening])
+    with contextlib.suppress(KeyboardInterrupt):  # which uvicorn raises when it has ended
+        uvicorn.Server(config).run([listening])
 
 
 def _listen(port: int) -> socket.socket:
@@ -83,7 +85,7 @@ def _listen(port: int) -> socket.socket:
         listening.bind((_HOST, port))
     except OSError as err:
         raise StorageError(
-            f"port {port} cannot be used: {os_reason(err)}; choose another one (--port), or none"
+            f"port {port} cannot be used: {err.strerror or err}; choose another one (--port), or none"
         ) from err
     listening.listen(100)
     return listening

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from tupli_mcap.cli.options import local_path
 from tupli_mcap.cli.terminal import flush, say
 from tupli_mcap.errors import missing_extra
 
@@ -15,7 +16,8 @@ __all__ = ["browse"]
 
 def browse(
     path: Annotated[
-        Path, typer.Argument(metavar="[PATH]", help="A directory, a storage, or a recording.")
+        Path,
+        typer.Argument(metavar="PATH", help="A directory, a storage, or a recording.", parser=local_path),
     ] = Path(),
     port: Annotated[int, typer.Option(min=0, max=65535, help="By default, a free one.")] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only print the address.")] = False,
