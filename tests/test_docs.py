@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -163,6 +164,11 @@ def test_every_environment_variable_is_listed() -> None:
     page = (ROOT / "docs/reference/variables.md").read_text(encoding="utf-8")
     variables = re.compile(r"TUPLI_MCAP_[A-Z_]+")
     assert set(variables.findall(code)) == set(variables.findall(page))
+
+
+def test_the_citation_is_of_this_version() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 # --- that these tests can fail ---

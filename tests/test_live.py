@@ -84,7 +84,7 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
-        process.wait(20)
+        process.wait(120)
 
 
 def roll(env: gym.Env[Any, Any], steps: int, pause: float = 0.0, seed: int = 1) -> None:
@@ -830,7 +830,7 @@ class Client:
         time.sleep(0.2)  # for the server to hear of it
 
     def join(self) -> None:
-        self._thread.join(10)
+        self._thread.join(120)
 
 
 def in_file(path: Path) -> dict[tuple[str, int, bytes], int]:

@@ -248,11 +248,11 @@ def test_the_web_viewer_ends_with_the_command(folder: Path) -> None:
         url = urlsplit(process.stdout.readline().strip())
         data = urlsplit(parse_qs(url.query)["url"][0].removeprefix("rerun+"))
         assert url.hostname == data.hostname == "127.0.0.1"
-        with urllib.request.urlopen(f"http://{url.netloc}/", timeout=20) as page:
+        with urllib.request.urlopen(f"http://{url.netloc}/", timeout=120) as page:
             assert b"Rerun" in page.read()
         assert {address for port in (url.port, data.port) for address in listening(port)} == {"0100007F"}
         process.send_signal(signal.SIGINT)
-        assert process.wait(20) == 0
+        assert process.wait(120) == 0
         assert process.stderr is not None and process.stderr.read() == ""
     finally:
         process.kill()
@@ -290,7 +290,7 @@ def test_the_native_viewer_stays_open(folder: Path, monkeypatch: pytest.MonkeyPa
         with Recording(folder / "runs" / "one.mcap") as recording:
             pid = recording.replay(episodes="best")
         client = ViewerClient.connect(f"rerun+http://127.0.0.1:{ports[0]}/proxy")
-        until = time.monotonic() + 20
+        until = time.monotonic() + 120
         timelines: list[str | None] = []
         while timelines != ["step"] and time.monotonic() < until:
             timelines = [found.current_timeline for found in client.get_state().recordings]
@@ -301,7 +301,7 @@ def test_the_native_viewer_stays_open(folder: Path, monkeypatch: pytest.MonkeyPa
         if pid:
             os.kill(pid, signal.SIGKILL)
         screen.terminate()
-        screen.wait(10)
+        screen.wait(120)
 
 
 def test_in_a_notebook_it_is_the_result_of_a_cell(folder: Path) -> None:

@@ -70,7 +70,7 @@ def test_all_episodes_apart_are_opened_from_the_standard_input(
 ) -> None:
     shown(viewer, cart_pole, "--split")
     with HeadlessViewer(tmp_path, piped=cart_pole.with_suffix(".rrd")) as window:
-        for _ in patiently(20.0):
+        for _ in patiently(120.0):
             if len(window.settled().recordings) == 3:
                 break
         assert len(window.client.get_state().recordings) == 3 and window.problems() == []
@@ -83,7 +83,7 @@ def test_recordings_of_different_environments_are_opened_without_a_complaint(
     result = CliRunner().invoke(app, ["replay", str(cart_pole), str(other), "--save", str(goal)])
     assert "open it with: rerun - < " in result.output
     with HeadlessViewer(tmp_path, piped=goal) as window:
-        for _ in patiently(20.0):
+        for _ in patiently(120.0):
             if len(window.settled().recordings) == 2:
                 break
         assert len(window.client.get_state().recordings) == 2 and window.problems() == []

@@ -25,6 +25,7 @@ _ADDRESS = re.compile(r"gRPC connections on 127\.0\.0\.1:(\d+)")
 _OPTIONS = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen")
 _SOME = 100  # pixels of data that make a view filled
 _BAR = 36  # rows of pixels
+_PATIENCE = 120.0  # seconds: the machine may be busy
 _FADED = 6.0  # seconds after which the viewer's notes on loading are gone
 _ENVIRONMENT = {"RUST_LOG": "info", "NO_COLOR": "1", "RERUN_APP_ONLY": "true", "DISPLAY": ""}
 
@@ -71,7 +72,7 @@ class HeadlessViewer:
         return self._process.pid
 
     def _port(self) -> int:
-        for _ in patiently(30.0):
+        for _ in patiently(_PATIENCE):
             if found := _ADDRESS.search(self._words()):
                 return int(found[1])
             if self._process.poll() is not None:
@@ -96,7 +97,7 @@ class HeadlessViewer:
 
     def settled(self) -> ViewerState:
         """The state once nothing loads any more and every view has been drawn at least once."""
-        for _ in patiently(20.0):
+        for _ in patiently(_PATIENCE):
             state = self.client.get_state()
             if state.recordings and not state.loading:
                 break
@@ -109,7 +110,7 @@ class HeadlessViewer:
 
     def _pause(self) -> None:
         """Stops the time, else every picture waits for the next ones."""
-        for _ in patiently(20.0):
+        for _ in patiently(_PATIENCE):
             try:
                 return self.client.set_time(play_state="paused")
             except ConnectionError as err:  # the recording in front is not the one that has some

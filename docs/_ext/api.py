@@ -89,6 +89,8 @@ def _as_rest(app: Sphinx, what: str, name: str, value: Any, options: Any, lines:
     if what == "data" and value.__doc__ == type(value).__doc__:
         lines.clear()  # what its type is about
     lines[:] = _escaped("\n".join(_sections(lines))).split("\n")
+    if what in ("attribute", "data", "property"):
+        lines.insert(0, "")  # else what stands before a colon in the first line is taken for a type
 
 
 def _sections(lines: list[str]) -> Iterator[str]:
