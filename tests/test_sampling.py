@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from environments import Sampler, same
 from gymnasium import spaces
-from test_readme import missing, run_python
 
 from tupli_mcap import RecordEpisodes, Recording, TupliDataset
 from tupli_mcap.dataset.items import FIELDS
@@ -132,11 +131,3 @@ def test_loaded_windows_are_those_of_the_recordings(recorded: list[Path]) -> Non
         found, expected = made(loaded)[5:90].asdict(), made(recordings)[5:90].asdict()
         assert found.keys() == expected.keys()
         assert all(same(found[name], expected[name]) for name in found)
-
-
-def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "sampling.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    names = run_python(text)
-    assert names["one"].states.shape == (10, 4) and names["around"][:32].masks["action"].shape == (32, 4)
-    assert names["windows"][[0, 17, 4]].states.shape == (3, 10, 4) and missing(text) == []

@@ -21,7 +21,6 @@ import pytest
 from environments import Sampler, Scripted, roll, same
 from gymnasium import spaces
 from hypothesis import given, strategies as st
-from test_readme import missing, run_python
 from test_sampling_properties import FEW, Library, dataset_of, libraries
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, TupliDataset, files
@@ -580,11 +579,3 @@ def test_any_changed_byte_gives_columns_or_a_clear_error(cart: Files, tmp_path: 
         except TupliError as err:
             refusals.append(str(err))
     assert len(refusals) > 60 and all(name in refusal for refusal in refusals)
-
-
-def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    text = (Path(__file__).parents[1] / "docs" / "columns.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    assert run_python(text)["batch"].states.shape == (3, 8, 4) and missing(text) == []
-    told = set(re.findall(r"[a-z_]+(?:\.npy|\.json)", text.split("```\ncolumns/")[1].split("```")[0]))
-    assert told - {"state_joints.npy"} == {path.name for path in (tmp_path / "columns").iterdir()}

@@ -39,7 +39,7 @@ from tupli_mcap.torch.order import Batches, Blocks, Part  # noqa: E402
 from tupli_mcap.torch.packed import packed  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")  # torchdata's
-GUIDE = Path(__file__).parents[1] / "docs" / "pytorch.md"
+GUIDE = Path(__file__).parents[1] / "docs" / "howto" / "pytorch.md"
 SMALL = 20_000  # bytes: a few chunks of what `record` writes
 
 
@@ -652,7 +652,7 @@ def test_batches_go_through_the_pinning_thread(dataset: TupliDataset) -> None:
 
 def test_the_documented_policy_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run_python(GUIDE.read_text())
+    names = run_python(GUIDE.read_text(encoding="utf-8").replace("{code-cell} ", ""))
     assert len(names["rest"]) == len(names["stream"]) - 1
     assert names["batch"]["next", "reward"].shape == (32, 1)
     policy, test = names["policy"], gym.make("CartPole-v1")

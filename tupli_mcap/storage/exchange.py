@@ -124,8 +124,9 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
         data = source.load_artifact(artifact)
         (item,) = source.list_artifacts(FilterEQ(key="id", value=artifact))
         target.store_artifact(data, ArtifactMetadata.model_validate(item.model_dump()))
+    told = benchmark.stored_metadata  # what its hash is of
     target.store_benchmark(
-        BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=benchmark.metadata)
+        BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=told)
     )
     return len(missing)
 
