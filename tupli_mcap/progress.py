@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, ClassVar
 
 __all__ = ["Progress", "progress"]
 
@@ -15,7 +15,9 @@ _PATIENCE = 1.0  # seconds without a bar
 
 
 class Progress:
-    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it."""
+    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it, and no other one shows."""
+
+    _shown: ClassVar[list[Progress]] = []
 
     def __init__(self, total: int, what: str, *, in_bytes: bool) -> None:
         self._total = total
@@ -30,8 +32,9 @@ class Progress:
         """`steps` more are done."""
         self._done += steps
         if self._bar is None:
-            if time.monotonic() - self._started < _PATIENCE or not _visible():
+            if time.monotonic() - self._started < _PATIENCE or self._shown or not _visible():
                 return
+            self._shown.append(self)
             from rich.console import Console
             from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
 
@@ -41,11 +44,22 @@ class Progress:
             self._bar = Bar(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
             self._task = self._bar.add_task(self._what, total=self._total)
             self._bar.start()
-        self._bar.update(self._task, completed=self._done, refresh=True)
+        self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
+
+    @property
+    def is_done(self) -> bool:
+        return self._done >= self._total
+
+    def expect(self, steps: int) -> None:
+        """`steps` more are to be done."""
+        self._total += steps
 
     def close(self) -> None:
+        """Takes the bar away; one that advances once more comes back."""
         if self._bar is not None:
             self._bar.stop()
+            self._bar = None
+            self._shown.remove(self)
 
 
 @contextmanager

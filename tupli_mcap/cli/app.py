@@ -22,6 +22,7 @@ from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust, upkeep
 from tupli_mcap.cli.terminal import (
     fail,
+    fetch_progress,
     flush,
     print_traceback,
     say,
@@ -54,7 +55,8 @@ class _Group(TyperGroup):
         words = [word for word in given if word != "--debug"] + words[len(given) :]
         begin_json(next((word for word in given if word in _NAMES), None))
         try:
-            with warnings_in_one_line():
+            from_servers = any("://" in word for word in given)
+            with warnings_in_one_line(), fetch_progress() if from_servers else contextlib.nullcontext():
                 code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
             flush()
         except BaseException as err:  # noqa: BLE001 - what is no error of ours is raised again

@@ -13,6 +13,7 @@ import contextlib
 import os
 import re
 import sys
+import threading
 import traceback
 import unicodedata
 import warnings
@@ -23,6 +24,7 @@ __all__ = [
     "ask_secret",
     "can_print",
     "fail",
+    "fetch_progress",
     "flush",
     "one_line",
     "print_traceback",
@@ -194,6 +196,26 @@ def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int
     with Progress(TextColumn(what), *shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("steps", total=total)
         yield lambda done: progress.update(task, completed=min(done, total))
+
+
+@contextlib.contextmanager
+def fetch_progress() -> Iterator[None]:
+    """Shows the bytes that come from servers in ranges, where that takes a while."""
+    from tupli_mcap.progress import progress
+    from tupli_mcap.remote.source import watching
+
+    lock = threading.Lock()
+    with progress(0, "fetching", in_bytes=True) as bar:
+
+        def watch(planned: int, came: int) -> None:
+            with lock:
+                bar.expect(planned)
+                bar.advance(came)
+                if bar.is_done:  # what is printed now would stand below it
+                    bar.close()
+
+        with watching(watch):
+            yield
 
 
 @contextlib.contextmanager

@@ -83,6 +83,25 @@ class _Blocks:
         self._bytes -= key[2] - key[1]
 
 
+_watch: Callable[[int, int], None] | None = None
+
+
+@contextmanager
+def watching(watch: Callable[[int, int], None]) -> Iterator[None]:
+    """Has a function told, from any thread, how many bytes more are to come from servers, and how many have come."""
+    global _watch
+    _watch = watch
+    try:
+        yield
+    finally:
+        _watch = None
+
+
+def _tell(planned: int, came: int) -> None:
+    if _watch is not None:
+        _watch(planned, came)
+
+
 _blocks = _Blocks(BLOCK_BYTES)
 _fetchers = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="tupli-remote")
 
@@ -140,6 +159,7 @@ class RemoteSource:
         with self._lock:
             self._planned = pieces_of(missing)[::-1]
             self._unread = set()
+            _tell(sum(stop - start for start, stop in self._planned), 0)
             self._fill()
 
     def _ask_for(self, start: int, stop: int) -> _Block:
@@ -151,6 +171,7 @@ class RemoteSource:
                     return self._begin(first, last)
             if stop <= _HEAD:
                 start, stop = 0, min(_HEAD, self.size)
+            _tell(stop - start, 0)
             return self._begin(start, stop)
 
     def _go_on(self, block: _Block) -> None:
@@ -174,6 +195,7 @@ class RemoteSource:
         data = self._remote.get(start, stop, self._tail.version)
         if len(data) != stop - start:
             raise changed(self._url)
+        _tell(0, len(data))
         return data
 
     def refresh(self) -> None:
@@ -240,7 +262,7 @@ def _download(url: str, remote: RemoteObject, file: IO[bytes], size: int) -> Non
     """Copies a file, with a bar of the bytes; a connection that breaks off is an error."""
     done = 0
     try:
-        with progress(size, f"downloading {shown(url)} (bytes)") as bar:
+        with progress(size, f"downloading {shown(url)}", in_bytes=True) as bar:
             for piece in remote.pieces():
                 file.write(piece)
                 done += len(piece)
