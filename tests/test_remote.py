@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import multiprocessing
+import os
 import pickle
+import pty
 import re
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +32,7 @@ from tupli_mcap.remote.patterns import _expression
 from tupli_mcap.remote.plan import pieces_of
 
 EPISODES, STEPS = 40, 500
+TOOL = Path(sys.executable).with_name("tupli-mcap")
 
 
 @pytest.fixture(scope="module")
@@ -232,6 +238,25 @@ def test_commands_take_addresses(server: WebServer, large: Path, command: str) -
     assert far.exit_code == near.exit_code == 0, far.output
     there = far.stdout.replace(server.url(), str(large))
     assert json.loads(there).keys() == json.loads(near.stdout).keys()
+
+
+def test_a_terminal_shows_the_bytes_that_come(server: WebServer) -> None:
+    server.delay = 0.7
+    ours, theirs = pty.openpty()
+    command = [str(TOOL), "doctor", server.url(), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=theirs) as process:
+        os.close(theirs)
+        said, _ = process.communicate(timeout=120)
+    shown_there = b""
+    with contextlib.suppress(OSError):  # the other end has closed
+        while part := os.read(ours, 1 << 16):
+            shown_there += part
+    os.close(ours)
+    assert json.loads(said)["result"]["episodes"] == EPISODES
+    assert re.search(rb"fetching.*[0-9.]+/[0-9.]+ MB", shown_there)
+    assert shown_there.rindex(b"\x1b[?25h") > shown_there.rindex(
+        b"fetching"
+    )  # it is gone, and the cursor is back
 
 
 # ---- buckets

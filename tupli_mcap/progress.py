@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import Any, ClassVar
+from typing import Any
 
-__all__ = ["Progress", "progress"]
+__all__ = ["Progress", "alone", "progress"]
 
 _PATIENCE = 1.0  # seconds without a bar
+_shown: list[object] = []  # what shows at the moment: at most one
 
 
 class Progress:
-    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it, and no other one shows."""
-
-    _shown: ClassVar[list[Progress]] = []
+    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it, and no other one shows. Safe
+    from several threads."""
 
     def __init__(self, total: int, what: str, *, in_bytes: bool) -> None:
         self._total = total
@@ -25,41 +26,74 @@ class Progress:
         self._in_bytes = in_bytes
         self._done = 0
         self._started = time.monotonic()
+        self._lock = threading.Lock()
+        self._closed = False
         self._bar: Any = None
         self._task: Any = None
 
     def advance(self, steps: int) -> None:
         """`steps` more are done."""
-        self._done += steps
-        if self._bar is None:
-            if time.monotonic() - self._started < _PATIENCE or self._shown or not _visible():
-                return
-            self._shown.append(self)
-            from rich.console import Console
-            from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
+        with self._lock:
+            self._done += steps
+            if self._bar is None and self._is_due():
+                self._show()
+            if self._bar is not None:
+                self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
 
-            columns = [*Bar.get_default_columns()]
-            if self._in_bytes:
-                columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
-            self._bar = Bar(*columns, console=Console(stderr=True), transient=True, auto_refresh=False)
-            self._task = self._bar.add_task(self._what, total=self._total)
-            self._bar.start()
-        self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
+    def expect(self, steps: int) -> None:
+        """`steps` more are to be done; or fewer, where negative."""
+        with self._lock:
+            self._total += steps
 
     @property
     def is_done(self) -> bool:
+        """Whether nothing is left to be done."""
         return self._done >= self._total
 
-    def expect(self, steps: int) -> None:
-        """`steps` more are to be done."""
-        self._total += steps
+    def hide(self) -> None:
+        """Takes the bar away until the next step."""
+        with self._lock:
+            if self._bar is not None:
+                self._bar.stop()
+                self._bar = None
+                _shown.remove(self)
 
     def close(self) -> None:
-        """Takes the bar away; one that advances once more comes back."""
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
-            self._shown.remove(self)
+        """Takes the bar away."""
+        self._closed = True
+        self.hide()
+
+    def _is_due(self) -> bool:
+        waited = time.monotonic() - self._started
+        return waited >= _PATIENCE and not self._closed and not _shown and _visible()
+
+    def _show(self) -> None:
+        from rich.console import Console
+        from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
+
+        _shown.append(self)
+        columns = [*Bar.get_default_columns()]
+        if self._in_bytes:
+            columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
+        # What is printed to stdout stays there, whatever the bar does.
+        self._bar = Bar(
+            *columns, console=Console(stderr=True), transient=True, auto_refresh=False, redirect_stdout=False
+        )
+        self._task = self._bar.add_task(self._what, total=self._total)
+        self._bar.start()
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """Shows no bar while something else shows."""
+    mark = object()
+    for bar in [each for each in _shown if isinstance(each, Progress)]:
+        bar.hide()
+    _shown.append(mark)
+    try:
+        yield
+    finally:
+        _shown.remove(mark)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ import contextlib
 import os
 import re
 import sys
-import threading
 import traceback
 import unicodedata
 import warnings
@@ -42,6 +41,7 @@ __all__ = [
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _UNUSUAL = re.compile(r"[^\n -~]")
+_hide_bar: Callable[[], None] | None = None
 
 
 def visible(text: str) -> str:
@@ -79,6 +79,7 @@ def say_styled(*parts: tuple[str, str]) -> None:
     from rich.text import Text
 
     shown = [(_encodable(sys.stdout, visible(text)), style) for text, style in parts]
+    _clear()
     Console(highlight=False, soft_wrap=True).print(Text.assemble(*shown))
 
 
@@ -126,7 +127,14 @@ def terminal_width() -> int | None:
 
 
 def _write(stream: TextIO, text: str) -> None:
+    _clear()
     stream.write(_encodable(stream, text))
+
+
+def _clear() -> None:
+    """Takes a bar away, beside which what is printed would stand."""
+    if _hide_bar is not None:
+        _hide_bar()
 
 
 def _encodable(stream: TextIO, text: str) -> str:
@@ -192,8 +200,11 @@ def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from tupli_mcap.progress import alone
+
     shown = (BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
-    with Progress(TextColumn(what), *shown, console=Console(stderr=True), transient=True) as progress:
+    columns = TextColumn(what), *shown
+    with alone(), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("steps", total=total)
         yield lambda done: progress.update(task, completed=min(done, total))
 
@@ -201,31 +212,36 @@ def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int
 @contextlib.contextmanager
 def fetch_progress() -> Iterator[None]:
     """Shows the bytes that come from servers in ranges, where that takes a while."""
+    global _hide_bar
     from tupli_mcap.progress import progress
-    from tupli_mcap.remote.source import watching
+    from tupli_mcap.remote import watching
 
-    lock = threading.Lock()
     with progress(0, "fetching", in_bytes=True) as bar:
 
         def watch(planned: int, came: int) -> None:
-            with lock:
-                bar.expect(planned)
-                bar.advance(came)
-                if bar.is_done:  # what is printed now would stand below it
-                    bar.close()
+            bar.expect(planned)
+            bar.advance(came)
+            if bar.is_done:
+                bar.hide()
 
-        with watching(watch):
-            yield
+        _hide_bar = bar.hide
+        try:
+            with watching(watch):
+                yield
+        finally:
+            _hide_bar = None
 
 
 @contextlib.contextmanager
 def status(doing: str) -> Iterator[Callable[[str], None] | None]:
-    """Gives a function that shows what is being worked on; None where stderr is no terminal."""
-    if not sys.stderr.isatty():
+    """Gives a function that shows what is being worked on; None where stderr is no terminal, or a bar shows."""
+    if not sys.stderr.isatty() or _hide_bar is not None:
         yield None
         return
     from rich.console import Console
     from rich.text import Text
 
-    with Console(stderr=True).status("") as shown:
+    from tupli_mcap.progress import alone
+
+    with alone(), Console(stderr=True).status("") as shown:
         yield lambda name: shown.update(Text(visible(f"{doing} {name}"), overflow="ellipsis", no_wrap=True))

@@ -11,7 +11,7 @@ from tupli_mcap.remote.names import is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import matching
 from tupli_mcap.remote.plan import is_cut_cheaper
-from tupli_mcap.remote.source import RemoteSource, copied, open_url
+from tupli_mcap.remote.source import RemoteSource, copied, open_url, watching
 
 __all__ = [
     "RemoteSource",
@@ -23,4 +23,5 @@ __all__ = [
     "open_store",
     "open_url",
     "shown",
+    "watching",
 ]

@@ -18,9 +18,15 @@ from tupli_mcap.remote.names import is_web, shown
 __all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store"]
 
 _T = TypeVar("_T")
+Tell = Callable[[int], None]  # how many bytes more have come
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
 _RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
+_PIECE = 256 << 10  # bytes that are handed on at least
 _CLIENT = {"connect_timeout": "10s", "timeout": "120s", "allow_http": True}
+
+
+def _nobody(_: int) -> None:
+    pass
 
 
 class NoRangesError(Exception):
@@ -42,12 +48,12 @@ class RemoteObject(Protocol):
         """Its last `length` bytes, or all of them; NoRangesError."""
         ...
 
-    def get(self, start: int, stop: int, version: str) -> memoryview:
-        """The bytes `start:stop` of the version; RecordingError if it is another one by now."""
+    def get(self, start: int, stop: int, version: str, tell: Tell = ...) -> memoryview:
+        """The bytes `start:stop` of the version, telling as they come; RecordingError if it is another one by now."""
         ...
 
-    def pieces(self) -> Iterator[memoryview]:
-        """All of its bytes, from one request."""
+    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+        """Its bytes from an offset on, from one request; RecordingError if it is not the version given."""
         ...
 
 
@@ -153,20 +159,31 @@ class _StoredObject:
                 raise NoRangesError from err
         return End(memoryview(_asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
-    def get(self, start: int, stop: int, version: str) -> memoryview:
-        options: dict[str, Any] = {"range": (start, stop)}
-        if version.startswith('"'):  # a weak tag matches nothing
+    def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
+        data, at = bytearray(stop - start), 0
+        for piece in self._streamed({"range": (start, stop)}, version):
+            if at + len(piece) > len(data):
+                raise changed(self._url)
+            data[at : at + len(piece)] = piece
+            at += len(piece)
+            tell(len(piece))
+        if at != len(data):
+            raise changed(self._url)
+        return memoryview(data).toreadonly()
+
+    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+        yield from self._streamed({"range": {"offset": start}} if start else {}, version)
+
+    def _streamed(self, options: dict[str, Any], version: str | None) -> Iterator[memoryview]:
+        if version and version.startswith('"'):  # a weak tag matches nothing
             options["if_match"] = version
         try:
             found = self._ask(options)
         except _RefusedError as err:
             raise changed(self._url) from err
-        if _version(found.meta) != version:
+        if version is not None and _version(found.meta) != version:
             raise changed(self._url)
-        return memoryview(_asked(self._url, found.bytes))
-
-    def pieces(self) -> Iterator[memoryview]:
-        stream = iter(self._ask({}).stream())
+        stream = iter(found.stream(_PIECE))
         while (piece := _asked(self._url, lambda: next(stream, None))) is not None:
             yield memoryview(piece)
 
@@ -235,11 +252,15 @@ class _FsspecObject:
         data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
         return End(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
 
-    def get(self, start: int, stop: int, version: str) -> memoryview:
-        return memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))
+    def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
+        data = memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))
+        if len(data) != stop - start:
+            raise changed(self._url)
+        tell(len(data))
+        return data
 
-    def pieces(self) -> Iterator[memoryview]:
-        yield memoryview(self._asked(lambda: self._system.cat_file(self._path)))
+    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+        yield memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start)))
 
     def _asked(self, ask: Callable[[], _T]) -> _T:
         try:

@@ -16,10 +16,10 @@ from urllib.parse import urlsplit
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.names import shown
-from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, changed, check_process, find
+from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
 
-__all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url"]
+__all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url", "watching"]
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
 # What is fetched when a file is opened: the summary and the index, unless the file is huge.
@@ -98,8 +98,9 @@ def watching(watch: Callable[[int, int], None]) -> Iterator[None]:
 
 
 def _tell(planned: int, came: int) -> None:
-    if _watch is not None:
-        _watch(planned, came)
+    watch = _watch
+    if watch is not None:
+        watch(planned, came)
 
 
 _blocks = _Blocks(BLOCK_BYTES)
@@ -157,9 +158,10 @@ class RemoteSource:
             if start < first and not _blocks.find(self._file, start, stop)
         ]
         with self._lock:
+            given_up = sum(stop - start for start, stop in self._planned)
             self._planned = pieces_of(missing)[::-1]
             self._unread = set()
-            _tell(sum(stop - start for start, stop in self._planned), 0)
+            _tell(sum(stop - start for start, stop in self._planned) - given_up, 0)
             self._fill()
 
     def _ask_for(self, start: int, stop: int) -> _Block:
@@ -192,11 +194,18 @@ class RemoteSource:
         return block
 
     def _get(self, start: int, stop: int) -> memoryview:
-        data = self._remote.get(start, stop, self._tail.version)
-        if len(data) != stop - start:
-            raise changed(self._url)
-        _tell(0, len(data))
-        return data
+        left = stop - start
+
+        def tell(came: int) -> None:
+            nonlocal left
+            left -= came
+            _tell(0, came)
+
+        try:
+            return self._remote.get(start, stop, self._tail.version, tell)
+        except BaseException:
+            _tell(-left, 0)
+            raise
 
     def refresh(self) -> None:
         """Nothing: it is one version."""

@@ -20,7 +20,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.errors import FormatError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.progress import progress
 from tupli_mcap.remote import copied, shown
@@ -33,7 +33,6 @@ __all__ = ["fetched", "fetched_url"]
 _BUDGET_VARIABLE: Final = "TUPLI_MCAP_CACHE_BYTES"
 _BUDGET: Final = 4 << 30
 _PART: Final = ".part"
-_PIECE: Final = 8 << 20
 
 
 @contextlib.contextmanager
@@ -87,8 +86,13 @@ def fetched_url(url: str) -> Iterator[Path]:
         return
 
     def pieces(start: int) -> Iterator[memoryview]:
-        for at in range(start, end.size, _PIECE):
-            yield remote.get(at, min(at + _PIECE, end.size), end.version)
+        if start == end.size:
+            return
+        for piece in remote.pieces(start, end.version):
+            start += len(piece)
+            yield piece
+        if start != end.size:
+            raise RecordingError(f"{shown(url)}: expected {end.size} bytes, found {start}; try again")
 
     which = hashlib.sha256(f"{url}\n{end.version}\n{end.size}".encode()).hexdigest()
     name = f"{which[:32]}-{files.as_file_name(Path(urlsplit(url).path).name)}"
