@@ -22,8 +22,8 @@ from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 
 LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
 
-_START = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
-_END = np.dtype(
+STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
+ENDS = np.dtype(
     [
         ("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("length", "<u8"), ("return", "<f8"),
         ("end", "u1"), ("time", "<u8"),
@@ -118,7 +118,7 @@ class EpisodeDeriver:
         self._lengths = np.zeros(self._n, np.int64)
         self.totals = np.zeros(self._n)
         # ends whose final state comes with the next batch, by sub-environment
-        self._waiting: Array = np.zeros(self._n, _END)
+        self._waiting: Array = np.zeros(self._n, ENDS)
         self._waits = np.zeros(self._n, np.bool_)
 
     def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
@@ -140,14 +140,14 @@ class EpisodeDeriver:
         env = found.env[going_on]
         with np.errstate(over="ignore", invalid="ignore"):  # of infinite rewards
             rewards[found.first[going_on]] += self.totals[env]
-            totals = _sums(rewards, found.first)
+            totals = sums(rewards, found.first)
         lengths[going_on] += self._lengths[env]
         first_rows[going_on] = self._first_rows[env]
-        starts = np.zeros(len(found.env), _START)
+        starts = np.zeros(len(found.env), STARTS)
         starts["episode"] = numbers = rows["episode"][found.env, found.begin]
         starts["env"], starts["first_row"] = found.env, first_rows
         starts["time"] = self._reset_times(rows, found)
-        ends = np.zeros(len(found.env), _END)
+        ends = np.zeros(len(found.env), ENDS)
         for name in ("episode", "env", "first_row"):
             ends[name] = starts[name]
         ends["length"], ends["return"] = lengths, totals
@@ -232,7 +232,7 @@ class _Segments:
         self.is_first[1:] = self.is_final[:-1] = self.env[1:] != self.env[:-1]
 
 
-def _sums(values: Array, firsts: Array) -> Array:
+def sums(values: Array, firsts: Array) -> Array:
     """The sum of each part of `values`, added up one after the other, as a loop would."""
     if not len(firsts):
         return np.zeros(0)

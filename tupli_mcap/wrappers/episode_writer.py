@@ -14,24 +14,18 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.arrays import Array, arrays_at
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, StepError
-from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.journal.seals import Durability
-from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.infos import entries_of
 from tupli_mcap.recording.write.options import Capture, Mode, RecordOptions
 from tupli_mcap.recording.write.rotation import Rotation
-from tupli_mcap.recording.write.rows.contract import StepStore
-from tupli_mcap.recording.write.rows.single import SingleRows
-from tupli_mcap.recording.write.rows.variable import final_encoder
-from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
@@ -40,6 +34,7 @@ from tupli_mcap.wrappers.base import Recorder
 from tupli_mcap.wrappers.benchmark import with_labels
 from tupli_mcap.wrappers.run import with_run
 from tupli_mcap.wrappers.stacks import format_version, with_stacks
+from tupli_mcap.wrappers.streams import Stream, Streams
 
 
 class EpisodeWriter(Recorder):
@@ -123,7 +118,7 @@ class EpisodeWriter(Recorder):
 
     def _record_to(self, writer: RecordingWriter) -> None:
         self._writer = writer
-        self._streams = _Streams(writer, self._spaces, self._num_envs)
+        self._streams = Streams(writer, self._spaces, self._num_envs)
         self._work.recorders.append(self._streams)
 
     @property
@@ -249,6 +244,44 @@ class EpisodeWriter(Recorder):
                 self._writer.flush_if_due()
                 self._writer.sync_step()
 
+    def episodes(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Any,
+        timeouts: Any,
+        final_states: Any,
+        *,
+        env: int = 0,
+    ) -> None:
+        """Records whole episodes, which lie one after another along the first axis of all arrays (NumPy's).
+
+        Args:
+            terminals, timeouts: an episode ends where one of them is set, the last one at the last step.
+            final_states: the state after each episode, along the first axis of arrays.
+            env: in which stream.
+
+        Raises:
+            StepError: as `step`; also if an episode is running, and for arrays of unequal length. Episodes ahead of the
+                one that is refused are recorded.
+        """
+        stream = self._stream(env)
+        if stream.is_running and stream.over is None:
+            raise StepError(f"an episode is running{_in(self._num_envs, env)}; call end() or discard() first")
+        n = len(rewards)
+        flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
+        stops = np.flatnonzero(flags[0] | flags[1]) + 1
+        if not n or stops[-1:] != n:
+            raise StepError(
+                "expected whole episodes, whose last step has a flag set, found none at the last step"
+            )
+        with _Whole(self._work, self._writer):
+            stream.end()
+            stream.put_episodes(states, actions, rewards, *flags, stops, final_states)
+            self._writer.flush_if_due()
+            self._writer.sync_step()
+
     def end(
         self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0
     ) -> None:
@@ -290,7 +323,7 @@ class EpisodeWriter(Recorder):
         _close(self._work, self._discarded, self._compression)
         self._finalizer.detach()
 
-    def _stream(self, env: int) -> _Stream:
+    def _stream(self, env: int) -> Stream:
         if self._work.state or self._writer.closed:
             self._work.refuse()
         streams = self._streams.streams
@@ -301,14 +334,14 @@ class EpisodeWriter(Recorder):
             raise StepError(f"env: expected a stream from 0 to {len(streams) - 1}, found {env!r:.40}{more}")
         return streams[env]
 
-    def _ready(self, env: int) -> _Stream:
+    def _ready(self, env: int) -> Stream:
         stream = self._stream(env)
         if not stream.is_running or stream.over is not None:
             ended = "the step before has ended the episode" if stream.is_running else "no episode is running"
             raise StepError(f"{ended}{_in(self._num_envs, env)}; call begin() first")
         return stream
 
-    def _running(self, env: int) -> _Stream:
+    def _running(self, env: int) -> Stream:
         stream = self._stream(env)
         if not stream.is_running:
             raise StepError(f"no episode is running{_in(self._num_envs, env)}; call begin() first")
@@ -335,133 +368,6 @@ class _Whole:
         else:
             self._writer.stop(err)
         return False
-
-
-class _Streams:
-    """Records the episodes of each stream into one file."""
-
-    def __init__(self, writer: RecordingWriter, spaces: StepLayout, num_envs: int | None) -> None:
-        self.writer, self.spaces, self._num_envs = writer, spaces, num_envs
-        self.infos = InfoRecorder(True)
-        self.streams = [_Stream(self, i) for i in range(num_envs or 1)]
-
-    @property
-    def is_running(self) -> bool:
-        """True if some stream is within an episode."""
-        return any(stream.is_running for stream in self.streams)
-
-    def begin(self, state: Any, action: Any, reward: Any) -> None:
-        """Fixes the layout by the values of the first step, where it is not fixed yet."""
-        writer = self.writer
-        if not writer.streams:
-            layout = decide_layout(self.spaces, [state], [action], [reward], writer.layout)
-            schema, n = self.infos.codec.schema(), self._num_envs
-            writer.begin(layout, n or 1, vector=n is not None, apart=True, info_schema=schema)
-
-    def close(self) -> None:
-        """Ends the running episodes as their flags say, or as interrupted, and finishes the file."""
-        if self.writer.closed:
-            return
-        for stream in self.streams:
-            stream.end()
-        self.writer.close()
-
-
-class _Stream:
-    """Records the episodes of one stream.
-
-    Attributes:
-        is_running: an episode has begun and not ended.
-        over: how the last step has ended the running episode, None if it has not.
-    """
-
-    def __init__(self, streams: _Streams, env: int) -> None:
-        self._streams, self._writer, self._env = streams, streams.writer, env
-        self.is_running = False
-        self.over: int | None = None
-        self._facts = ResetFacts(None, None, "", "{}", 0)
-        self._metadata: dict[str, Any] = {}
-        self._episode: StartedEpisode | None = None
-        self._store: StepStore | None = None
-
-    def begin(self, facts: ResetFacts, metadata: dict[str, Any]) -> None:
-        """Begins an episode, which is written with its first step."""
-        self._facts, self._metadata = facts, metadata
-        self.is_running, self.over = True, None
-
-    def put(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
-        """Records a step."""
-        if self._episode is None:
-            self._put_first(state, action, reward, terminal, timeout)
-        else:
-            self._store.put_whole(state, action, reward, terminal, timeout)  # type: ignore[union-attr]
-        if terminal or timeout:
-            self.over = TERMINAL if terminal else TIMEOUT
-
-    def _put_first(self, *step: Any) -> None:
-        writer = self._writer
-        is_first = not writer.streams
-        self._streams.begin(*step[:3])
-        self._store = store = writer.streams[self._env]
-        store.begin_episode(writer.next_episode)
-        episode = writer.start_episode(self._env, store.count, self._facts)
-        try:
-            store.put_whole(*step)
-        except StepError:
-            writer.drop_start()
-            raise
-        self._episode = episode
-        if is_first:
-            writer.take_place()
-
-    def put_many(
-        self,
-        states: Any,
-        actions: Any,
-        rewards: Any,
-        terminals: Array,
-        timeouts: Array,
-        infos: Sequence[Mapping[str, Any]],
-    ) -> None:
-        """Records several steps."""
-        columns = (states, actions, rewards)
-        for i in range(len(rewards)):
-            store = self._store
-            if self._episode and not infos and isinstance(store, SingleRows) and store.can_put_many:
-                rest = [arrays_at(column, slice(i, None)) for column in columns]
-                store.put_many(rest[0], rest[1], rest[2], terminals[i:], timeouts[i:], self._episode.number)
-                self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
-                break
-            state, action, reward = (arrays_at(column, i) for column in columns)
-            self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
-            if infos:
-                self.put_info(infos[i])
-
-    def put_info(self, info: Mapping[str, Any]) -> None:
-        """Records the info of the step just put."""
-        if self._episode is not None and self._store is not None:
-            step = self._store.count - self._episode.first_row - 1
-            self._streams.infos.put(self._writer, self._episode.number, step, info)
-
-    def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
-        """Ends the running episode, if there is one; one without a step is none."""
-        writer, episode, store = self._writer, self._episode, self._store
-        if episode is not None and store is not None:
-            final = None
-            if final_state is not None and writer.layout is not None:
-                final = final_encoder(writer.layout)(final_state)
-            text = jsonvalue.dumps_plain({**self._metadata, **(metadata or {})})
-            length = store.count - episode.first_row
-            how = INTERRUPTED if self.over is None else self.over
-            writer.end_episode(episode, how, length, store.total, final, text)
-        self._episode = None
-        self.is_running, self.over = False, None
-
-    def discard(self) -> int | None:
-        """Ends the running episode as one to leave out; returns its number, None if it has no step."""
-        number = None if self._episode is None else self._episode.number
-        self.end(metadata={"discarded": True})
-        return number
 
 
 def _in(num_envs: int | None, env: int) -> str:

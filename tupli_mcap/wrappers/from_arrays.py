@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
@@ -18,6 +19,7 @@ from tupli_mcap.wrappers.episode_writer import EpisodeWriter
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
 _CHUNK: Final = 256 * 1024
+_TOGETHER: Final = 1 << 16  # steps
 _MANY: Final = (
     16  # streams up to which chunks are as large as those of one: they all have room in the journal
 )
@@ -118,8 +120,8 @@ def write_rollout(
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
     ) as writer:  # fmt: skip
-        for part in rollout.parts:
-            _write(writer, part)
+        for batch in _batches(rollout.parts):
+            _write(writer, batch)
 
 
 class _Rollout(NamedTuple):
@@ -157,7 +159,69 @@ class _Given(NamedTuple):
     metadata: Any
 
 
-def _write(writer: EpisodeWriter, part: _Part) -> None:
+def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
+    """Parts that follow each other in one stream, and can be written together."""
+    batch: list[_Part] = []
+    steps = 0
+    for part in parts:
+        plain = _is_plain(part)
+        if batch and (not plain or part.env != batch[0].env or steps >= _TOGETHER):
+            yield batch
+            batch, steps = [], 0
+        if plain:
+            batch.append(part)
+            steps += len(part.rewards)
+        else:
+            yield [part]
+    if batch:
+        yield batch
+
+
+def _is_plain(part: _Part) -> bool:
+    """Whether it is an episode that its last step ends, with nothing else to say of it."""
+    if part.infos or part.metadata or part.final_state is None:
+        return False
+    done = part.terminals | part.timeouts
+    return bool(done[-1]) and int(np.count_nonzero(done)) == 1
+
+
+def _write(writer: EpisodeWriter, batch: Sequence[_Part]) -> None:
+    """Writes parts, together where their arrays can be joined without a change."""
+    joined: list[Any] = []
+    if len(batch) > 1:
+        with contextlib.suppress(_UnlikeError):
+            joined = [_joined([part[field] for part in batch]) for field in range(1, 6)]
+            joined.append(_joined([arrays_at(part.final_state, None) for part in batch]))
+    if joined:
+        writer.episodes(*joined, env=batch[0].env)
+        return
+    for part in batch:
+        _write_one(writer, part)
+
+
+class _UnlikeError(Exception):
+    """Arrays that differ in dtype, shape or structure."""
+
+
+def _joined(trees: Sequence[Any]) -> Any:
+    """One tree, of the arrays of several one after another."""
+    first = trees[0]
+    if any(type(tree) is not type(first) for tree in trees):
+        raise _UnlikeError
+    if isinstance(first, Mapping):
+        if any(tree.keys() != first.keys() for tree in trees):
+            raise _UnlikeError
+        return {key: _joined([tree[key] for tree in trees]) for key in first}
+    if isinstance(first, tuple):
+        if any(len(tree) != len(first) for tree in trees):
+            raise _UnlikeError
+        return tuple(_joined([tree[i] for tree in trees]) for i in range(len(first)))
+    if len({(array.dtype, array.shape[1:]) for array in trees}) > 1:
+        raise _UnlikeError
+    return np.concatenate(trees)
+
+
+def _write_one(writer: EpisodeWriter, part: _Part) -> None:
     n = len(part.rewards)
     infos = (
         [{name: values[i] for name, values in part.infos.items()} for i in range(n)] if part.infos else None

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
-from tupli_mcap.journal.derive import LAST_ROW, StartedEpisode
+from tupli_mcap.journal.derive import LAST_ROW, EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Area, Journal
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
@@ -237,11 +237,12 @@ class RecordingWriter:
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
         return plan_areas(
-            self._laid(), self.num_envs, self.options.chunk_size, step_capacity,
+            self.laid(), self.num_envs, self.options.chunk_size, step_capacity,
             vector=self.is_vector and not self._apart, infos=has_infos, frames=bool(self.channels.cameras),
         )  # fmt: skip
 
-    def _laid(self) -> StepLayout:
+    def laid(self) -> StepLayout:
+        """The layout; RecordingError before the first step."""
         if self.layout is None:
             raise RecordingError(f"{self.path} has no step yet, so its layout is not known")
         return self.layout
@@ -252,7 +253,7 @@ class RecordingWriter:
         return self.events
 
     def _make_stores(self, areas: Sequence[Area]) -> None:
-        layout, channels = self._laid(), self.channels
+        layout, channels = self.laid(), self.channels
         self.journal = self._new_journal(areas)
         self.journal.publish(durable=self._durable, replaced=self.replaced)
         file = ToFile(self.add_chunk, self._start_chunks, self._grow, self._durable, self._sealed)
@@ -318,6 +319,11 @@ class RecordingWriter:
         pack = EPISODE_AND_ENV.pack
         events.append(time.time_ns(), *[(channel, pack(e.number, e.env) + final) for e, final in finals])
         return row
+
+    def add_episodes(self, batch: EpisodeBatch) -> None:
+        """Writes starts, final states and ends of whole episodes, whose numbers follow the last one's."""
+        self._events().extend(batch)
+        self.next_episode += len(batch.starts)
 
     def flush_if_due(self) -> None:
         """Flushes if `flush_seconds` were asked for and have passed since the last flush."""

@@ -109,15 +109,18 @@ class SingleRows:
         return not self._sealed and not self._layout.images
 
     def put_many(
-        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episode: int
+        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episodes: Any
     ) -> None:
-        """As `put_whole` of several steps of an episode, which lie along the first axis of all arrays.
+        """As `put_whole` of several steps, which lie along the first axis of all arrays.
+
+        Args:
+            episodes: the number of their episode, or of each step's.
 
         Raises:
             StepError: something cannot be stored exactly; nothing is recorded.
         """
         n, layout = len(terminals), self._layout
-        columns = [("terminal", terminals), ("timeout", timeouts)]
+        columns = [("terminal", terminals), ("timeout", timeouts), ("episode", np.broadcast_to(episodes, n))]
         for root, leaves in ((states, layout.state), (actions, layout.action), (rewards, layout.reward)):
             for leaf in leaves:
                 value = exact_array(
@@ -131,11 +134,9 @@ class SingleRows:
         ]  # one after the other, as steps add them
         begin = 0
         while begin < n:
-            begin = self._put_rows(columns, begin, n, totals, episode)
+            begin = self._put_rows(columns, begin, n, totals)
 
-    def _put_rows(
-        self, columns: Sequence[tuple[str, Array]], begin: int, end: int, totals: Array, episode: int
-    ) -> int:
+    def _put_rows(self, columns: Sequence[tuple[str, Array]], begin: int, end: int, totals: Array) -> int:
         """Writes as many of the steps as the half has room for; returns how far it came."""
         area, size = self._area, self._area.row_size
         first = (self._offset() - self._starts[self._half]) // size
@@ -145,7 +146,6 @@ class SingleRows:
             rows[name] = values[begin : begin + count]
         # behind the values: the first row with a header is the running one, whose state is taken
         rows.view(self._heads)["head"] = np.frombuffer(self._hole, f"V{BODY}")
-        rows["episode"] = episode
         rows["#log_time"] = time.time_ns()
         after = self._offset() + count * size
         self._buffer[after : after + BODY] = bytes(BODY)  # nobody knows the state there

@@ -1,0 +1,214 @@
+"""What records the episodes of streams that nobody steps: each begins, takes steps and ends, on its own."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array, arrays_at
+from tupli_mcap.errors import StepError
+from tupli_mcap.journal.derive import ENDS, STARTS, EpisodeBatch, StartedEpisode, sums
+from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, ResetFacts
+from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.rows.contract import StepStore
+from tupli_mcap.recording.write.rows.single import SingleRows
+from tupli_mcap.recording.write.rows.variable import final_encoder
+from tupli_mcap.recording.write.single import decide_layout
+from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.spaces.exact import exact_array, leaf_value
+
+
+class Streams:
+    """Records the episodes of each stream into one file."""
+
+    def __init__(self, writer: RecordingWriter, spaces: StepLayout, num_envs: int | None) -> None:
+        self.writer, self.spaces, self._num_envs = writer, spaces, num_envs
+        self.infos = InfoRecorder(True)
+        self.streams = [Stream(self, i) for i in range(num_envs or 1)]
+
+    @property
+    def is_running(self) -> bool:
+        """True if some stream is within an episode."""
+        return any(stream.is_running for stream in self.streams)
+
+    def begin(self, state: Any, action: Any, reward: Any) -> None:
+        """Fixes the layout by the values of the first step, where it is not fixed yet."""
+        writer = self.writer
+        if not writer.streams:
+            layout = decide_layout(self.spaces, [state], [action], [reward], writer.layout)
+            schema, n = self.infos.codec.schema(), self._num_envs
+            writer.begin(layout, n or 1, vector=n is not None, apart=True, info_schema=schema)
+
+    def close(self) -> None:
+        """Ends the running episodes as their flags say, or as interrupted, and finishes the file."""
+        if self.writer.closed:
+            return
+        for stream in self.streams:
+            stream.end()
+        self.writer.close()
+
+
+class Stream:
+    """Records the episodes of one stream.
+
+    Attributes:
+        is_running: an episode has begun and not ended.
+        over: how the last step has ended the running episode, None if it has not.
+    """
+
+    def __init__(self, streams: Streams, env: int) -> None:
+        self._streams, self._writer, self._env = streams, streams.writer, env
+        self.is_running = False
+        self.over: int | None = None
+        self._facts = ResetFacts(None, None, "", "{}", 0)
+        self._metadata: dict[str, Any] = {}
+        self._episode: StartedEpisode | None = None
+        self._store: StepStore | None = None
+
+    def begin(self, facts: ResetFacts, metadata: dict[str, Any]) -> None:
+        """Begins an episode, which is written with its first step."""
+        self._facts, self._metadata = facts, metadata
+        self.is_running, self.over = True, None
+
+    def put(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """Records a step."""
+        if self._episode is None:
+            self._put_first(state, action, reward, terminal, timeout)
+        else:
+            self._store.put_whole(state, action, reward, terminal, timeout)  # type: ignore[union-attr]
+        if terminal or timeout:
+            self.over = TERMINAL if terminal else TIMEOUT
+
+    def _put_first(self, *step: Any) -> None:
+        writer = self._writer
+        is_first = not writer.streams
+        self._streams.begin(*step[:3])
+        self._store = store = writer.streams[self._env]
+        store.begin_episode(writer.next_episode)
+        episode = writer.start_episode(self._env, store.count, self._facts)
+        try:
+            store.put_whole(*step)
+        except StepError:
+            writer.drop_start()
+            raise
+        self._episode = episode
+        if is_first:
+            writer.take_place()
+
+    def put_many(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Array,
+        timeouts: Array,
+        infos: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Records several steps."""
+        columns = (states, actions, rewards)
+        for i in range(len(rewards)):
+            store = self._store
+            if self._episode and not infos and isinstance(store, SingleRows) and store.can_put_many:
+                rest = [arrays_at(column, slice(i, None)) for column in columns]
+                store.put_many(rest[0], rest[1], rest[2], terminals[i:], timeouts[i:], self._episode.number)
+                self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
+                break
+            state, action, reward = (arrays_at(column, i) for column in columns)
+            self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
+            if infos:
+                self.put_info(infos[i])
+
+    def put_episodes(
+        self,
+        states: Any,
+        actions: Any,
+        rewards: Any,
+        terminals: Array,
+        timeouts: Array,
+        stops: Array,
+        finals: Any,
+    ) -> None:
+        """Records whole episodes: together where that can be, else one after another."""
+        columns = (states, actions, rewards, terminals, timeouts)
+        facts = ResetFacts(None, None, "", "{}", time.time_ns())
+        begin = 0
+        for i, stop in enumerate(stops.tolist()):
+            store = self._store
+            if isinstance(store, SingleRows) and store.can_put_many and i < len(stops) - 1:
+                rest = [arrays_at(column, slice(begin, None)) for column in columns]
+                with contextlib.suppress(StepError):  # of one of them; those ahead of it are recorded
+                    self._put_together(store, rest, stops[i:] - begin, arrays_at(finals, slice(i, None)))
+                    return
+            self.begin(facts, {})
+            part = [arrays_at(column, slice(begin, stop)) for column in columns]
+            self.put_many(part[0], part[1], part[2], part[3], part[4], ())
+            self.end(arrays_at(finals, i))
+            begin = stop
+
+    def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
+        """Records whole episodes by what the recorder derives of rows: their starts, ends and final states.
+
+        Raises:
+            StepError: something cannot be stored exactly; nothing is recorded.
+        """
+        writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
+        numbers = np.arange(writer.next_episode, writer.next_episode + count)
+        states = _final_bytes(writer.laid(), finals, count)
+        begun, first_row = time.time_ns(), store.count
+        values, flags = columns[:3], columns[3:]
+        store.put_many(values[0], values[1], values[2], flags[0], flags[1], np.repeat(numbers, lengths))
+        starts, ends = np.zeros(count, STARTS), np.zeros(count, ENDS)
+        for table, time_ns in ((starts, begun), (ends, time.time_ns())):
+            table["episode"], table["env"], table["time"] = numbers, self._env, time_ns
+            table["first_row"] = first_row + stops - lengths
+        rewards = np.asarray(values[2], np.float64).reshape(stops[-1], -1).sum(axis=1)
+        ends["length"], ends["return"] = lengths, sums(rewards, stops - lengths)
+        ends["end"] = np.where(flags[0][stops - 1], TERMINAL, TIMEOUT)
+        writer.add_episodes(EpisodeBatch(starts, ends, states))
+
+    def put_info(self, info: Mapping[str, Any]) -> None:
+        """Records the info of the step just put."""
+        if self._episode is not None and self._store is not None:
+            step = self._store.count - self._episode.first_row - 1
+            self._streams.infos.put(self._writer, self._episode.number, step, info)
+
+    def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
+        """Ends the running episode, if there is one; one without a step is none."""
+        writer, episode, store = self._writer, self._episode, self._store
+        if episode is not None and store is not None:
+            final = None
+            if final_state is not None and writer.layout is not None:
+                final = final_encoder(writer.layout)(final_state)
+            text = jsonvalue.dumps_plain({**self._metadata, **(metadata or {})})
+            length = store.count - episode.first_row
+            how = INTERRUPTED if self.over is None else self.over
+            writer.end_episode(episode, how, length, store.total, final, text)
+        self._episode = None
+        self.is_running, self.over = False, None
+
+    def discard(self) -> int | None:
+        """Ends the running episode as one to leave out; returns its number, None if it has no step."""
+        number = None if self._episode is None else self._episode.number
+        self.end(metadata={"discarded": True})
+        return number
+
+
+def _final_bytes(layout: StepLayout, finals: Any, count: int) -> Array:
+    """Final states as they follow `episode` and `env` in `/final_state`: uint8 (count, bytes)."""
+    message = layout.final_message
+    table = np.zeros(count, message.dtype)
+    for leaf in layout.final_leaves:
+        value = exact_array(
+            leaf_value(finals, leaf), layout.dtypes[leaf.name], (count, *leaf.shape), leaf.path
+        )
+        if leaf.size:
+            table[leaf.name] = value
+    return table.view(np.uint8).reshape(count, -1)[:, BODY + EPISODE_AND_ENV.size :]
