@@ -237,6 +237,46 @@ def test_a_killed_process_loses_none_of_many_steps(tmp_path: Path) -> None:
         np.testing.assert_array_equal([step[2] for step in told.steps], rewards[: len(told.steps)])
 
 
+def test_a_killed_process_loses_none_of_many_episodes(tmp_path: Path) -> None:
+    """Of calls that have returned; of the one it dies in, steps and final states that are not recorded yet."""
+    rng = np.random.default_rng(0)
+    states, finals, rewards = (
+        rng.random((500, 3)).astype(np.float32),
+        rng.random((50, 3), np.float32),
+        rng.random(500),
+    )
+    ends = np.arange(500) % 10 == 9
+    calls = [slice(0, 1), slice(1, 12), slice(12, 30), slice(30, 50)]  # episodes
+
+    class Calls:
+        def run(self, writer: EpisodeWriter, told: Any) -> None:
+            for call in calls:
+                part = slice(call.start * 10, call.stop * 10)
+                actions, flags = np.full(len(rewards[part]), 4), (ends[part], None)
+                writer.episodes(states[part], actions, rewards[part], *flags, finals[call])
+                told()
+
+    for seed in range(24):
+        path = tmp_path / f"{seed}.mcap"
+        function = ("SingleRows._put_rows", "Stream._put_together", "EpisodeLog.extend")[seed % 3]
+        done = _die(Calls(), BOX, Moment("by hand", (function,), times=3), random.Random(seed), path)
+        assert done < len(calls)
+        found = read(path)
+        whole = calls[done - 1].stop if done else 0
+        assert len(found) >= whole
+        steps = [step for told in found for step in told.steps]
+        assert same(
+            [(step[0], step[2]) for step in steps],
+            list(zip(states, rewards.tolist(), strict=False))[: len(steps)],
+        )
+        for i, told in enumerate(found):
+            assert told.end == "terminal" or i == len(found) - 1
+            assert same(told.final, finals[i]) or (told.final is None and i >= whole)
+        assert [p for p in verify_recording(path).problems if p.severity != "note"] == []
+        EpisodeWriter(path, BOX, ACTIONS, mode="a").close()
+        assert same(read(path), found)
+
+
 @pytest.mark.parametrize("call", ["step", "begin", "end", "discard"])
 def test_what_interrupts_a_call_loses_no_step(tmp_path: Path, call: str) -> None:
     """Ctrl-C at any line: closing finishes the file from its journal."""

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import concatenate, create_empty_array
+from mcap.reader import make_reader
 
 import tupli_mcap
-from tupli_mcap import Recording, StepError, verify_recording, write_rollout
+from tupli_mcap import EpisodeWriter, Recording, StepError, verify_recording, write_rollout
+from tupli_mcap.arrays import arrays_at
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 STEPS, N = 200, 3
@@ -60,6 +63,97 @@ def test_a_rollout_is_what_the_wrapper_records(tmp_path: Path, mode: AutoresetMo
             for name in ("states", "actions", "rewards", "terminals", "timeouts", "final_state"):
                 np.testing.assert_array_equal(getattr(expected, name), getattr(found, name), name)
             assert wrapped.index["return"][i] == written.index["return"][j]
+
+
+def messages(path: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Everything that a recording says, but when."""
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            found.setdefault(channel.topic, []).append((message.sequence, message.data))
+    return found
+
+
+NESTED = spaces.Dict(
+    {"a": spaces.Box(-9, 9, (3,)), "b": spaces.Tuple([spaces.Discrete(4), spaces.Box(0, 9, (0,))])}
+)
+
+
+@pytest.mark.parametrize(
+    ("space", "reward"),
+    [
+        (spaces.Box(-9, 9, (2, 3), np.float64), None),
+        (NESTED, None),
+        (spaces.Box(-9, 9, (0,)), None),  # without a byte
+        (spaces.Discrete(9), spaces.Box(-9, 9, (2,), np.float64)),
+    ],
+)
+def test_many_episodes_at_once_are_as_one_after_another(tmp_path: Path, space: Any, reward: Any) -> None:
+    """Byte for byte the same messages, over many changes of halves of the journal, with rewards that overflow."""
+    rng, n = np.random.default_rng(0), 900
+    space.seed(1)
+    states, finals = (
+        concatenate(space, [space.sample() for _ in range(n)], create_empty_array(space, n)) for _ in range(2)
+    )
+    actions, rewards = rng.normal(size=(n, 2)), rng.normal(size=n)
+    rewards[[100, 200, 300]] = np.inf, -np.inf, np.nan
+    if reward is not None:
+        rewards = rng.normal(size=(n, 2))
+    terminals, timeouts = rng.random(n) < 0.1, rng.random(n) < 0.02
+    terminals[400:700] = timeouts[400:700] = False  # longer than a half
+    terminals[-1] = True
+    stops = np.flatnonzero(terminals | timeouts) + 1
+    given = (space, spaces.Box(-9, 9, (2,), np.float64))
+    options: dict[str, Any] = {"reward_space": reward, "num_envs": 2, "chunk_size": 5000, "capture": "none"}
+    with EpisodeWriter(tmp_path / "single.mcap", *given, **options) as writer:
+        begin = 0
+        for i, stop in enumerate(stops.tolist()):
+            writer.begin(env=1)
+            part = slice(begin, stop)
+            steps = (arrays_at(column, part) for column in (states, actions, rewards, terminals, timeouts))
+            writer.steps(*steps, env=1)
+            writer.end(arrays_at(finals, i), env=1)
+            begin = stop
+    with EpisodeWriter(tmp_path / "many.mcap", *given, **options) as writer:
+        for first, last in ((0, 3), (3, 40), (40, len(stops))):
+            part = slice(stops[first - 1] if first else 0, stops[last - 1])
+            steps = (arrays_at(column, part) for column in (states, actions, rewards, terminals, timeouts))
+            writer.episodes(*steps, arrays_at(finals, slice(first, last)), env=1)
+            assert len(Recording(tmp_path / "many.mcap").episodes) == last
+    assert messages(tmp_path / "single.mcap") == messages(tmp_path / "many.mcap")
+    assert verify_recording(tmp_path / "many.mcap").problems == []
+    with Recording(tmp_path / "single.mcap") as single, Recording(tmp_path / "many.mcap") as many:
+        for name in single.index.dtype.names:
+            if not name.endswith("time"):
+                np.testing.assert_array_equal(single.index[name], many.index[name], name)
+        assert (many.index["start_time"] <= many.index["end_time"]).all()
+
+
+def test_many_episodes_at_once_need_their_ends(tmp_path: Path) -> None:
+    with EpisodeWriter(tmp_path / "r.mcap", spaces.Box(-1, 1, (2,)), spaces.Discrete(2)) as writer:
+        steps = np.zeros((3, 2), np.float32), np.zeros(3, np.int64), np.zeros(3)
+        with pytest.raises(StepError, match="expected whole episodes, found no flag at the last step"):
+            writer.episodes(*steps, [True, False, False], None, np.zeros((1, 2), np.float32))
+        writer.begin()
+        with pytest.raises(StepError, match=r"an episode is running; call end\(\) or discard\(\) first"):
+            writer.episodes(*steps, [True, False, True], None, np.zeros((2, 2), np.float32))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_value_that_cannot_be_stored_leaves_whole_episodes(tmp_path: Path) -> None:
+    n = 30_000
+    states, finals, ends = np.zeros((n, 2), np.float32), np.ones((n // 10, 2)), np.arange(n) % 10 == 9
+    finals[2000] = 0.1  # float32 cannot hold it
+    with pytest.raises(StepError, match="state: expected values that float32 holds exactly, found float64"):
+        write_rollout(
+            tmp_path / "r.mcap", states, np.zeros((n, 1)), np.ones(n), ends, final_states=finals,
+            autoreset="disabled",
+        )  # fmt: skip
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert set(recording.index["length"]) == {10}
+        assert 0 < len(recording.episodes) <= 2000
+        assert all(episode.final_state[0] == 1 for episode in recording.episodes)
+    assert verify_recording(tmp_path / "r.mcap").problems == []
 
 
 def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:

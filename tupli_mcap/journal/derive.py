@@ -140,7 +140,7 @@ class EpisodeDeriver:
         env = found.env[going_on]
         with np.errstate(over="ignore", invalid="ignore"):  # of infinite rewards
             rewards[found.first[going_on]] += self.totals[env]
-            totals = sums(rewards, found.first)
+        totals = sums(rewards, found.first)
         lengths[going_on] += self._lengths[env]
         first_rows[going_on] = self._first_rows[env]
         starts = np.zeros(len(found.env), STARTS)
@@ -236,6 +236,7 @@ def sums(values: Array, firsts: Array) -> Array:
     """The sum of each part of `values`, added up one after the other, as a loop would."""
     if not len(firsts):
         return np.zeros(0)
-    if (values == np.rint(values)).all() and np.abs(values).sum() < 2**53:
-        return np.add.reduceat(values, firsts) + 0.0  # exact in any order
-    return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts)[1:]]) + 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # of infinite values
+        if (values == np.rint(values)).all() and np.abs(values).sum() < 2**53:
+            return np.add.reduceat(values, firsts) + 0.0  # exact in any order
+        return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts)[1:]]) + 0.0

@@ -145,20 +145,21 @@ class EpisodeWriter(Recorder):
             StepError: an episode runs in this stream that no flag has ended.
             RecordingError: metadata that is no dict of what JSON can hold.
         """
-        stream = self._stream(env)
-        if stream.is_running and stream.over is None:
-            raise StepError(f"an episode is running{_in(self._num_envs, env)}; call end() or discard() first")
+        self._between(env)
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
             raise StepError(f"seed: expected an integer or None, found {shorten(seed)}")
         told = "" if options is None else jsonvalue.dumps_any(options)
         facts = ResetFacts(None if seed is None else int(seed), None, told, "{}", time.time_ns())
         entries = _metadata(metadata)
         with _Whole(self._work, self._writer):
-            stream.end()
-            if self.rotation.is_due(self._writer) and not self._streams.is_running:
-                self._go_on()
-                stream = self._streams.streams[env]
-            stream.begin(facts, entries)
+            self._next(env).begin(facts, entries)
+
+    def _next(self, env: int) -> Stream:
+        """The stream, ready for its next episode, which may be in the next file."""
+        self._streams.streams[env].end()
+        if self.rotation.is_due(self._writer) and not self._streams.is_running:
+            self._go_on()
+        return self._streams.streams[env]
 
     def _go_on(self) -> None:
         """In the next file."""
@@ -257,28 +258,27 @@ class EpisodeWriter(Recorder):
     ) -> None:
         """Records whole episodes, which lie one after another along the first axis of all arrays (NumPy's).
 
+        A process that is killed meanwhile loses steps that are not yet recorded, and final states of those that are.
+
         Args:
             terminals, timeouts: an episode ends where one of them is set, the last one at the last step.
             final_states: the state after each episode, along the first axis of arrays.
             env: in which stream.
 
         Raises:
-            StepError: as `step`; also if an episode is running, and for arrays of unequal length. Episodes ahead of the
-                one that is refused are recorded.
+            StepError: as `step`; also if an episode is running, and for arrays of unequal length. Of the episodes of
+                this call only those ahead of the one that is refused may be recorded.
         """
-        stream = self._stream(env)
-        if stream.is_running and stream.over is None:
-            raise StepError(f"an episode is running{_in(self._num_envs, env)}; call end() or discard() first")
+        self._between(env)
         n = len(rewards)
         flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
         stops = np.flatnonzero(flags[0] | flags[1]) + 1
         if not n or stops[-1:] != n:
             raise StepError(
-                "expected whole episodes, whose last step has a flag set, found none at the last step"
+                "expected whole episodes, found no flag at the last step; steps() records a part of one"
             )
         with _Whole(self._work, self._writer):
-            stream.end()
-            stream.put_episodes(states, actions, rewards, *flags, stops, final_states)
+            self._next(env).put_episodes(states, actions, rewards, *flags, stops, final_states)
             self._writer.flush_if_due()
             self._writer.sync_step()
 
@@ -333,6 +333,12 @@ class EpisodeWriter(Recorder):
             more = "; pass num_envs for several streams" if self._num_envs is None else ""
             raise StepError(f"env: expected a stream from 0 to {len(streams) - 1}, found {env!r:.40}{more}")
         return streams[env]
+
+    def _between(self, env: int) -> None:
+        """StepError if an episode runs in this stream that no flag has ended."""
+        stream = self._stream(env)
+        if stream.is_running and stream.over is None:
+            raise StepError(f"an episode is running{_in(self._num_envs, env)}; call end() or discard() first")
 
     def _ready(self, env: int) -> Stream:
         stream = self._stream(env)

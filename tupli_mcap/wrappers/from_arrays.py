@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple
 
 import gymnasium as gym
@@ -19,7 +19,7 @@ from tupli_mcap.wrappers.episode_writer import EpisodeWriter
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
 _CHUNK: Final = 256 * 1024
-_TOGETHER: Final = 1 << 16  # steps
+_TOGETHER: Final = 1 << 13  # steps; a killed process loses the final states of what is written together
 _MANY: Final = (
     16  # streams up to which chunks are as large as those of one: they all have room in the journal
 )
@@ -30,7 +30,7 @@ _CHOOSE: Final = (
 
 
 class _Part(NamedTuple):
-    """Steps of one episode."""
+    """Steps of one episode; `whole`: of several, one after another, each ended by a flag and with its final state."""
 
     env: int
     states: Any
@@ -41,6 +41,7 @@ class _Part(NamedTuple):
     final_state: Any
     infos: Mapping[str, Any]
     metadata: Mapping[str, Any]
+    whole: bool = False
 
 
 def write_rollout(
@@ -120,8 +121,8 @@ def write_rollout(
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
     ) as writer:  # fmt: skip
-        for batch in _batches(rollout.parts):
-            _write(writer, batch)
+        for part in rollout.parts:
+            _write(writer, part)
 
 
 class _Rollout(NamedTuple):
@@ -141,8 +142,9 @@ def _rollout_of(given: _Given, autoreset: Any, reward_space: gym.Space[Any] | No
         return _Rollout(_episodes(given), _episode(given, 0), 1, None)
     given = _Given._make([*(map_arrays(one, _array) for one in given[:-1]), given.metadata])
     lead = _lead(given.rewards, reward_space)
-    parts = list(_streams(given, lead, _mode(autoreset)))  # looked at before anything is written
-    return _Rollout(parts, given, lead, given.rewards.shape[1] if lead == 2 else None)
+    return _Rollout(
+        _streams(given, lead, _mode(autoreset)), given, lead, given.rewards.shape[1] if lead == 2 else None
+    )
 
 
 class _Given(NamedTuple):
@@ -159,77 +161,17 @@ class _Given(NamedTuple):
     metadata: Any
 
 
-def _batches(parts: Iterable[_Part]) -> Iterator[list[_Part]]:
-    """Parts that follow each other in one stream, and can be written together."""
-    batch: list[_Part] = []
-    steps = 0
-    for part in parts:
-        plain = _is_plain(part)
-        if batch and (not plain or part.env != batch[0].env or steps >= _TOGETHER):
-            yield batch
-            batch, steps = [], 0
-        if plain:
-            batch.append(part)
-            steps += len(part.rewards)
-        else:
-            yield [part]
-    if batch:
-        yield batch
-
-
-def _is_plain(part: _Part) -> bool:
-    """Whether it is an episode that its last step ends, with nothing else to say of it."""
-    if part.infos or part.metadata or part.final_state is None:
-        return False
-    done = part.terminals | part.timeouts
-    return bool(done[-1]) and int(np.count_nonzero(done)) == 1
-
-
-def _write(writer: EpisodeWriter, batch: Sequence[_Part]) -> None:
-    """Writes parts, together where their arrays can be joined without a change."""
-    joined: list[Any] = []
-    if len(batch) > 1:
-        with contextlib.suppress(_UnlikeError):
-            joined = [_joined([part[field] for part in batch]) for field in range(1, 6)]
-            joined.append(_joined([arrays_at(part.final_state, None) for part in batch]))
-    if joined:
-        writer.episodes(*joined, env=batch[0].env)
+def _write(writer: EpisodeWriter, part: _Part) -> None:
+    steps = part.states, part.actions, part.rewards, part.terminals, part.timeouts
+    if part.whole:
+        writer.episodes(*steps, part.final_state, env=part.env)
         return
-    for part in batch:
-        _write_one(writer, part)
-
-
-class _UnlikeError(Exception):
-    """Arrays that differ in dtype, shape or structure."""
-
-
-def _joined(trees: Sequence[Any]) -> Any:
-    """One tree, of the arrays of several one after another."""
-    first = trees[0]
-    if any(type(tree) is not type(first) for tree in trees):
-        raise _UnlikeError
-    if isinstance(first, Mapping):
-        if any(tree.keys() != first.keys() for tree in trees):
-            raise _UnlikeError
-        return {key: _joined([tree[key] for tree in trees]) for key in first}
-    if isinstance(first, tuple):
-        if any(len(tree) != len(first) for tree in trees):
-            raise _UnlikeError
-        return tuple(_joined([tree[i] for tree in trees]) for i in range(len(first)))
-    if len({(array.dtype, array.shape[1:]) for array in trees}) > 1:
-        raise _UnlikeError
-    return np.concatenate(trees)
-
-
-def _write_one(writer: EpisodeWriter, part: _Part) -> None:
     n = len(part.rewards)
     infos = (
         [{name: values[i] for name, values in part.infos.items()} for i in range(n)] if part.infos else None
     )
     writer.begin(metadata=part.metadata, env=part.env)
-    writer.steps(
-        part.states, part.actions, part.rewards, part.terminals, part.timeouts, infos=infos, env=part.env
-    )
+    writer.steps(*steps, infos=infos, env=part.env)
     writer.end(part.final_state, env=part.env)
 
 
@@ -283,64 +225,102 @@ def _episode_flags(given: Any, n: int) -> Array:
 
 
 def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
-    """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other."""
+    """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other.
+
+    Raises:
+        StepError: arrays do not fit together; at once, before anything is written.
+    """
     shape = given.rewards.shape[:lead]
     for name in ("actions", "next_states", "infos"):
         _check_shape(name, getattr(given, name), shape, shape[0])
     _check_shape("states", given.states, shape, shape[0], shape[0] + 1)
-    terminals, timeouts = (
-        _flags("terminals", given.terminals, shape),
-        _flags("timeouts", given.timeouts, shape),
-    )
+    terminals = _flags("terminals", given.terminals, shape)
+    timeouts = _flags("timeouts", given.timeouts, shape)
     done = terminals | timeouts
     if not mode and done[:-1].any():
         step = np.argwhere(done[:-1])[0][0]
         raise StepError(f"autoreset: an episode ends at step {step}, and the arrays go on; {_CHOOSE}")
-    final_of = _finals(given, done, mode)
-    for env in range(shape[1] if lead == 2 else 1):
-        column = (env,) if lead == 2 else ()
-        for begin, end in _spans(done[:, *column], mode):
-            where = (slice(begin, end + 1), *column)
-            states, actions, infos = (
-                arrays_at(tree, where) for tree in (given.states, given.actions, given.infos or {})
-            )
-            rewards, metadata = given.rewards[where], given.metadata or {}
-            yield _Part(
-                env, states, actions, rewards, terminals[where], timeouts[where], final_of((end, *column)),
-                infos, metadata,
-            )  # fmt: skip
+    given = given._replace(terminals=terminals, timeouts=timeouts)
+    finals = _Finals(given, done, mode)
+    columns = [(env,) for env in range(shape[1])] if lead == 2 else [()]
+    spans = [_spans(done[:, *column], mode) for column in columns]
+    parts = (_parts(given, finals, *each) for each in zip(columns, spans, strict=True))
+    return itertools.chain.from_iterable(parts)
 
 
-def _spans(done: Array, mode: str) -> Iterator[tuple[int, int]]:
-    """First and last step of each episode of one sub-environment."""
-    begin, last = 0, len(done) - 1
-    for end in dict.fromkeys([*np.flatnonzero(done).tolist(), last]):
-        if end >= begin:
-            yield begin, end
-            begin = end + 1 + (mode == "next-step")
-        elif done[end]:
-            raise StepError(
-                f"autoreset: expected a reset at step {end}, after an end, found another end; {_CHOOSE}"
-            )
+def _spans(done: Array, mode: str) -> tuple[Array, Array]:
+    """First and last steps of the episodes of one sub-environment."""
+    last, is_reset = len(done) - 1, mode == "next-step"
+    ends = np.flatnonzero(done)
+    if not done[last]:
+        ends = np.append(ends, last)
+    begins = np.append(0, ends[:-1] + 1 + is_reset)
+    empty = ends[(begins > ends) & done[ends]]
+    if len(empty):
+        raise StepError(
+            f"autoreset: expected a reset at step {empty[0]}, after an end, found another end; {_CHOOSE}"
+        )
+    kept = begins <= ends
+    return begins[kept], ends[kept]
 
 
-def _finals(given: _Given, done: Array, mode: str) -> Callable[[tuple[int, ...]], Any]:
-    """What gives the final state of an episode, None if it is not known, from the place of its last step."""
-    order = {tuple(place): k for k, place in enumerate(np.argwhere(done).tolist())}
-    if given.final_states is not None:
-        _check_shape("final_states", given.final_states, (len(order),), len(order))
-    steps, known = len(done), _length(given.states)
+def _parts(
+    given: _Given, finals: _Finals, column: tuple[int, ...], spans: tuple[Array, Array]
+) -> Iterator[_Part]:
+    """The episodes of one sub-environment, those together that can be written together."""
+    begins, ends = spans
+    alone = ~finals.done[ends, *column] | ~finals.known(ends, column)
+    if given.infos or given.metadata:
+        alone[:] = True
+    cuts = np.flatnonzero(np.diff(begins // _TOGETHER).astype(np.bool_) | alone[1:] | alone[:-1]) + 1
+    for first, stop in itertools.pairwise([0, *cuts.tolist(), len(ends)]):
+        whole = stop - first > 1
+        rows: Any = slice(begins[first], ends[stop - 1] + 1)
+        after = ends[first : stop - 1] + 1
+        if (begins[first + 1 : stop] != after).any():  # resets, which are no steps
+            rows = np.setdiff1d(np.arange(rows.start, rows.stop), after)
+        where, last = (rows, *column), ends[first:stop] if whole else int(ends[first])
+        states, actions, rewards, terminals, timeouts, infos = (
+            arrays_at(tree, where) for tree in (*given[:5], given.infos or {})
+        )
+        yield _Part(
+            column[0] if column else 0, states, actions, rewards, terminals, timeouts, finals.at(last, column),
+            infos, given.metadata or {}, whole,
+        )  # fmt: skip
 
-    def final_of(place: tuple[int, ...]) -> Any:
-        if given.final_states is not None and place in order:
-            return arrays_at(given.final_states, order[place])
+
+class _Finals:
+    """Where the states after the last steps of episodes are."""
+
+    def __init__(self, given: _Given, done: Array, mode: str) -> None:
+        self.done = done
+        self._given, self._mode = given, mode
+        self._order = (
+            np.cumsum(done.reshape(-1)).reshape(done.shape) - 1
+        )  # of the ends, as `argwhere` has them
+        if given.final_states is not None:
+            count = int(np.count_nonzero(done))
+            _check_shape("final_states", given.final_states, (count,), count)
+
+    def known(self, last: Any, column: tuple[int, ...]) -> Any:
+        """Whether the states after these steps are known: bool, or an array of them."""
+        if self._given.next_states is not None:
+            return np.ones_like(last, np.bool_)
+        steps, done = len(self.done), self.done[last, *column]
+        is_next = ~done | (self._mode == "next-step") | ((last + 1 == steps) & (self._mode != "same-step"))
+        in_states = is_next & (last + 1 < _length(self._given.states))
+        return in_states if self._given.final_states is None else in_states | done
+
+    def at(self, last: Any, column: tuple[int, ...]) -> Any:
+        """The states after these steps; None where they are not known."""
+        given, place = self._given, (last, *column)
+        if not np.all(self.known(last, column)):
+            return None
+        if given.final_states is not None and np.all(self.done[place]):
+            return arrays_at(given.final_states, self._order[place])
         if given.next_states is not None:
             return arrays_at(given.next_states, place)
-        after = place[0] + 1
-        is_final = place not in order or mode == "next-step" or (after == steps and mode != "same-step")
-        return arrays_at(given.states, (after, *place[1:])) if is_final and after < known else None
-
-    return final_of
+        return arrays_at(given.states, (last + 1, *column))
 
 
 def _mode(given: Any) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -136,17 +135,16 @@ class Stream:
         stops: Array,
         finals: Any,
     ) -> None:
-        """Records whole episodes: together where that can be, else one after another."""
+        """Records whole episodes, of which `stops` are the ends: together where that can be, else one by one."""
         columns = (states, actions, rewards, terminals, timeouts)
         facts = ResetFacts(None, None, "", "{}", time.time_ns())
         begin = 0
         for i, stop in enumerate(stops.tolist()):
             store = self._store
-            if isinstance(store, SingleRows) and store.can_put_many and i < len(stops) - 1:
+            if isinstance(store, SingleRows) and store.can_put_many and store.can_derive:
                 rest = [arrays_at(column, slice(begin, None)) for column in columns]
-                with contextlib.suppress(StepError):  # of one of them; those ahead of it are recorded
-                    self._put_together(store, rest, stops[i:] - begin, arrays_at(finals, slice(i, None)))
-                    return
+                self._put_together(store, rest, stops[i:] - begin, arrays_at(finals, slice(i, None)))
+                return
             self.begin(facts, {})
             part = [arrays_at(column, slice(begin, stop)) for column in columns]
             self.put_many(part[0], part[1], part[2], part[3], part[4], ())
@@ -154,25 +152,24 @@ class Stream:
             begin = stop
 
     def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
-        """Records whole episodes by what the recorder derives of rows: their starts, ends and final states.
+        """Records whole episodes, of which rows and final states hold all there is to say.
 
         Raises:
             StepError: something cannot be stored exactly; nothing is recorded.
         """
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
         numbers = np.arange(writer.next_episode, writer.next_episode + count)
-        states = _final_bytes(writer.laid(), finals, count)
-        begun, first_row = time.time_ns(), store.count
-        values, flags = columns[:3], columns[3:]
-        store.put_many(values[0], values[1], values[2], flags[0], flags[1], np.repeat(numbers, lengths))
+        final_bytes = _final_bytes(writer.laid(), finals, count)
+        now, first_row = time.time_ns(), store.count
+        states, actions, rewards, terminals, timeouts = columns
+        store.put_many(states, actions, rewards, terminals, timeouts, np.repeat(numbers, lengths))
         starts, ends = np.zeros(count, STARTS), np.zeros(count, ENDS)
-        for table, time_ns in ((starts, begun), (ends, time.time_ns())):
+        for table, time_ns in ((starts, now), (ends, time.time_ns())):
             table["episode"], table["env"], table["time"] = numbers, self._env, time_ns
             table["first_row"] = first_row + stops - lengths
-        rewards = np.asarray(values[2], np.float64).reshape(stops[-1], -1).sum(axis=1)
-        ends["length"], ends["return"] = lengths, sums(rewards, stops - lengths)
-        ends["end"] = np.where(flags[0][stops - 1], TERMINAL, TIMEOUT)
-        writer.add_episodes(EpisodeBatch(starts, ends, states))
+        ends["length"], ends["return"] = lengths, sums(np.asarray(rewards, np.float64), stops - lengths)
+        ends["end"] = np.where(terminals[stops - 1], TERMINAL, TIMEOUT)
+        writer.add_episodes(EpisodeBatch(starts, ends, final_bytes))
 
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""

@@ -129,9 +129,8 @@ class SingleRows:
                 if leaf.size:
                     columns.append((leaf.name, value))
         amounts = np.asarray(rewards, np.float64).reshape(n, -1).sum(axis=1)
-        totals = np.cumsum(np.append(float(self.total), amounts))[
-            1:
-        ]  # one after the other, as steps add them
+        with np.errstate(over="ignore", invalid="ignore"):  # of infinite rewards
+            totals = np.cumsum(np.append(float(self.total), amounts))[1:]  # one by one, as steps add them
         begin = 0
         while begin < n:
             begin = self._put_rows(columns, begin, n, totals)
