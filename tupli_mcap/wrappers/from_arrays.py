@@ -295,9 +295,8 @@ class _Finals:
     def __init__(self, given: _Given, done: Array, mode: str) -> None:
         self.done = done
         self._given, self._mode = given, mode
-        self._order = (
-            np.cumsum(done.reshape(-1)).reshape(done.shape) - 1
-        )  # of the ends, as `argwhere` has them
+        # the numbers of the ends, as `argwhere` has them
+        self._order = np.cumsum(done.reshape(-1)).reshape(done.shape) - 1
         if given.final_states is not None:
             count = int(np.count_nonzero(done))
             _check_shape("final_states", given.final_states, (count,), count)
