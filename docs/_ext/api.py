@@ -45,9 +45,9 @@ def public_names(module: str) -> Iterator[tuple[str, Any]]:
 
 
 def documented(module: str) -> str:
-    """The page of a module: an entry for each of its names, as MyST."""
+    """The page of a module: an entry for each of its names, those of the top level first, as MyST."""
     entries = []
-    for name, value in public_names(module):
+    for name, value in sorted(public_names(module), key=lambda entry: entry[0].startswith(module)):
         kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
         kind = "exception" if kind == "class" and issubclass(value, BaseException) else kind
         if module == "tupli_mcap.errors" and kind != "exception":
@@ -90,7 +90,7 @@ def _as_rest(app: Sphinx, what: str, name: str, value: Any, options: Any, lines:
         lines.clear()  # what its type is about
     lines[:] = _escaped("\n".join(_sections(lines))).split("\n")
     if what in ("attribute", "data", "property"):
-        lines.insert(0, "")  # else what stands before a colon in the first line is taken for a type
+        lines[:0] = ("..", "")  # else what stands before a colon in the first line is taken for a type
 
 
 def _sections(lines: list[str]) -> Iterator[str]:

@@ -30,7 +30,7 @@ def layers() -> str:
     drawing = (
         f'<svg viewBox="0 0 {_WIDTH} {y}" class="house" role="img" aria-label="Layers">{"".join(rows)}</svg>'
     )
-    return f"```{{raw}} html\n{drawing}\n```"
+    return f'```{{raw}} html\n<div class="house">{drawing}</div>\n```'
 
 
 def _sentence(room: str) -> str:

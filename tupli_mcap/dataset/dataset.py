@@ -64,7 +64,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         ds = tupli_mcap.open("runs/")
         best = ds.filter("return > 100").sort("return", descending=True).head(10)
 
-    Files are looked into when the episodes are needed, and errors of theirs come then.
+    Files are opened when their episodes are needed; their errors are raised then.
 
     Raises:
         RecordingError: there is no such file.
@@ -123,7 +123,7 @@ def _files_in(source: Openable) -> Sequence[str]:
 class Dataset(RandomAccess):
     """Episodes, wherever they lie, in an order.
 
-    It reads when it is asked for something, and only what it is asked for. The episodes are listed once. Verbs that
+    Nothing is read before it is needed, and the episodes are listed once. Verbs that
     narrow (`filter`, `sort`, `head`, `sample`, `split`, an index) give another dataset and change nothing in this one.
     Iteration gives episodes, and `len` counts them. Not thread-safe; a pickled copy opens the files itself.
 
@@ -261,15 +261,15 @@ class Dataset(RandomAccess):
     # ---- narrowing
 
     def filter(self, test: Test) -> Dataset:
-        """The episodes that a test is true of, in their order.
+        """The episodes that match a test, in the same order.
 
         Args:
             test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`), or a function of an
                 `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
-            FilterError: the test names an unknown key, also of the metadata; compares one with what it can never be; or
-                is none of these.
+            FilterError: the test names an unknown key (of the metadata, too), compares a key with a value that it can
+                never have, or is neither a text, an expression nor a function.
         """
         if callable(test) and not isinstance(test, BaseFilter):
             return self._of([header for header in self.headers if test(self._episode(header))])
@@ -306,7 +306,7 @@ class Dataset(RandomAccess):
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
 
-        Equal ones stay in their order; those that have no such value come last.
+        Equal episodes keep their order; episodes without the value come last.
 
         Raises:
             FilterError: an unknown key, also of the metadata.
@@ -343,8 +343,8 @@ class Dataset(RandomAccess):
         Which side an episode is on depends on its id and the seed alone: it stays there when others are added.
 
         Args:
-            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. Of a few values, all
-                may come to one side: look at both.
+            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. If there are few
+                values, all may fall on one side: look at both.
 
         Raises:
             DatasetError: the fraction is not between 0 and 1.
@@ -447,15 +447,15 @@ class Dataset(RandomAccess):
         """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
 
         Args:
-            length: of windows of steps that follow each other within an episode; without it, single transitions.
+            length: steps of each window, which follow each other within an episode; without it, single transitions.
             fields: as for `windows`, or for `transitions`.
             seed: of the order; drawn if it is None.
-            drop_last: leaves a last batch out that is not full.
-            chosen: of windows: stride, pad, history; of transitions: n_step, discount.
+            drop_last: leaves out the last batch if it is not full.
+            chosen: further arguments of `windows` (stride, pad, history) or `transitions` (n_step, discount).
 
         Raises:
             MissingExtraError: PyTorch is not installed.
-            SamplingError: no episode has so many steps.
+            SamplingError: no episode has that many steps.
         """
         from tupli_mcap.torch.mapped import loader
 
@@ -491,7 +491,7 @@ class Dataset(RandomAccess):
     # ---- out
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
-        """A row a step, or a row an episode; a column a dimension, with its name where the recording knows it.
+        """One row per step or per episode, one column per dimension, with its name where the recording has one.
 
         Infos and metadata have a column for each key: `info.x`, `metadata.score`.
 
@@ -509,7 +509,7 @@ class Dataset(RandomAccess):
         return tables.arrow(self, level)
 
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Writes the episodes to a new recording, with all that belongs to them, in the order of their times.
+        """Writes the episodes to a new recording, with everything that belongs to them, in the order of their times.
 
         Of one recording, episodes keep their ids; of several, they get new ones.
 
@@ -540,9 +540,9 @@ class Dataset(RandomAccess):
 
         Raises:
             DatasetError: there is no episode, or the target exists (and not `overwrite`).
-            RecordingError: the function gives something else than the recording's dtype holds exactly, or the target
+            RecordingError: the function returns values that the recording's dtype cannot hold exactly, or the target
                 cannot be written.
-            StepError: a value of variable size is none of its space.
+            StepError: a value of variable size is not in its space.
         """
         return curate.relabel(self, function, curate.file_path(target), fields, overwrite=overwrite)
 

@@ -1,6 +1,6 @@
 """One recording, one `.mcap` file: written, appended to, read, recovered, rewritten.
 
-recording, episode, frames    `Recording`, and what it gives; `verbs` are those that it has in common with a dataset
+recording, episode, frames    `Recording`, and what it gives; `verbs` are those it shares with a dataset
 opened, contents              what `Recording` is built on: an open file, and everything that is known of it then
 index, limits                 the episode index, and whether it can be true
 channels                      the channels that a layout needs

@@ -44,7 +44,7 @@ class Step(_Step):
 
 
 class Described(Protocol):
-    """Something that says what the metadata of an episode are."""
+    """What knows the metadata of an episode."""
 
     metadata: dict[str, Any]
 
@@ -52,7 +52,7 @@ class Described(Protocol):
 class Episode(GymnasiumNames):
     """One episode of a recording. Columns are arrays (lists for leaves of variable size), nested as the space is.
 
-    Arrays are decoded on access, from the chunks the episode lies in, and kept; they are the caller's own.
+    Arrays are decoded on access, from the chunks that hold the episode, and kept. They are the caller's to change.
     """
 
     def __init__(self, recording: Recording, position: int) -> None:
@@ -148,14 +148,14 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """What the metadata callback returned last, and what annotations say."""
+        """What the metadata callback returned last, updated by annotations."""
         return self._recording.episode_metadata(self._position)
 
     def annotate(self, **values: Any) -> None:
-        """Says more about the episode, in its file: `annotate(success=True, note="gripper slipped")`.
+        """Adds metadata to the episode, in its file: `annotate(success=True, note="gripper slipped")`.
 
-        Values count more than the metadata that were recorded; None takes a key away. See `annotate_episodes`, which
-        says it of many episodes at once.
+        Values take precedence over the metadata that were recorded; None removes a key. `annotate_episodes` does this
+        for many episodes at once.
         """
         self._recording.annotate([self.number], values)
         self.__dict__.pop("metadata", None)
@@ -243,7 +243,7 @@ class Episode(GymnasiumNames):
 
     @property
     def position(self) -> int:
-        """Where it is in `recording.episodes`; its number, unless the recording was compacted."""
+        """Its index in `recording.episodes`: its number, unless episodes were removed from the recording."""
         return self._position
 
     def to_rerun(self, stream: Any = None) -> Any:
@@ -277,8 +277,8 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def frames(self) -> Frames:
-        """The recorded pictures, of the camera "render" or else the first one; `frames.steps` says what they show.
-        None were recorded where it is empty."""
+        """The recorded pictures, of the camera "render" or else the first one; empty if none were recorded.
+        `frames.steps` says which states they show."""
         return self._recording.frames(self._position)
 
     def __iter__(self) -> Iterator[Step]:

@@ -74,7 +74,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return iter(self.episodes)
 
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
-        """Gives episodes (their numbers; None: all) values that count more than the metadata that were recorded.
+        """Gives episodes (their numbers; None: all) metadata that take precedence over what was recorded.
 
         Raises:
             RecordingError: it has no path; otherwise as `annotate_episodes`.
@@ -95,9 +95,10 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def seeds(self) -> list[int | None]:
-        """The seed of each episode, None where it has none; one beyond 64 bits is read from its start.
+        """The seed of each episode, None where it has none. Seeds beyond 64 bits are read from the starts of their
+        episodes.
 
-        Earlier writers said nothing of such a seed in the index; there, only `Episode.seed` has it.
+        In files of earlier versions the index lacks such seeds; there, only `Episode.seed` has them.
         """
         rows = self.index
         fields = zip(rows["has_seed"].tolist(), rows["seed"].tolist(), strict=True)
@@ -123,10 +124,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         return starts
 
     def resets_before(self, i: int) -> list[EpisodeStart]:
-        """The resets just before that of episode `i` that no step followed, the earliest first.
+        """The resets without a step just before that of episode `i`, the earliest first.
 
-        They are known where the random stream goes on from them: the later resets had no seed. One that is `continued`
-        was none: from there on, the stream is not the one of the episode before.
+        They are known where later resets had no seed, so that the random stream goes on from them. Where one is
+        `continued`, there was no reset: from there on, the random stream is not that of the episode before.
         """
         row = self.index[i]
         found: list[EpisodeStart] = []
@@ -193,7 +194,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that there are frames of; empty if there are none."""
+        """The cameras with recorded frames; empty if there are none."""
         return self._cameras.names
 
     def frames(self, i: int, camera: str | None = None) -> Frames:
@@ -344,7 +345,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def stored(self) -> StoredSteps:
-        """Where the steps lie; RecordingError if there is none yet."""
+        """A handle to the recording's step chunks. Raises RecordingError if there is no step yet."""
         finals = self._topics.get(FINAL_STATE)
         where, source = self.address, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)

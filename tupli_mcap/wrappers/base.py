@@ -1,4 +1,4 @@
-"""What those that record have in common: options, files, rotation, closing."""
+"""What all recorders share: options, files, rotation, closing."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 class Recorder:
-    """What records to a file, or to one after another.
+    """A recorder that writes one file, or one after another.
 
     Attributes:
-        rotation: which files there are.
+        rotation: the files that were written, and when the next one begins.
     """
 
     rotation: Rotation
@@ -203,7 +203,7 @@ class EpisodeWrapper(Recorder):
 
 
 def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
-    """What a metadata callback returns, as JSON; RecordingError unless it is a dict of what JSON can hold."""
+    """The metadata that a callback returned, as JSON. Raises RecordingError unless it is a dict of JSON values."""
     state, action, reward, terminal, timeout, info = step
     rl_tuple = RLTuple.model_construct(
         state=state, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
@@ -232,7 +232,7 @@ def check_kind(env: object, *, vector: bool) -> None:
 
 
 def wrong_kind(env: object, expected: str) -> RecordingError:
-    """The error for what is no environment, or one of another kind; it names the recorder of that kind."""
+    """The error for an object that is no environment, or one of the other kind; it names the right recorder."""
     libraries = {cls.__module__.partition(".")[0] for cls in type(env).__mro__}
     name = type(env).__name__
     if isinstance(env, gym.Env):

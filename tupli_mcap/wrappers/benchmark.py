@@ -28,7 +28,7 @@ class Captured:
         attachments: name -> (media type, bytes).
 
     Raises:
-        RecordingError: the environment is no pickle of up to 16 MiB.
+        RecordingError: the environment cannot be pickled into at most 16 MiB.
     """
 
     def __init__(

@@ -52,9 +52,9 @@ class EpisodeWriter(Recorder):
     Args:
         path: the recording, or a directory, in which a new file is named by time. Missing directories are made.
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
-        num_envs: None for one stream of episodes; a number for as many streams in one file, like the sub-environments
-            of a vector environment. Each has an episode of its own; `env` in the calls says which stream is meant.
-        labels: this and every other argument is as `tupli_mcap.RecordEpisodes` takes it.
+        num_envs: None for one stream of episodes, or the number of streams in the file, like the sub-environments of a
+            vector environment. Each stream runs an episode of its own; `env` in the calls selects the stream.
+        labels: this and all further arguments are those of `tupli_mcap.RecordEpisodes`.
 
     Raises:
         SpaceError: a space cannot be recorded; the message has the path of the leaf.
@@ -142,8 +142,8 @@ class EpisodeWriter(Recorder):
             env: in which stream.
 
         Raises:
-            StepError: an episode runs in this stream that no flag has ended.
-            RecordingError: metadata that is no dict of what JSON can hold.
+            StepError: the last episode of this stream still runs: no flag has ended it.
+            RecordingError: the metadata is no dict of JSON values.
         """
         self._between(env)
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
@@ -183,7 +183,7 @@ class EpisodeWriter(Recorder):
         """Records a step: the observation, the action that was chosen on it, and what came of it.
 
         Args:
-            terminal, timeout: the step has ended the episode; `end` tells what the last state was.
+            terminal, timeout: the step ended the episode; pass the state after it to `end`.
             info: entries to record with it: numbers, texts, arrays, and lists and dicts of them.
             env: in which stream.
 
@@ -221,7 +221,7 @@ class EpisodeWriter(Recorder):
         infos: Sequence[Mapping[str, Any]] | None = None,
         env: int = 0,
     ) -> None:
-        """Records several steps of the running episode, which lie along the first axis of all arrays (NumPy's).
+        """Records several steps of the running episode, from NumPy arrays whose first axis is time.
 
         Args:
             terminals, timeouts: by default false; only the last step may have one of them set.
@@ -285,8 +285,8 @@ class EpisodeWriter(Recorder):
     def end(
         self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0
     ) -> None:
-        """Ends the running episode as the flags of its last step say, as "interrupted" if neither is set; an episode
-        without a step is none.
+        """Ends the running episode as the flags of its last step say, or as "interrupted" if neither is set. An episode
+        without steps is not recorded.
 
         Args:
             final_state: the observation after the last step; None: not known.
@@ -305,9 +305,8 @@ class EpisodeWriter(Recorder):
     def discard(self, *, env: int = 0) -> None:
         """Drops the running episode: it will not be in the finished file, and its number is not used again.
 
-        Its steps are in the file by now, so the file is written anew without them when it is closed. If the process is
-        killed before, the episode is found as an interrupted one, with `discarded` true in its metadata; and without
-        that if it is killed before this call.
+        Its steps may be in the file already, so `close()` writes the file anew without them. If the process is killed
+        before that, the episode stays as an interrupted one, with `discarded` true in its metadata.
 
         Raises:
             StepError: no episode is running.

@@ -63,7 +63,7 @@ def record_rollouts(
 
     Args:
         env_id: as `gymnasium.make` takes it; "module:Name-v0" imports the module first.
-        steps: in total; with several sub-environments at least so many. The last episode may end
+        steps: in total; with several sub-environments at least this many. The last episode may end
             "interrupted".
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
