@@ -22,8 +22,8 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
 
 SEEDS = {seed.name: seed for seed in load_seeds()}
-SAMPLE = 2_500
-PARTS = 5
+SAMPLE = 1_000
+PARTS = 2
 
 
 @pytest.fixture(scope="module")
