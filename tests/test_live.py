@@ -794,6 +794,7 @@ class Client:
         self._topics: set[str] = set()  # listened to
         self.messages: list[tuple[str, int, bytes]] = []
         self._port = port
+        self._over = False  # nobody will answer any more
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -804,7 +805,7 @@ class Client:
     async def _listen(self) -> None:
         async with aiohttp.ClientSession() as session:
             place = f"ws://127.0.0.1:{self._port}"
-            while not answers(self._port):
+            while not answers(self._port) and not self._over:
                 await asyncio.sleep(0.05)
             async with session.ws_connect(
                 place, protocols=("foxglove.sdk.v1", "foxglove.websocket.v1")
@@ -830,6 +831,8 @@ class Client:
         time.sleep(0.2)  # for the server to hear of it
 
     def join(self) -> None:
+        """Once the rollout is over: until all has come that was sent."""
+        self._over = True
         self._thread.join(120)
 
 

@@ -347,6 +347,8 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "export": ("export --storage lab --filter 'return > 100' -o good.mcap",),
     "trust": ("trust run.mcap --show", "trust --key colleague.pub --name colleague"),
     "untrust": ("untrust run.mcap",),
+    "backup-server": ("backup-server shared/ -o backup/",),
+    "restore-server": ("restore-server backup/ shared/",),
     "serve": ("serve shared/", "serve shared/ --host 0.0.0.0 --port 80 --guests"),
     "login": ("login ann --url http://192.0.2.7:8080",),
     "signup": ("signup ann",),

@@ -19,7 +19,7 @@ Url = Annotated[
     typer.Option(
         envvar="TUPLI_MCAP_URL",
         metavar="URL",
-        help="The server; by default that of the last login.",
+        help="The server; by default that of the last login, or this machine.",
         readable=False,
     ),
 ]

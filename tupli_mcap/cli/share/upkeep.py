@@ -25,9 +25,10 @@ def backup_server(
     blobs: Blobs = "",
     as_json: Json = False,
 ) -> None:
-    """Copy all that a server keeps into a directory, while it runs.
+    """Copy a server's data into a directory, while it runs.
 
-    Files that the directory has already are not copied again. `tupli-mcap serve` serves a backup as it is.
+    Files that the directory has already are not copied again. A backup can be
+    served as it is.
     """
     _copy(directory, output, database, blobs, "backed up", as_json=as_json)
 
@@ -39,9 +40,10 @@ def restore_server(
     blobs: Blobs = "",
     as_json: Json = False,
 ) -> None:
-    """Put a backup where a server is to keep things, and where nothing is kept yet.
+    """Restore a backup to where a server keeps its data.
 
-    Another database and another bucket than before will do, so that this moves a server, too.
+    Nothing may be there yet. It may be another database and another bucket than
+    before, so that this moves a server, too.
     """
     _copy(directory, backup, database, blobs, "restored", as_json=as_json)
 
