@@ -137,7 +137,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The inner environment's: where it is kept is no part of what an environment is."""
+        """The spec of the inner environment, without this wrapper."""
         return self.env.spec
 
     # --- stepping ---
@@ -349,7 +349,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return loaded
 
     def publish(self, publish_in: str = "global") -> None:
-        """Note that a group may see the benchmark."""
+        """Let a group see the benchmark."""
         self.storage.publish_benchmark(self._stored_id(), publish_in)
 
     def delete(self, delete_artifacts: bool = False, delete_episodes: bool = True) -> DeletedBenchmark:

@@ -1,4 +1,4 @@
-"""A recording of some episodes: those that a filter is true of, or those of a dataset."""
+"""A recording of some episodes: those that match a filter, or those of a dataset."""
 
 from __future__ import annotations
 

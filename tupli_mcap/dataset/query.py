@@ -65,7 +65,7 @@ class Query:
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:
-        """The benchmarks the benchmark filter is true of."""
+        """The benchmarks that match the benchmark filter."""
         if self._benchmarks is None:
             self._benchmarks = self.source.benchmarks(self.benchmark_filter)
         return self._benchmarks

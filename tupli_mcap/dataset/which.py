@@ -95,7 +95,7 @@ def check_choice(text: str, filter: BaseFilter | None = None) -> None:
 
 
 def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
-    """The positions of the episodes that a filter is true of, without those that the storage has deleted."""
+    """The positions of the episodes that match a filter, without those that the storage has deleted."""
     path, deleted = recording.path, set[int]()
     if path is not None and _may_be_noted(path):
         from tupli_mcap.storage.sidecar import Notes

@@ -36,7 +36,7 @@ def examine(
             `dataset.which.chosen_from` has chosen is examined as it is.
         checks: ids of the checks to run (see `CHECKS`); all by default. skip: those to leave out.
         thresholds: for the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
-        episode_filter: examine only episodes that it is true of.
+        episode_filter: examine only episodes that match it.
         progress: called with the name of each recording before it is read.
 
     Raises:

@@ -95,7 +95,7 @@ def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeade
 
 
 def python_line(shelf: Shelf, filter: str, sort: str = "") -> str:
-    """The Python that opens the episodes that a filter is true of; all of them where it is empty."""
+    """The Python that opens the episodes that match a filter; all of them where it is empty."""
     line = f"tupli_mcap.open({shelf.opened_by!r})"
     line += f".filter({filter!r})" if filter else ""
     falling = ", descending=True" if sort.startswith("-") else ""

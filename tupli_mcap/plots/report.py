@@ -52,7 +52,7 @@ def report(
             `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out.
         episode: whose steps are shown: a number, "best", "worst", "first" or "last"; with one recording also
             several, such as "3,7".
-        episode_filter: show only episodes that it is true of.
+        episode_filter: show only episodes that match it.
         x: what returns, lengths and the like are drawn over: "steps" of the run, "episodes" (their numbers) or "time"
             since its start, each when an episode ended. By default episodes of one recording, and steps of several.
 

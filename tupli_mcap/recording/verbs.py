@@ -54,7 +54,7 @@ class DatasetVerbs(SaysWhatIsMeant):
         return self.dataset.keys
 
     def filter(self, test: Test) -> Dataset:
-        """The episodes that a test is true of: `recording.filter("return > 100")`."""
+        """The episodes that match a test: `recording.filter("return > 100")`."""
         return self.dataset.filter(test)
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:

@@ -1,12 +1,11 @@
 """The server: what a storage holds, shared between people over HTTP.
 
-settings              how it is set up
-run                   the processes
+settings, run         how it is set up; the processes
 app, routes/          the routes, and what they answer
 pages/                what browsers are shown besides
 traffic/              requests and connections: limited, counted, logged
 wire                  JSON of requests, answers and errors
-library               all that is kept, and changes that touch database and files at once
+library, backup       all that is kept, and changes that touch database and files at once; copies of it
 people/               users, groups, roles, tokens, and what each may do and read
 items                 benchmarks and artifacts
 episodes, arrivals    recordings and their episodes: those that are there, and those that come
@@ -14,5 +13,4 @@ selection             which episodes a query means
 uploads, blobs        bytes on their way in, and where they lie
 database, tables      the database, and what is in it
 migrations/           tables of earlier versions
-backup                copies of all of it
 """

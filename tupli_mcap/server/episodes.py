@@ -54,13 +54,13 @@ def find_episodes(
     after: After | None = None,
     only: ColumnElement[bool] | None = None,
 ) -> Iterator[EpisodeHeader]:
-    """The readable episodes that a filter is true of, see `queries.find_episodes`."""
+    """The readable episodes that match a filter, see `queries.find_episodes`."""
     seen = _seen(caller) if only is None else and_(_seen(caller), only)
     return queries.find_episodes(connection, filter, limit=limit, offset=offset, after=after, only=seen)
 
 
 def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
-    """How many readable episodes a filter is true of."""
+    """How many readable episodes that match a filter."""
     return queries.count_episodes(connection, filter, only=_seen(caller))
 
 
@@ -107,7 +107,7 @@ def publish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Lets a group see the caller's own episodes that a filter is true of: all, or none; done twice, nothing changes.
+    """Lets a group see the caller's own episodes that match a filter: all, or none; done twice, nothing changes.
 
     only: see `find_episodes`.
 
@@ -150,7 +150,7 @@ def unpublish(
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
-    """Deletes the readable episodes that a filter is true of; returns how many, and the names of files to forget.
+    """Deletes the readable episodes that match a filter; returns how many, and the names of files to forget.
 
     Raises:
         DeniedError: one of them is somebody else's, and the caller has not the right; none is deleted then.
@@ -194,7 +194,7 @@ def no_episode(uri: str) -> NotFoundError:
 def _own_first(
     connection: Connection, caller: Caller, filter: BaseFilter | None, only: ColumnElement[bool] | None
 ) -> list[EpisodeHeader]:
-    """The readable episodes that a filter is true of; of one that several people have stored, the caller's own."""
+    """The readable episodes that match a filter; of one that several people have stored, the caller's own."""
     found: dict[str, EpisodeHeader] = {}
     for header in find_episodes(connection, caller, filter, only=only):
         if header.id not in found or header.created_by == caller.name:

@@ -84,7 +84,7 @@ class Items:
     def list_benchmarks(
         self, connection: Connection, caller: Caller, filter: BaseFilter | None
     ) -> list[BenchmarkHeader]:
-        """The readable benchmarks that a filter is true of, oldest first."""
+        """The readable benchmarks that match a filter, oldest first."""
         matches = compile_predicate(filter, BenchmarkHeader)
         found = [_benchmark(row) for row in self._readable(connection, caller, "benchmark")]
         return sorted((h for h in found if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
@@ -120,7 +120,7 @@ class Items:
     def list_artifacts(
         self, connection: Connection, caller: Caller, filter: BaseFilter | None
     ) -> list[ArtifactMetadataItem]:
-        """The readable artifacts that a filter is true of, oldest first."""
+        """The readable artifacts that match a filter, oldest first."""
         matches = compile_predicate(filter, ArtifactMetadataItem)
         found = [_artifact(row) for row in self._readable(connection, caller, "artifact")]
         return sorted((i for i in found if matches(i)), key=lambda i: (time_ns(i.created_at) or 0, i.id))

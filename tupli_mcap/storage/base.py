@@ -61,7 +61,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
-        """The benchmarks a filter is true of, oldest first."""
+        """The benchmarks that match a filter, oldest first."""
 
     @abstractmethod
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
@@ -73,7 +73,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
-        """Note that a group may see a benchmark."""
+        """Let a group see a benchmark."""
 
     # --- artifacts ---
 
@@ -87,7 +87,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
-        """The artifacts a filter is true of, oldest first."""
+        """The artifacts that match a filter, oldest first."""
 
     @abstractmethod
     def artifact_users(self, uri: str) -> list[str]:
@@ -103,7 +103,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def publish_artifact(self, uri: str, publish_in: str = "global") -> None:
-        """Note that a group may see an artifact."""
+        """Let a group see an artifact."""
 
     # --- episodes ---
 
@@ -131,12 +131,12 @@ class TupliStorage(ABC):
         limit: int | None = None,
         offset: int = 0,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        """The episodes a filter is true of, in the order of their recordings; EpisodeItems with tuples if
+        """The episodes that match a filter, in the order of their recordings; EpisodeItems with tuples if
         asked."""
 
     @abstractmethod
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
-        """How many episodes a filter is true of."""
+        """How many episodes match a filter."""
 
     @abstractmethod
     def delete_episode(self, uri: str) -> None:
@@ -144,11 +144,11 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def delete_episodes(self, filter: BaseFilter) -> int:
-        """Delete every episode a filter is true of; returns how many."""
+        """Delete every episode that matches a filter; returns how many."""
 
     @abstractmethod
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
-        """Note that a group may see an episode."""
+        """Let a group see an episode."""
 
     # --- recordings ---
 
@@ -157,13 +157,13 @@ class TupliStorage(ABC):
         """Where a new recording of a stored benchmark may be written; nothing is there yet. `name` is part of it."""
 
     def beginning_recording(self) -> AbstractContextManager[object]:
-        """Held from looking up a benchmark until the file to record to is open, so that it is not deleted in
+        """A lock to hold from looking up a benchmark until its new recording is open, so that nobody deletes it in
         between."""
         return nullcontext()
 
     @abstractmethod
     def ingest(self, path: Path) -> None:
-        """Take note of a recording that was written to `new_recording_path`, or has grown.
+        """Catalogue a recording that was written to `new_recording_path`, or has grown.
 
         A finished one without episodes is removed.
         """
@@ -172,7 +172,7 @@ class TupliStorage(ABC):
     def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         """The recording of an `EpisodeHeader.recording`; the caller closes it.
 
-        episodes: numbers of those that will be read, where these are not all: others may be missing in it.
+        episodes: the numbers of those that will be read (None: all); what is opened may lack the others.
         """
 
     @abstractmethod

@@ -91,7 +91,7 @@ def write(
     filter: BaseFilter | None = None,
     sign: SigningKey | None = None,
 ) -> Path:
-    """Write a benchmark with its artifacts and its episodes (those a filter is true of) into a new file.
+    """Write a benchmark with its artifacts and its episodes (those that match a filter) into a new file.
 
     sign: the key to sign it with.
 
@@ -116,7 +116,7 @@ def write(
 
 
 def export(storage: FileStorage, target: Path, filter: BaseFilter | None = None) -> Path:
-    """Write the episodes a filter is true of into the new recording `target`, without artifacts.
+    """Write the episodes that match a filter into the new recording `target`, without artifacts.
 
     Raises:
         StorageError: There are none, they are of several benchmarks, or the file exists or cannot be written.

@@ -57,7 +57,7 @@ def copy_episodes(
     benchmark_id: str | None = None,
     dry_run: bool = False,
 ) -> dict[str, Copied]:
-    """Copies the episodes that a filter is true of to another storage, with their benchmarks and what these need; only
+    """Copies the episodes that match a filter to another storage, with their benchmarks and what these need; only
     those of one benchmark if it is named. Without a filter, benchmarks without episodes are copied, too.
 
     What the target has already stays as it is there; episodes keep their ids. Nothing of it is executed. In a

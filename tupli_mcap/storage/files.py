@@ -262,7 +262,7 @@ class FileStorage(TupliStorage):
         return self._recordings.count(filter)
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
-        """What a question, such as those of `catalog.queries`, finds in the catalog, which is up to date."""
+        """The answer of the catalog, brought up to date, to a question such as those of `catalog.queries`."""
         return self._recordings.ask(question)
 
     @property
@@ -362,7 +362,7 @@ class FileStorage(TupliStorage):
         return bundles.write(self, benchmark_id, Path(target), filter, sign)
 
     def export(self, target: str | os.PathLike[str], filter: BaseFilter | None = None) -> Path:
-        """Write episodes of one benchmark, those a filter is true of, into one file; see `bundles.export`."""
+        """Write episodes of one benchmark, those that match a filter, into one file; see `bundles.export`."""
         return bundles.export(self, Path(target), filter)
 
     def import_bundle(

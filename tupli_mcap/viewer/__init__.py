@@ -45,7 +45,7 @@ def save(
         sources: a recording, its path or URL, a storage's directory, or several of them.
         episodes: "best", "worst", "first", "last", "all", "3,7-9", or numbers; by default all, or of more than ten the
             last, the best and the worst (of each recording, or of more than three recordings, of all).
-        filter: only episodes that it is true of.
+        filter: only episodes that match it.
         form: "joined" on one timeline, "split" into a Rerun recording each, or "compare" in the same plots.
         force: replace a file that exists.
         tell: given the command that opens the file.

@@ -165,7 +165,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The inner environment's: a recorder is no part of what an environment is."""
+        """The spec of the inner environment, without this recorder."""
         return self.env.spec
 
     @property

@@ -89,7 +89,7 @@ def episodes(
     after: str = "",
     before: str = "",
 ) -> Response:
-    """Episodes that a filter is true of, in some order, a page at a time."""
+    """Episodes that match a filter, in some order, a page at a time."""
 
     def ask(connection: Connection) -> tuple[Dataset | None, Table]:
         of = find_dataset(shelf, connection, dataset) if dataset else None

@@ -43,7 +43,7 @@ class Key(BaseModel):
 
 @router.post("/list", response_model=Found)
 def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
-    """The episodes that a filter is true of, in the order of their recordings, a page at a time."""
+    """The episodes that match a filter, in the order of their recordings, a page at a time."""
     most = library.settings.max_page
     size = most if told.limit is None else min(told.limit, most)
     with library.database.reading() as connection:
@@ -58,14 +58,14 @@ def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body
 
 @router.post("/count")
 def count_episodes(library: Served, caller: Reader, told: Annotated[Chosen, Body()]) -> int:
-    """How many episodes a filter is true of."""
+    """How many episodes match a filter."""
     with library.database.reading() as connection:
         return episodes.count_episodes(connection, caller, told.filter)
 
 
 @router.post("/delete")
 def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Body()]) -> Response:
-    """Deletes the episodes that a filter is true of; `{"episodes": how many}`."""
+    """Deletes the episodes that match a filter; `{"episodes": how many}`."""
     if told.filter is None:
         raise StorageError("expected a filter that says which episodes to delete")
     return answer({"episodes": library.delete_episodes(caller, told.filter)})
@@ -73,7 +73,7 @@ def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Bod
 
 @router.post("/publish")
 def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Body()]) -> Response:
-    """Lets a group see the episodes that a filter is true of, or no more: all, or none; `{"episodes": how many}`."""
+    """Lets a group see the episodes that match a filter, or no more: all, or none; `{"episodes": how many}`."""
     change = episodes.publish if told.published else episodes.unpublish
     with library.database.writing() as connection:
         return answer({"episodes": change(connection, caller, told.filter, told.group)})

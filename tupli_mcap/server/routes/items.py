@@ -35,7 +35,7 @@ def store_benchmark(library: Served, caller: Writer, told: BenchmarkQuery) -> Re
 
 @router.post("/benchmarks/list", response_model=Found)
 def list_benchmarks(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
-    """The benchmarks that a filter is true of, oldest first."""
+    """The benchmarks that match a filter, oldest first."""
     with library.database.reading() as connection:
         found = library.items.list_benchmarks(connection, caller, told.filter)
     return paged(found, told, library.settings.max_page)
@@ -88,7 +88,7 @@ async def store_artifact(
 
 @router.post("/artifacts/list", response_model=Found)
 def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
-    """The artifacts that a filter is true of, oldest first."""
+    """The artifacts that match a filter, oldest first."""
     with library.database.reading() as connection:
         found = library.items.list_artifacts(connection, caller, told.filter)
     return paged(found, told, library.settings.max_page)

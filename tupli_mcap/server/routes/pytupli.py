@@ -285,7 +285,7 @@ def load_benchmark(library: Served, caller: Reader, benchmark_id: str) -> Respon
 
 @router.post("/benchmarks/list", response_model=list[BenchmarkHeader])
 def list_benchmarks(library: Served, caller: Reader, told: _Filter = None) -> Response:
-    """The benchmarks that a filter is true of."""
+    """The benchmarks that match a filter."""
     with library.database.reading() as connection:
         return answer(library.items.list_benchmarks(connection, caller, _filter(told)))
 
@@ -334,7 +334,7 @@ def load_artifact(library: Served, caller: Reader, request: Request, artifact_id
 
 @router.post("/artifacts/list", response_model=list[ArtifactMetadataItem])
 def list_artifacts(library: Served, caller: Reader, told: _Filter = None) -> Response:
-    """The artifacts that a filter is true of."""
+    """The artifacts that match a filter."""
     with library.database.reading() as connection:
         return answer(library.items.list_artifacts(connection, caller, _filter(told)))
 
@@ -373,7 +373,7 @@ def record_episode(library: Served, caller: Changing, told: Episode) -> Response
 
 @router.post("/episodes/list", response_model=list[EpisodeHeader])
 def list_episodes(library: Served, caller: Reader, told: _Filter = None) -> Response:
-    """The episodes that a filter is true of, with their tuples if `include_tuples` says so."""
+    """The episodes that match a filter, with their tuples if `include_tuples` says so."""
     with_tuples = bool((told or {}).get("include_tuples"))
     with library.database.reading() as connection:
         found = list(episodes.find_episodes(connection, caller, _filter(told)))

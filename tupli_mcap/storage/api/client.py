@@ -51,14 +51,14 @@ _EPISODE_ID: Final = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 class TupliAPIClient(People, Recordings, TupliStorage):
     """A storage on the server at `url`: `tupli-mcap serve` starts one.
 
-    Without a URL it is that of TUPLI_MCAP_URL, of the last `login` or `set_url`, or of this machine. What is recorded
-    is written here first, and sent behind for as long as it takes: recording neither waits for the server nor fails for
-    it. Every question waits until all that this process has recorded is there, of what goes on the episodes that have
-    ended; so does the end of the program. What it could not send is sent by the next one. Usable from any thread; in
-    another process it is opened anew.
+    Without a URL it is that of TUPLI_MCAP_URL, of the last `login` or `set_url`, or of this machine. Recordings are
+    written on this machine first and sent in the background: recording neither waits for the server nor fails with it.
+    Every query waits until the server has all that this process has recorded, and of recordings that still grow the
+    ended episodes; so does the end of the program. What a program could not send, the next one sends. Usable from any
+    thread; in another process it is opened anew.
 
     Raises:
-        StorageError: the URL is none of a web server; later, the server does not answer, or refuses.
+        StorageError: the URL is no web server's; later, the server does not answer, or refuses.
     """
 
     def __init__(self, url: str | None = None) -> None:
@@ -98,9 +98,10 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         return self._outbox.waiting_elsewhere()
 
     def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
-        """Wait until the server has all that this process has recorded; of what goes on, the episodes that have ended.
+        """Wait until the server has all that this process has recorded: of recordings that still grow, the ended
+        episodes.
 
-        everything: also what other processes have left. tell: is told how many more bytes were sent.
+        everything: also what other processes have left. tell: called with the number of bytes just sent.
 
         Raises:
             StorageError: the server does not answer, or refuses some of it; that stays on this machine.
@@ -278,11 +279,11 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self._unpublish("episodes", _episode(uri), unpublish_from)
 
     def publish_episodes(self, filter: BaseFilter, publish_in: str = "global") -> int:
-        """Let a group see every episode of yours that a filter is true of; returns how many."""
+        """Let a group see every episode of yours that matches a filter; returns how many."""
         return self._publish_all(filter, publish_in, published=True)
 
     def unpublish_episodes(self, filter: BaseFilter, unpublish_from: str) -> int:
-        """Take every episode that a filter is true of away from a group; returns how many."""
+        """Take every episode that matches a filter away from a group; returns how many."""
         return self._publish_all(filter, unpublish_from, published=False)
 
     def _publish_all(self, filter: BaseFilter, group: str, *, published: bool) -> int:

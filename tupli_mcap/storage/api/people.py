@@ -73,11 +73,11 @@ class People:
         return _group(as_told(_Group, self._session.ask("GET", f"/v1/groups/{_name(group_name)}")))
 
     def delete_group(self, group_name: str) -> None:
-        """Delete a group; what is published in it is seen by its owners only."""
+        """Delete a group; afterwards, only its owners see what was published in it."""
         self._session.ask("DELETE", f"/v1/groups/{_name(group_name)}")
 
     def add_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
-        """Give users roles in a group, beside those that they hold: all of them, or none."""
+        """Give users roles in a group, in addition to those that they hold; all are given, or none."""
         wanted = [member.model_dump(exclude_none=True) for member in group_membership_query.members]
         path = f"/v1/groups/{_name(group_membership_query.group_name)}/members"
         return _group(as_told(_Group, self._session.ask("PUT", path, wanted)))
@@ -110,7 +110,7 @@ class People:
         `write` all of it, for so many days, or for ever.
 
         Returns:
-            The token; this once with the text that it is.
+            The token. Its text is in it this once only.
         """
         wanted = {"name": name, "scope": scope, "days": days}
         return _token(as_told(_Token, self._session.ask("POST", "/v1/api-tokens", wanted)))

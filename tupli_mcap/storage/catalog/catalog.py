@@ -150,7 +150,7 @@ class Catalog:
     def episodes(
         self, filter: BaseFilter | None = None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
-        """The episodes that a filter is true of, ordered by recording (path) and episode number.
+        """The episodes that match a filter, ordered by recording (path) and episode number.
 
         Raises:
             FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be.
@@ -159,7 +159,7 @@ class Catalog:
             return list(queries.find_episodes(connection, filter, limit=limit, offset=offset))
 
     def count(self, filter: BaseFilter | None = None) -> int:
-        """How many episodes a filter is true of. Raises as `episodes` does."""
+        """How many episodes match a filter. Raises as `episodes` does."""
         with self._read() as connection:
             return queries.count_episodes(connection, filter)
 

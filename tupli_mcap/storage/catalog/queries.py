@@ -100,7 +100,7 @@ def find_episodes(
     sort: Sort | None = None,
     backwards: bool = False,
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that a filter is true of, by default ordered by recording (path) and episode number.
+    """The episodes that match a filter, by default ordered by recording (path) and episode number.
 
     after: where to go on. only: a condition on rows of EPISODE and RECORDING that holds besides the filter.
     backwards: in the opposite order; `after` is then the episode before which they lie.
@@ -127,7 +127,7 @@ def count_episodes(
     only: ColumnElement[bool] | None = None,
     most: int | None = None,
 ) -> int:
-    """How many episodes a filter is true of, counted up to `most`. Raises as `find_episodes` does."""
+    """How many episodes match a filter, counted up to `most`. Raises as `find_episodes` does."""
     meant = _bound(filter)
     found = _narrowed(connection, meant, only)
     if found.exact and most is None:
@@ -223,7 +223,7 @@ def _headers(
     limit: int | None,
     offset: int,
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that a filter is true of; `limit` and `offset` count those that SQL finds.
+    """The episodes that match a filter; `limit` and `offset` count those that SQL finds.
 
     Raises:
         FilterError: the connection has the option `tupli_deadline`, and that has passed.
