@@ -346,6 +346,7 @@ def test_a_loader_in_one_call(dataset: Dataset) -> None:
 def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
     states = dataset.read(["states"]).states.astype(np.float64)
     found = dataset.stats()
+    assert len(repr(found)) < 800
     assert set(found) == {"states", "actions", "rewards"}
     state = found["states"]
     assert state.count.tolist() == [len(states)] * 4

@@ -156,6 +156,16 @@ class TestRun:
                 recorded.step(np.zeros(2, np.int64))
         assert Recording(tmp_path / "v.mcap").episodes[0].run.metadata == {"n": 2}
 
+    @pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+    def test_names_the_environment_that_functions_make(self, kind: Any, tmp_path: Path) -> None:
+        env = gym.wrappers.vector.RecordEpisodeStatistics(kind([lambda: gym.make("CartPole-v1")] * 2))
+        with RecordVectorEpisodes(env, tmp_path) as recorded:
+            recorded.reset(seed=0)
+            recorded.step(np.zeros(2, np.int64))
+        (path,) = tmp_path.iterdir()
+        assert path.name.startswith("CartPole-v1_")
+        assert Recording(path).run.environment == "CartPole-v1"
+
     def test_the_files_of_a_storage_are_called_by_run_and_time(self, tmp_path: Path) -> None:
         for name in ("../../ppo seed 3", None):
             env = TupliEnvWrapper(gym.make("CartPole-v1"), FileStorage(tmp_path / "lab"), name=name)

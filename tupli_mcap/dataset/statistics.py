@@ -26,7 +26,7 @@ _SAMPLED = 1 << 16  # steps that quantiles are of, at even distances
 _BLOCK = 1 << 16  # steps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FieldStatistics:
     """Statistics of a leaf; each array has the leaf's shape.
 
@@ -43,6 +43,15 @@ class FieldStatistics:
     min: Array
     max: Array
     quantiles: dict[float, Array]
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name} {_brief(getattr(self, name))}" for name in ("mean", "std", "min", "max"))
+        return f"<FieldStatistics: {told}>"
+
+
+def _brief(values: Array) -> str:
+    text = np.array2string(values, precision=4, threshold=8, edgeitems=2, max_line_width=1000)
+    return " ".join(text.split())
 
 
 def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, dict[str, FieldStatistics]]:

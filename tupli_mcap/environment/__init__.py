@@ -2,7 +2,7 @@
 
 from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust
-from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, note, resets_itself
+from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, name_of, note, resets_itself
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
 from tupli_mcap.environment._pickling import rebuild_ezpickled
@@ -20,6 +20,7 @@ __all__ = [
     "entry_point_name",
     "fingerprint",
     "more_than_data",
+    "name_of",
     "named_imports",
     "note",
     "reasons_for_distrust",

@@ -9,6 +9,7 @@ import importlib.metadata
 import json
 import platform
 import random
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
@@ -26,6 +27,7 @@ from tupli_mcap.errors import TupliError, brief
 
 # Python 3.11 and 3.12 keep attributes outside a dict until somebody asks for one, and reach them slower from then on.
 _HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
+_ID_IN_TEXT = re.compile(r"<\w+<([^<>]+)>>+$")  # as Gymnasium writes an environment: <Wrapper<Class<id>>>
 _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  # among a spec's arguments
 
 
@@ -42,6 +44,25 @@ def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Enviro
     if inner and isinstance(inner[0], gym.Env):
         return note(inner[0])
     return _noted(env, *_told_of_many(env.unwrapped))
+
+
+def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str:
+    """The Gymnasium id of an environment, of several that of the first sub-environment, wherever it lives; where there
+    is none, the name of its class.
+    """
+    base: Any = env.unwrapped
+    name = getattr(getattr(base, "spec", None), "id", None)
+    if isinstance(name, str):
+        return name
+    inner = getattr(base, "envs", None)
+    if inner and isinstance(inner[0], gym.Env):
+        return name_of(inner[0])
+    if type(base) is gym.vector.AsyncVectorEnv:
+        # a text, as a spec may be nothing that another process can send
+        with contextlib.suppress(Exception):
+            if found := _ID_IN_TEXT.search(base.call("__str__")[0]):
+                return found[1]
+    return type(base).__name__
 
 
 def capture(

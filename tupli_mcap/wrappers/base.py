@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import gymnasium as gym
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
@@ -107,7 +108,7 @@ class EpisodeWrapper(Recorder):
         captured = Captured(env, options.capture_env, options.attachments)
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
         spaces.to_metadata()
-        environment = type(env.unwrapped).__name__ if env.spec is None else env.spec.id
+        environment = name_of(env)
         attachments = with_run(captured.with_labels(spaces, options.labels), options, environment)
         options = replace(options, attachments=attachments)
         name = options.name or environment
