@@ -493,11 +493,23 @@ def test_success_of_sub_environments_is_understood(autoreset: Any, record_info: 
 class TestCommands:
     def test_ls_filters_sorts_and_chooses_columns(self, tmp_path: Path) -> None:
         for i in range(3):
-            record(tmp_path / f"{i}.mcap", episodes=i + 1, name=f"run-{i}", metadata={"lr": 10.0**-i})
+            record(
+                tmp_path / f"{i}.mcap",
+                episodes=i + 1,
+                name=f"run-{i}",
+                metadata={"lr": 10.0**-i},
+                tags=["a", "b"],
+            )
         lines = command("ls", str(tmp_path), "--sort", "-episodes", "--columns", "run,episodes").splitlines()
         assert [line.split() for line in lines] == [
             ["RUN", "EPISODES"], ["run-2", "3"], ["run-1", "2"], ["run-0", "1"],
         ]  # fmt: skip
+        lines = command(
+            "ls", str(tmp_path), "--sort", "-settings", "--columns", "settings,tags,split"
+        ).splitlines()
+        assert [line.split()[0] for line in lines] == ["SETTINGS", "lr=1", "lr=0.1", "lr=0.01"]
+        shown = command("episodes", str(tmp_path / "0.mcap"), "--columns", "run,run.tags").splitlines()
+        assert [line.split() for line in shown] == [["RUN", "RUN.TAGS"], ["run-0", "a,", "b"]]
         found = json.loads(
             command("ls", str(tmp_path), "--filter", "run.metadata.lr < 0.5 and seed = 0", "--json")
         )["result"]
@@ -544,6 +556,8 @@ class TestCommands:
         assert "grade" not in Recording(path).episodes[0].metadata
         command("tag", path, "--undo")
         assert Recording(path).episodes[0].metadata["grade"] == 1.5
+        wrong = CliRunner().invoke(app, ["edit", path, "lr=0.5"])
+        assert "lr=0.5 is no recording; to change metadata of the run, --set lr=0.5" in wrong.output
         command(
             "edit",
             path,

@@ -172,6 +172,11 @@ def edit(
     """
     from tupli_mcap.recording import edit_run, undo_edit
 
+    meant = [str(file) for file in files if "=" in str(file) and not file.exists()]
+    if meant:
+        raise typer.BadParameter(
+            f"{meant[0]} is no recording; to change metadata of the run, --set {meant[0]}"
+        )
     if undo == any(given is not None for given in (name, settings, tags, run_split)):
         raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split; or --undo")
     metadata = dict(pair_of(text) for text in settings or ())

@@ -15,12 +15,12 @@ from tupli_mcap.cli.output import (
     counted,
     number,
     numbers,
+    pairs_of,
     print_facts,
     print_json,
     print_table,
     print_wrapped,
     short_ids,
-    short_value,
     time_of,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
@@ -219,9 +219,7 @@ def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
         "run": run.get("name", ""),
         "split": run.get("split", ""),
         "tags": ", ".join(run.get("tags", ())),
-        "settings": ", ".join(
-            f"{key}={short_value(value)}" for key, value in run.get("metadata", {}).items()
-        ),
+        "settings": pairs_of(run.get("metadata", {})),
         "command": " ".join(run.get("command", ())),
         "commit": f"{git.get('commit', '')!s:.12}{', with changes' if git.get('dirty') is True else ''}"
         if git

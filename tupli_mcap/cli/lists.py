@@ -25,6 +25,7 @@ from tupli_mcap.cli.output import (
     bytes_of,
     number,
     numbers,
+    pairs_of,
     print_json,
     print_table,
     short_ids,
@@ -87,10 +88,22 @@ _COLUMNS = {
     "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
     "size": _Listed("size", Column("SIZE", "right"), _each(lambda r: bytes_of(r.size))),
     "state": _Listed("state", Column("STATE"), _each(lambda r: r.state)),
+    "split": _Listed("split", Column("SPLIT"), _each(lambda r: r.split)),
+    "tags": _Listed("tags", Column("TAGS", shrink="end"), _each(lambda r: ", ".join(r.tags))),
+    "settings": _Listed(
+        "settings", Column("SETTINGS", shrink="end"), _each(lambda r: pairs_of(r.settings or {}))
+    ),
 }
 
 
-_MEANT = {"date": "started", "time": "started", "created": "started", "length": "steps", "name": "run"}
+_MEANT = {
+    "date": "started",
+    "time": "started",
+    "created": "started",
+    "length": "steps",
+    "name": "run",
+    "metadata": "settings",
+}
 """What columns may be called."""
 
 
@@ -109,10 +122,11 @@ def ls(
     """List recordings in files and directories: their runs.
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
-    state. RETURN is the mean over episodes. STATE is `complete`, `recording` while somebody
-    writes it, or `recovered` if its writer was killed or failed; then all finished steps are
-    there, if its journal is. Deleted episodes are not counted. With --filter, only the
-    episodes that match are counted.
+    state, and where asked for split, tags, settings (the metadata of the run). RETURN is the
+    mean over episodes. STATE is `complete`, `recording` while somebody writes it, or
+    `recovered` if its writer was killed or failed; then all finished steps are there, if its
+    journal is. Deleted episodes are not counted. With --filter, only the episodes that match
+    are counted.
     """
     from tupli_mcap.storage.listing import list_recordings
 
@@ -156,7 +170,9 @@ def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -
 
     def key(item: ListedRecording) -> Any:
         value = getattr(item, field)
-        return None if item.error or (isinstance(value, float) and math.isnan(value)) else value
+        if item.error or value is None or (isinstance(value, float) and math.isnan(value)):
+            return None
+        return pairs_of(value) if isinstance(value, dict) else value
 
     known = [item for item in items if key(item) is not None]
     return [*sorted(known, key=key, reverse=descending), *(item for item in items if key(item) is None)]
@@ -277,7 +293,8 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     from tupli_mcap.schema.facts import path_in
     from tupli_mcap.schema.predicate import MISSING, look_up
 
-    paths = [path_in(key, EpisodeHeader) for key in keys]
+    # a run is known by its name, as in other tables
+    paths = [path_in("run.name" if key == "run" else key, EpisodeHeader) for key in keys]
     found = [[look_up(header, path) for path in paths] for header in headers]
     for key, column in zip(keys, zip(*found, strict=True), strict=False):
         if all(value is MISSING for value in column):
@@ -329,7 +346,7 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
                 header.end,
                 "" if header.seed is None else str(header.seed),
                 *([when(header.created_at)] if roomy else []),
-                ", ".join(f"{key}={short_value(value)}" for key, value in header.metadata.items()),
+                pairs_of(header.metadata),
             )
         )
     print_table(columns, rows, empty="no episodes")

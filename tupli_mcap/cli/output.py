@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, Final, Literal, NamedTuple
@@ -207,9 +207,16 @@ def short_value(value: object) -> str:
         return f"{value:.4g}"
     if isinstance(value, str):
         return value
+    if isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return ", ".join(value)
     from tupli_mcap.jsonvalue import shown
 
     return shown(value)
+
+
+def pairs_of(values: Mapping[str, Any]) -> str:
+    """Metadata in a table: `lr=0.0003, algo=ppo`."""
+    return ", ".join(f"{key}={short_value(value)}" for key, value in values.items())
 
 
 def counted(count: int, noun: str) -> str:

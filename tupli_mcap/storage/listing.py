@@ -9,7 +9,7 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,8 +76,8 @@ class ListedRecording(NamedTuple):
     return_mean: over the episodes that are left, None if there are none; without the `return_nan` whose return is
         NaN, and NaN itself where that is so of all. size: bytes of the file.
     state: as `tupli_mcap.recording.description.state_of` says.
-    name, environment, started (ISO 8601 in UTC): of its run. success: the share of the episodes that succeeded, among
-        the `success_known` whose metadata say it; None if none do.
+    name, environment, started (ISO 8601 in UTC), split, tags, settings (its metadata): of its run.
+    success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if none do.
     """
 
     path: str
@@ -95,6 +95,9 @@ class ListedRecording(NamedTuple):
     started: str = ""
     success: float | None = None
     success_known: int = 0
+    split: str = ""
+    tags: tuple[str, ...] = ()
+    settings: dict[str, Any] | None = None
 
 
 class Compactable(NamedTuple):
@@ -229,7 +232,7 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
             rows = recording.index[kept]
             returns = spread_of(rows["return"])
-            said = successes(recording, kept)
+            said, run = successes(recording, kept), recording.readable_runs[0]
             return ListedRecording(
                 path=str(path),
                 episodes=len(rows),
@@ -241,10 +244,13 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 benchmark_id=recording.benchmark_id,
                 state=state_of(recording),
                 name=", ".join(dict.fromkeys(run.name for run in recording.readable_runs)),
-                environment=recording.readable_runs[0].environment,
-                started=recording.readable_runs[0].started,
+                environment=run.environment,
+                started=run.started,
                 success=sum(said) / len(said) if said else None,
                 success_known=len(said),
+                split=run.split,
+                tags=run.tags,
+                settings=run.metadata,
             )
     except (TupliError, OSError) as err:
         return ListedRecording(str(path), error=str(err))
