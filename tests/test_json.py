@@ -88,7 +88,9 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(Path("lab"))
     with FileStorage("lab") as storage:
         storage.delete_episode(storage.list_episodes()[0].id)
-    record_rollouts("CartPole-v1", "runs/a.mcap", steps=200, seed=1, name="a", metadata={"lr": 0.1})
+    record_rollouts(
+        "CartPole-v1", "runs/a.mcap", steps=200, seed=1, name="a", metadata={"lr": 0.1}, tags=["b"]
+    )
     shutil.copy("runs/a.mcap", "a.mcap")
     damaged = record(Path("damaged.mcap"))
     hit(damaged, chunks(damaged, "/step")[2])
