@@ -122,11 +122,11 @@ def ls(
     """List recordings in files and directories: their runs.
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
-    state, and where asked for split, tags, settings (the metadata of the run). RETURN is the
-    mean over episodes. STATE is `complete`, `recording` while somebody writes it, or
-    `recovered` if its writer was killed or failed; then all finished steps are there, if its
-    journal is. Deleted episodes are not counted. With --filter, only the episodes that match
-    are counted.
+    state, split, tags, settings. The last three are shown where asked for; settings are the
+    metadata of the run. RETURN is the mean over episodes. STATE is `complete`, `recording`
+    while somebody writes it, or `recovered` if its writer was killed or failed; then all
+    finished steps are there, if its journal is. Deleted episodes are not counted. With
+    --filter, only the episodes that match are counted.
     """
     from tupli_mcap.storage.listing import list_recordings
 
