@@ -49,7 +49,7 @@ def _prose(text: str) -> str:
     """Help as MyST: what would be markup in it is escaped, and options are code."""
     text = re.sub(r"\n(?!\n)(?<!\n\n)", " ", text)
     text = re.sub(r"([*_<>\[\]|#])", r"\\\1", text)
-    return re.sub(r"(?<![\w`])(--[a-z][\w-]*)", r"`\1`", text)
+    return re.sub(r"`[^`]*`|(?<!\w)--[a-z][\w-]*", lambda found: f"`{found[0].strip('`')}`", text)
 
 
 def _cell(text: str) -> str:

@@ -141,16 +141,20 @@ def machine(results: dict[str, Any]) -> str:
     )
 
 
-LEGEND = (
-    "▼ less is better, ▲ more is better; ⚡ somebody is faster than tupli-mcap, and how many times. "
-    "Medians of rounds in alternation, ± half the range. *record* is what a step costs over the same rollout without a "
-    "recorder, closing counted; *open, list* gives each episode's length; *read all* opens and gives all columns, "
-    "*one field* the actions; *episode* and *window* are at random places of an open dataset that was read before; "
-    "*epoch* is a shuffled epoch of windows (up to 20,000; fewer where they are read one by one and slowly) in "
-    "PyTorch's `DataLoader`, its start counted; *filter* opens and gives the steps of the best 1 % of episodes; "
-    "*append* adds about 1,000 steps to what is there (200 images). "
-    "What was recorded or read is compared with what was rolled out before its time counts."
-)
+LEGEND = """▼ less is better, ▲ more is better; ⚡ somebody is faster than tupli-mcap, and how many times. Figures are \
+medians of rounds in alternation, ± half the range. What was recorded or read is compared with what was rolled out \
+before its time counts.
+
+| | |
+|---|---|
+| record | what a step costs over the same rollout without a recorder, closing included |
+| open, list | opening, and the length of each episode |
+| read all, one field | opening, and all columns, or the actions only |
+| episode, window | one at a random place of an open dataset that was read before |
+| epoch | a shuffled epoch of windows in PyTorch's `DataLoader`, its start included: 20,000 windows, fewer where they \
+are read one by one and slowly |
+| filter | opening, and the steps of the best 1 % of episodes |
+| append | adding about 1,000 steps to what is there (200 images) |"""
 
 
 VECTORS = (
