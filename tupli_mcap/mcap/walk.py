@@ -182,7 +182,7 @@ class Walk:
         elif opcode < 0x80 or not self._stands_at(position + 9 + length):
             return f"expected a record, found opcode {opcode}"
         if self._budget < 0:
-            return "too much of the file has been checked in vain"
+            return "too much damage: the limit of bytes to search for records is reached"
         body = memoryview(self._source.read(position + 9, length))
         try:
             if opcode in _PARSED:

@@ -148,7 +148,7 @@ def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:
 
 @contextlib.contextmanager
 def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator[None]:
-    """Closes a wrapper. A new file that no step came into is removed: it would be in the way of the next try."""
+    """Closes a wrapper. A new file without steps is removed: it would be in the way of the next try."""
     try:
         with contextlib.closing(env):
             yield

@@ -60,7 +60,7 @@ class Stream:
 
     Attributes:
         is_running: an episode has begun and not ended.
-        over: how the last step has ended the running episode, None if it has not.
+        over: how the last step ended the running episode; None while it runs.
     """
 
     def __init__(self, streams: Streams, env: int) -> None:

@@ -1,20 +1,21 @@
-"""Autoreset of a vector environment: what it says of it, and what its batches say.
+"""The autoreset mode of a vector environment: as it is declared, and as its batches show it.
 
 NEXT_STEP: after an end, the next call resets the sub-environment and ignores its action: a hole, no step.
 SAME_STEP: the call that ends an episode already returns the next one's first state; the final one is in its infos.
 DISABLED: the caller resets, all or by `reset_mask`.
 
-By the wrong mode, the next episode's first state is recorded as a final one, a reset as a step, or a step as a reset.
-An environment may say nothing of its mode, or something wrong, so:
+With the wrong mode, the next episode's first state would be recorded as a final one, a reset as a step, or a step as a
+reset. An environment may declare no mode, or a wrong one, so:
 
 1. A final state in the infos of a batch that ends episodes, other than the state that is returned, says same-step.
-   Where no mode is declared and no end has been recorded yet, that mode is gone on with; where another one is declared,
-   or ends have been recorded, the batch is refused. What the caller says counts more, and the caller is told.
-2. A flag in the batch after an end says that this was a step, and no reset; where no mode is declared, a reward says so
-   too. That batch is refused. (Wrappers may give rewards to resets, so a declared mode counts more than a reward.)
+   Where no mode is declared and no end has been recorded yet, that mode is taken; where another one is declared, or
+   ends have been recorded, the batch is refused. A mode given by the caller takes precedence, with a warning.
+2. A flag in the batch after an end shows that this was a step, and no reset; where no mode is declared, a reward shows
+   it too. That batch is refused. (Wrappers may give rewards to resets, so a declared mode takes precedence over a
+   reward.)
 3. Where no mode is declared, an end is written with the batch after it: if that is refused, without a final state.
-4. Under same-step autoreset without final states, as the caller has asked for, a step after an end without reward and
-   flags says that this was a reset, if no other step went without a reward. That batch is refused.
+4. Under same-step autoreset without final states, which the caller has asked for, a step after an end without reward
+   and flags shows that this was a reset, if every other step had a reward. That batch is refused.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ class Autoreset:
     """The mode of one vector environment, for all the recordings of a wrapper.
 
     Attributes:
-        mode: what is recorded by; "SameStep" once rule 1 has found it out.
+        mode: the mode that is recorded by; "SameStep" once rule 1 applied.
         is_assumed: neither the environment nor the caller has said which mode it is.
-        needs_no_finals: the caller has said that it is same-step autoreset, whatever infos hold.
-        watches_steps: `check_steps` is to be asked, as no final state was seen yet.
+        needs_no_finals: the caller has given same-step autoreset, whether infos hold final states or not.
+        watches_steps: `check_steps` must be called, because no final state was seen yet.
         is_plain: next-step autoreset, and not because it is assumed.
         has_ended: ends are recorded by the mode.
         doubt: what the caller should be told, if anything.
@@ -62,10 +63,10 @@ class Autoreset:
 
     @classmethod
     def of(cls, env: Any, given: Any) -> Autoreset:
-        """The one that the caller gives, or the environment declares; next-step is assumed.
+        """The mode that the caller gives, or the environment declares; by default next-step is assumed.
 
         Raises:
-            StepError: it is none of the three.
+            StepError: the mode is none of the three.
         """
         # those of Gymnasium 1.0 do not declare the only mode they have
         base = env.unwrapped
@@ -83,9 +84,9 @@ class Autoreset:
         raise StepError(f"autoreset_mode: expected NextStep, SameStep or Disabled, found {found!r:.80}")
 
     def resets_already(self, *, changed: bool) -> bool:
-        """For a batch with ends whose infos hold final states: whether that makes the mode same-step, from now on.
+        """Takes a batch with ends whose infos hold final states. Returns whether the mode is same-step from now on.
 
-        `changed`: the states it returned are others.
+        `changed`: the batch returned other states than these.
 
         Raises:
             StepError: that contradicts what was recorded, or what the caller has said.
@@ -113,7 +114,7 @@ class Autoreset:
             self._has_told, self.doubt = True, text
 
     def check_resets(self, holes: Array, done: Array, rewards: Array) -> None:
-        """For a batch in which the sub-environments `holes` should have been reset.
+        """Checks a batch in which the sub-environments `holes` should have been reset.
 
         Raises:
             StepError: they took a step.
@@ -130,7 +131,7 @@ class Autoreset:
             )
 
     def check_steps(self, ended: Array, done: Array, rewards: Array) -> None:
-        """For a batch under same-step autoreset, after one in which the sub-environments `ended`.
+        """Checks a batch under same-step autoreset, after one in which the sub-environments `ended`.
 
         Raises:
             StepError: one of them was reset only now.

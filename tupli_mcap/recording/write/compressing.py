@@ -1,4 +1,4 @@
-"""A thread that compresses chunks while the next rows are recorded, where that is worth a thread.
+"""Compresses chunks at once, or on a thread while the next rows are recorded, where a job is long enough.
 
 A small chunk is done before a thread has woken up and both have waited for the interpreter lock. Photographs, and the
 chunks of many sub-environments in one call, spend milliseconds in the compressor, which lets go of that lock.
@@ -21,7 +21,7 @@ LARGE = 3 << 20  # bytes that take as long at 3 GB/s; how long they do is known 
 class ChunkWorker:
     """Runs jobs one after another: on a thread of its own if the one before took long, else at once.
 
-    Of the first one its size decides.
+    For the first job, its size decides.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,8 @@ class ChunkWorker:
         self._seconds: float | None = None  # of processor time, of the last job
 
     def submit(self, job: Callable[[], T], size: int) -> Callable[[], T]:
-        """Does a job, or hands it over and returns once the thread has taken it up; what it returns waits for it.
+        """Does a job, or hands it to the thread and returns once that has begun. Returns a function that waits for the
+        job.
 
         The job's memory, `size` bytes, must stay until then.
         """

@@ -1,6 +1,6 @@
-"""Starts and ends of episodes on their way to the journal: what every episode does, in as few calls as it takes.
+"""Puts the starts and ends of episodes into the journal.
 
-Little of this is in the processor's caches when an episode ends, so that every function on the way costs.
+This runs once an episode, with cold processor caches: keep the chains of calls short.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ResetFacts(NamedTuple):
 
     @property
     def goes_on(self) -> bool:
-        """True if the reset had no seed, so that it went on with the random stream of what came before it."""
+        """True if the reset had no seed, so that the environment's random stream went on."""
         return self.seed is None and self.drawn_seed is None and not self.continued
 
 
@@ -65,7 +65,7 @@ _new: Callable[[type[StartedEpisode], tuple[Any, ...]], StartedEpisode] = tuple.
 
 
 class EpisodeLog(EventLog):
-    """The log of `/episode_start`, `/final_state` and `/episode_end`; `index` is told of every end."""
+    """The log of `/episode_start`, `/final_state` and `/episode_end`; every end is added to `index`."""
 
     def __init__(
         self,
@@ -158,11 +158,11 @@ class EpisodeLog(EventLog):
         )  # fmt: skip
 
     def expect_end(self, episode: StartedEpisode) -> None:
-        """The end of a started episode will be derived from its rows."""
+        """Notes that the end of a started episode will be derived from its rows."""
         self._running[episode.number] = episode
 
     def take_back(self, number: int) -> StartedEpisode:
-        """A running episode whose end will be logged: it is not derived after all."""
+        """Notes that the end of a running episode will be logged, and is not derived after all."""
         return self._running.pop(number)
 
     def extend(self, batch: EpisodeBatch) -> None:

@@ -21,8 +21,8 @@ Ask = Callable[..., Any]
 
 
 class FrameRecorder:
-    """Puts the frames of one camera into a recording: of an episode's first state, of the state after every `every`-th
-    step, and of its last one if it ends by itself.
+    """Records the frames of one camera: of an episode's first state, of the state after every `every`-th step, and of
+    the last state if the episode ends by a flag.
 
     A frame is in the journal, or in the file, when `step` returns. `options` have the `every` and the format of frames;
     `ask` calls what renders (`Work.ask`).
@@ -40,11 +40,11 @@ class FrameRecorder:
         self._first[env] = self._ask(self._rendered, render)
 
     def go_on(self, writer: RecordingWriter) -> None:
-        """The next frames go to another file."""
+        """Continues in another file."""
         self._writer = writer
 
     def forget(self, env: int) -> None:
-        """After a reset that failed: nothing is known of the state."""
+        """Forgets the pending picture after a reset that failed: the state is unknown."""
         self._first[env] = None
 
     def step(self, env: int, episode: int, step: int, ended: bool, render: Callable[[], Any] | None) -> None:
@@ -70,7 +70,7 @@ class FrameRecorder:
 
 
 def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
-    """Puts the frame of a step that is recorded into a recording; its time is not before the last one's."""
+    """Records the frame of a step; its time is not before that of the last frame."""
     camera, pairs = writer.channels.cameras[env]
     log = writer.frames[env]
     frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
@@ -86,7 +86,7 @@ class VectorFrames:
         self._n = num_envs
 
     def go_on(self, writer: RecordingWriter) -> None:
-        """The next frames go to another file."""
+        """Continues in another file."""
         self._frames.go_on(writer)
 
     def start(self, chosen: Array, render: Callable[[], Any]) -> None:

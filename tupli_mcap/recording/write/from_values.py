@@ -63,7 +63,7 @@ def write_recording(
 ) -> None:
     """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
 
-    `frames` says that some of them have frames.
+    `frames`: whether some of them have frames.
 
     Raises:
         StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag

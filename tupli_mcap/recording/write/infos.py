@@ -1,4 +1,4 @@
-"""Which infos of the steps are recorded, their way into the journal, and those of a vector environment taken apart.
+"""Chooses the infos of steps that are recorded, puts them into the journal, and splits those of vector environments.
 
 These are a dict as Gymnasium's environments return it, in which a mask `_<key>` says who has an entry; or, from
 `DictInfoToList` and from Stable-Baselines3, a list of infos.

@@ -1,4 +1,4 @@
-"""What `RecordEpisodes` is given, and whether it may be: all options stand here, and are checked here."""
+"""The options of `RecordEpisodes`, and their checks."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ _MOST = MAX_CHUNK // 2  # a chunk may come out larger; readers refuse those beyo
 
 @dataclass(frozen=True)
 class RecordOptions:
-    """The arguments of `RecordEpisodes`, which says what each of them is, under the same names.
+    """The arguments of `RecordEpisodes`, under the same names; its docstring says what each of them is.
 
     Raises:
-        RecordingError: one of them is something else than it may be.
+        RecordingError: one of them has a value that it may not have.
         MissingExtraError: the extra that `image_format` needs is not installed.
     """
 
@@ -111,7 +111,7 @@ class RecordOptions:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The one that frames come from, if any."""
+        """The camera that frames come from, if any."""
         return (CAMERA,) if self.every else ()
 
     @property
@@ -121,7 +121,7 @@ class RecordOptions:
 
     @property
     def has_callbacks(self) -> bool:
-        """True if values of each step are looked at beside its row."""
+        """True if a callback needs the values of each step."""
         return self.has_infos or self.metadata_callback is not None
 
     @property
@@ -131,7 +131,7 @@ class RecordOptions:
 
     @property
     def is_plain(self) -> bool:
-        """True if nothing follows a step but its row."""
+        """True if a step writes its row and nothing else."""
         needs = self.has_callbacks or self.every or self.has_limits
         return not needs and self.flush_seconds is None and self.durability != "step"
 

@@ -104,7 +104,7 @@ class Rotation:
 
     @property
     def paths(self) -> list[Path]:
-        """The files so far; one that no step came into is gone once it is closed."""
+        """The files so far; a file without steps is removed when it is closed."""
         return [path for path in self._paths[:-1] if path.exists()] + self._last()
 
     def _last(self) -> list[Path]:

@@ -83,7 +83,7 @@ class SingleRecorder:
         self._reset: tuple[Any, ResetFacts] | None = None
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
-        self._over: int | None = None  # how the last step has ended its episode, if that is not written yet
+        self._over: int | None = None  # how the last step ended its episode, until that is written
         self._rows: SingleRows | None = None  # if episodes can be derived from them
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset

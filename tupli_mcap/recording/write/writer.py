@@ -55,7 +55,7 @@ _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
 class RecordingWriter:
     """Writes one recording; `begin` is called at the first step, when the layout is known.
 
-    A new recording that no step came into is removed when it is closed, unless `keep_empty`.
+    A new recording without steps is removed when it is closed, unless `keep_empty`.
     """
 
     def __init__(
