@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import datetime
+import hashlib
+import ipaddress
 import json
 import os
 import re
@@ -15,6 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from serving import PASSWORD
 
 COMMAND = str(Path(sys.executable).with_name("tupli-mcap"))
@@ -80,3 +87,44 @@ def served(directory: Path, *options: str, port: int = 0) -> Iterator[Process]:
         yield process
     finally:
         process.kill()
+
+
+def certificate(folder: Path) -> tuple[Path, Path]:
+    """A certificate of 127.0.0.1, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
+    now = datetime.datetime.now(datetime.UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(1)
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=1))
+        .add_extension(
+            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
+        )
+        .sign(key, hashes.SHA256())
+    )
+    paths = folder / "certificate.pem", folder / "key.pem"
+    paths[0].write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    paths[1].write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+    )
+    return paths
+
+
+def sign_in(client: httpx.Client) -> dict[str, str]:
+    """The header that says that the admin asks."""
+    answer = client.post("/v1/tokens", json={"username": "admin", "password": PASSWORD})
+    return {"Authorization": f"Bearer {answer.json()['access_token']}"}
+
+
+def begin(client: httpx.Client, token: dict[str, str], data: bytes) -> str:
+    """Begins an upload; gives its address."""
+    digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
+    headers = {"Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}", **token}
+    return client.post("/v1/uploads", headers=headers).headers["Location"]

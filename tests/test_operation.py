@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import datetime
-import hashlib
-import ipaddress
 import signal
 import ssl
 import subprocess
@@ -16,10 +12,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from served import COMMAND, Process, served
+from served import COMMAND, begin, certificate, served, sign_in
 from serving import PASSWORD
 
 from tupli_mcap.storage import TupliAPIClient
@@ -33,45 +26,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def certificate(folder: Path) -> tuple[Path, Path]:
-    """A certificate of 127.0.0.1, and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
-    now = datetime.datetime.now(datetime.UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .add_extension(
-            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
-        )
-        .sign(key, hashes.SHA256())
-    )
-    paths = folder / "certificate.pem", folder / "key.pem"
-    paths[0].write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    paths[1].write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-    )
-    return paths
-
-
-def sign_in(server: Process, client: httpx.Client) -> dict[str, str]:
-    answer = client.post("/v1/tokens", json={"username": "admin", "password": PASSWORD})
-    return {"Authorization": f"Bearer {answer.json()['access_token']}"}
-
-
-def begin(client: httpx.Client, token: dict[str, str], data: bytes) -> str:
-    digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
-    headers = {"Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}", **token}
-    return client.post("/v1/uploads", headers=headers).headers["Location"]
-
-
 def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) -> None:
     cert, key = certificate(tmp_path)
     options = ("--workers", "2", "--certificate", str(cert), "--key", str(key))
@@ -81,7 +35,7 @@ def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) 
         secrets = [PASSWORD]
         for _ in range(4):  # each connection may reach another process
             with httpx.Client(base_url=server.url, verify=context, timeout=60) as client:
-                token = sign_in(server, client)
+                token = sign_in(client)
                 secrets.append(token["Authorization"].partition(" ")[2])
                 place = begin(client, token, recording)
                 offset = int(client.head(place, headers=token).headers["Upload-Offset"])
@@ -116,7 +70,7 @@ def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) 
 def test_who_is_sending_may_finish_when_the_server_stops(tmp_path: Path, recording: bytes) -> None:
     with served(tmp_path / "served") as server:
         with httpx.Client(base_url=server.url, timeout=120) as client:
-            token = sign_in(server, client)
+            token = sign_in(client)
             place = begin(client, token, recording)
             stopping = threading.Event()
 

@@ -171,10 +171,10 @@ def _number(text: str) -> int:
 
 @router.post("/tickets")
 def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body()]) -> Ticket:
-    """An address at which programs that cannot sign in may read a recording for a while."""
+    """An address at which programs that cannot sign in may read a recording for a while, and as long as it stays."""
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, told.recording)
-    ticket = library.tokens.ticket(caller.name, recording=found.name)
+    ticket = library.tokens.ticket(caller.name, recording=found.name, digest=found.digest)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
     return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
 
@@ -192,6 +192,8 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
         if not found.whole:
             query = EpisodeQuery(recordings=[found.name])
             selected = select_episodes(connection, caller, library.items, query)
+    if holder.ticket is not None and holder.ticket.get("digest", found.digest) != found.digest:
+        raise HTTPException(412, "this has changed; open it again")
     if not found.whole:
         return Response() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]

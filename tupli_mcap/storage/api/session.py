@@ -232,7 +232,6 @@ class Session:
             further = response.next_request
             if further is None or method != "GET":
                 break
-            further.headers.pop("If-Match", None)  # the bucket has tags of its own
             response.close()
             response = client.send(further, stream=stream)
         return response
