@@ -17,9 +17,10 @@ from starlette.exceptions import HTTPException
 
 import tupli_mcap
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FilterError, MissingExtraError, NotFoundError, TupliError
+from tupli_mcap.errors import FilterError, MissingExtraError, NotFoundError, SpaceError, TupliError
 from tupli_mcap.page import texts
 from tupli_mcap.page.shelf import Shelf
+from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
 __all__ = ["POLICY", "PageRoute", "Shown", "SignInNeededError", "address", "error_page", "page"]
@@ -168,7 +169,8 @@ def _told(request: Request, err: Exception) -> tuple[int, str]:
 
 
 def _status(err: Exception) -> tuple[int, str]:
-    kinds = ((NotFoundError, 404), (FilterError, 400), (MissingExtraError, 501))
+    wrong = (FilterError, SpaceError, UnmergeableError)
+    kinds = ((NotFoundError, 404), (wrong, 400), (MissingExtraError, 501))
     return next((code for kind, code in kinds if isinstance(err, kind)), 500), str(err)
 
 

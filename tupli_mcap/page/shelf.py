@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, and_
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
-from tupli_mcap.storage.catalog.queries import find_episodes
+from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 from tupli_mcap.storage.catalog.tables import EPISODE
 
 __all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes"]
@@ -79,14 +79,12 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
         NotFoundError: one of them is not there, or may not be read.
     """
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
-    found: dict[str, EpisodeHeader] = {}
-    for header in find_episodes(connection, wanted, only=seen_episodes(shelf)):
-        if header.id not in found or header.created_by == shelf.user:
-            found[header.id] = header
-    missing = [uri for uri in uris if uri not in found]
+    found = each_once(find_episodes(connection, wanted, only=seen_episodes(shelf)), shelf.user)
+    known = {header.id for header in found}
+    missing = [uri for uri in uris if uri not in known]
     if missing:
         raise NotFoundError(f"there is no episode {missing[0][:80]!r} here")
-    return list(found.values())
+    return found
 
 
 def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:

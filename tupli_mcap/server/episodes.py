@@ -114,7 +114,7 @@ def publish(
     Returns:
         How many they are.
     """
-    found = _own_first(connection, caller, filter, only)
+    found = queries.each_once(find_episodes(connection, caller, filter, only=only), caller.name)
     for header in found:
         if header.created_by != caller.name:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
@@ -141,7 +141,7 @@ def unpublish(
     Returns:
         How many they are.
     """
-    found = _own_first(connection, caller, filter, only)
+    found = queries.each_once(find_episodes(connection, caller, filter, only=only), caller.name)
     if any(header.created_by != caller.name for header in found):
         caller.demand(Right.EPISODE_DELETE, group)
     _set_audiences(connection, found, lambda groups: [name for name in groups if name != group])
@@ -189,17 +189,6 @@ def forget(connection: Connection, path: str) -> str:
 def no_episode(uri: str) -> NotFoundError:
     """The error for an id that no readable episode has."""
     return NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
-
-
-def _own_first(
-    connection: Connection, caller: Caller, filter: BaseFilter | None, only: ColumnElement[bool] | None
-) -> list[EpisodeHeader]:
-    """The readable episodes that match a filter; of one that several people have stored, the caller's own."""
-    found: dict[str, EpisodeHeader] = {}
-    for header in find_episodes(connection, caller, filter, only=only):
-        if header.id not in found or header.created_by == caller.name:
-            found[header.id] = header
-    return list(found.values())
 
 
 def _delete(connection: Connection, doomed: Sequence[EpisodeHeader]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
 from operator import and_
 from typing import Final, NamedTuple
@@ -95,12 +95,24 @@ def select_episodes(
         raise StorageError(
             f"expected episodes of at most {_MOST} recordings, found {len(numbers)}; name some (`recordings`)"
         )
-    return [Selected(name, _place(connection, name), found) for name, found in numbers.items()]
+    return _each_once(connection, caller, numbers)
 
 
-def _place(connection: Connection, name: str) -> str:
-    query = select(FILE.c.place).where(FILE.c.path == escape_text(name))
-    return unescape_text(connection.execute(query).scalar_one())
+def _each_once(
+    connection: Connection, caller: Caller, numbers: Mapping[str, Sequence[int]]
+) -> list[Selected]:
+    """Episodes by the names of their recordings; of what several people have stored, the caller's own alone."""
+    columns = (FILE.c.path, FILE.c.place, FILE.c.uuid, FILE.c.created_by)
+    found = connection.execute(select(*columns).where(FILE.c.path.in_(map(escape_text, numbers)))).all()
+    files = {unescape_text(file.path): file for file in found}
+    kept: dict[str, Selected] = {}
+    known: dict[str, set[int]] = {}
+    for name in sorted(numbers, key=lambda name: files[name].created_by != caller.name):
+        seen = known.setdefault(files[name].uuid, set())
+        if new := [number for number in numbers[name] if number not in seen]:
+            kept[name] = Selected(name, unescape_text(files[name].place), new)
+        seen.update(new)
+    return [kept[name] for name in numbers if name in kept]
 
 
 @contextlib.contextmanager

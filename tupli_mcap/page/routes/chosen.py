@@ -25,7 +25,7 @@ from tupli_mcap.page.routes.episode import Seen, look
 from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes
 from tupli_mcap.page.sparks import sparks_of
 from tupli_mcap.schema import EpisodeHeader, parse_bound
-from tupli_mcap.storage.catalog.queries import find_episodes
+from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 
 __all__ = ["router"]
 
@@ -94,7 +94,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         only = seen_episodes(shelf, *([of_dataset(dataset)] if dataset else []))
-        return list(find_episodes(connection, wanted, only=only))
+        return each_once(find_episodes(connection, wanted, only=only), shelf.user)
 
     headers = shelf.ask(ask)
     if not headers:

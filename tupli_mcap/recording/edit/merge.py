@@ -54,6 +54,10 @@ class MergeReport(NamedTuple):
     size: int = 0
 
 
+class UnmergeableError(RecordingError):
+    """Recordings that do not go into one."""
+
+
 class Excerpt(NamedTuple):
     """Some episodes of a recording: rows of its index, in their order."""
 
@@ -260,7 +264,10 @@ def _define_missing(
         info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
     png = png_leaves(container.channels or contents.channels)  # the first recording decides
     cameras = () if "frames" in without else source.cameras
-    register_channels(container, source.name, source.layout.without(without), envs, info, cameras, png)
+    try:
+        register_channels(container, source.name, source.layout.without(without), envs, info, cameras, png)
+    except RecordingError as err:
+        raise UnmergeableError(str(err)) from err
 
 
 def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
@@ -277,7 +284,9 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
     seen = {(first.uuid, int(number)): first for number in sources[0].rows["episode"]}
     steps = sum(int(source.rows["length"].sum()) for source in sources)
     if steps > LAST_ROW:
-        raise RecordingError(f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer")
+        raise UnmergeableError(
+            f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer"
+        )
     for other, rows in sources[1:]:
         description = other.layout.without(without).to_metadata()
         for name in _SPACES:
@@ -293,14 +302,14 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
                     f"{description.get(name)!s:.200}; steps of other layouts cannot be in one recording"
                 )
         if other.benchmark_id != first.benchmark_id:
-            raise RecordingError(
+            raise UnmergeableError(
                 f"{other.name}: expected a recording of benchmark {first.benchmark_id or 'none'}, as {first.name} is, "
                 f"found {other.benchmark_id or 'none'}"
             )
         for number in rows["episode"].tolist():
             before = seen.setdefault((other.uuid, number), other)
             if before is not other:
-                raise RecordingError(
+                raise UnmergeableError(
                     f"{other.name} holds episode {number} of {before.name} again; leave one out"
                 )
 
@@ -325,7 +334,7 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
                 continue
             data = recording.read_attachment(name)
             if attachments.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
-                raise RecordingError(
+                raise UnmergeableError(
                     f"{recording.name}: its attachment {name!r} differs from that of a recording before; a merged "
                     "recording can have one of a name only"
                 )

@@ -53,6 +53,7 @@ __all__ = [
     "count_episodes",
     "declare_key",
     "declared_keys",
+    "each_once",
     "find_episodes",
     "insert_all",
     "plan_of",
@@ -118,6 +119,15 @@ def find_episodes(
         return _headers(connection, meant, found, order, limit, offset)
     headers = _headers(connection, meant, found, order, None, 0)
     return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
+
+
+def each_once(headers: Iterable[EpisodeHeader], user: str) -> list[EpisodeHeader]:
+    """Each episode once: of one that several people have stored, the user's own, or else the first."""
+    found: dict[str, EpisodeHeader] = {}
+    for each in headers:
+        if each.id not in found or each.created_by == user:
+            found[each.id] = each
+    return list(found.values())
 
 
 def count_episodes(
