@@ -28,6 +28,7 @@ __all__ = [
     "delete_group",
     "delete_role",
     "delete_user",
+    "demand_over",
     "guest",
     "list_groups",
     "list_roles",
@@ -118,6 +119,15 @@ def delete_user(connection: Connection, name: str) -> bool:
     return bool(gone)
 
 
+def demand_over(connection: Connection, caller: Caller, name: str) -> None:
+    """Raises DeniedError for a user with rights in `global` that the caller lacks: who sets their password has these
+    rights from then on, and who deletes them locks those out who run the server."""
+    other = caller_named(connection, name)
+    if other is not None and name != caller.name:
+        for right in sorted(other.rights[GLOBAL]):
+            caller.demand(right)
+
+
 def list_users(connection: Connection) -> list[str]:
     """The names of all users, in the order of their making."""
     return list(connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars())
@@ -125,12 +135,13 @@ def list_users(connection: Connection) -> list[str]:
 
 def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:
     """A user as the one who asks; None if there is no such user."""
-    if not connection.execute(select(USER.c.name).where(USER.c.name == name)).first():
+    epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == name)).scalar()
+    if epoch is None:
         return None
     rights: dict[str, frozenset[Right]] = {}
     for group, roles in memberships_of(connection, name).items():
         rights[group] = frozenset[Right]().union(*(_rights_of(connection, role) for role in roles))
-    return Caller(name, rights, may_write)
+    return Caller(name, rights, may_write, epoch)
 
 
 def guest(connection: Connection) -> Caller:
@@ -224,6 +235,8 @@ def delete_group(connection: Connection, caller: Caller, name: str) -> None:
     """Deletes a group; its name stays taken. Raises NotFoundError, DeniedError."""
     _known(connection, caller, name)
     caller.demand(Right.GROUP_DELETE, name)
+    if name == GLOBAL:
+        raise DeniedError("everybody is in the group global; it cannot be deleted")
     connection.execute(delete(GROUP).where(GROUP.c.name == name))
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.team == name))
     audit(connection, caller.name, "delete_group", name)
@@ -256,6 +269,8 @@ def remove_member(connection: Connection, caller: Caller, group: str, user: str)
     """Takes a user out of a group; nothing happens if they are not in it. Raises NotFoundError, DeniedError."""
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
+    if group == GLOBAL:
+        demand_over(connection, caller, user)
     gone = delete(MEMBERSHIP).where(MEMBERSHIP.c.team == group, MEMBERSHIP.c.user == user)
     connection.execute(gone)
     audit(connection, caller.name, "remove_member", f"{group}: {user}")

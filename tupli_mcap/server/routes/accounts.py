@@ -184,6 +184,7 @@ def change_password(library: Served, caller: Writer, username: str, told: Passwo
     with library.database.writing() as connection:
         if username == caller.name and not accounts.verify_password(connection, username, told.old or ""):
             raise SignInError("the old password is not right")
+        accounts.demand_over(connection, caller, username)
         accounts.change_password(connection, username, told.password)
         audit(connection, caller.name, "change_password", username)
 
