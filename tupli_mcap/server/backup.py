@@ -120,7 +120,9 @@ class _Place(NamedTuple):
 
 def _place_of(settings: Settings) -> _Place:
     sqlite = settings.own / "server.sqlite"
-    blobs: Blobs = BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory)
+    blobs: Blobs = (
+        BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory, settings.making)
+    )
     return _Place(settings.database or f"sqlite:///{sqlite}", sqlite, blobs)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -15,7 +16,7 @@ from tupli_mcap import files
 from tupli_mcap.errors import StorageError
 from tupli_mcap.remote import open_store, shown
 from tupli_mcap.server.database import UnavailableError
-from tupli_mcap.storage.atomic import os_errors, write_bytes
+from tupli_mcap.storage.atomic import os_errors
 
 __all__ = ["PIECE", "Blobs", "BucketBlobs", "DirectoryBlobs", "LostError"]
 
@@ -62,17 +63,22 @@ class Blobs(Protocol):
 
 
 class DirectoryBlobs:
-    """Files below a directory."""
+    """Files below a directory. In another one, on the same file system, they are made."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path, making: Path) -> None:
+        self._root, self._making = root, making
 
     def write(self, name: str, data: bytes) -> None:
-        path = self._root / name
-        with os_errors("cannot write", path):
-            write_bytes(path, data)
-            files.sync(path)
-            files.sync(path.parent)
+        target = self._root / name
+        with os_errors("cannot write", target):
+            for folder in (self._making, target.parent):
+                folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=self._making) as made:
+                new = Path(made) / "new"
+                new.write_bytes(data)
+                files.sync(new)
+                new.replace(target)
+            files.sync(target.parent)
 
     def keep(self, name: str, path: Path) -> None:
         target = self._root / name

@@ -6,7 +6,9 @@ import contextlib
 import hashlib
 import os
 import secrets
+import shutil
 import tempfile
+import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -70,11 +72,14 @@ class Library:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+        settings.making.mkdir(exist_ok=True)
         self.database = Database(
             settings.database or f"sqlite:///{settings.own / 'server.sqlite'}", settings.query_seconds
         )
         self.blobs: Blobs = (
-            BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory)
+            BucketBlobs(settings.blobs)
+            if settings.blobs
+            else DirectoryBlobs(settings.directory, settings.making)
         )
         self.items = Items(settings)
         self.tokens = Tokens(settings)
@@ -217,7 +222,7 @@ class Library:
         with self.database.reading() as connection:
             benchmark = self.items.load_benchmark(connection, caller, episode.benchmark_id)
         spaces = episode_spaces([episode], declared_spaces(benchmark.serialized))
-        with tempfile.TemporaryDirectory(dir=self.settings.own) as folder:
+        with tempfile.TemporaryDirectory(dir=self.settings.making) as folder:
             path = Path(folder) / "episode.mcap"
             write_recording(
                 path,
@@ -344,10 +349,11 @@ class Library:
         """Deletes a user, and what nobody can see then of what they made; nothing happens if there is none.
 
         Raises:
-            DeniedError: it is somebody else, and the caller has not the right to.
+            DeniedError: it is somebody else, and the caller has not the right to, or has fewer rights than they.
         """
         caller.demand(Right.USER_DELETE, name)
         with self.database.writing() as connection:
+            accounts.demand_over(connection, caller, name)
             if accounts.delete_user(connection, name):
                 audit(connection, caller.name, "delete_user", name)
             unseen = self._forget_unseen(connection)
@@ -357,8 +363,8 @@ class Library:
         return [*self.items.forget_unseen(connection), *episodes.forget_unseen(connection)]
 
     def look_after(self) -> None:
-        """Deletes what nobody needs any more: files that nothing names, uploads that nobody has gone on with, and what
-        only users saw who are deleted. To be called now and then."""
+        """Deletes what nobody needs any more: files that nothing names, uploads that nobody has gone on with, what only
+        users saw who are deleted, and what a killed process was making. To be called now and then."""
         with self.database.writing() as connection:
             self.uploads.forget_old(connection)
             unseen = self._forget_unseen(connection)
@@ -366,6 +372,10 @@ class Library:
         with self.database.reading() as connection:
             old = pending(connection, seconds=self.settings.pending_seconds)
         self.sweep(old)
+        for folder in self.settings.making.iterdir():
+            with contextlib.suppress(OSError):  # another process has done it
+                if folder.stat().st_mtime <= time.time() - self.settings.pending_seconds:
+                    shutil.rmtree(folder)
 
     def reach(self) -> None:
         """Raises UnavailableError if the database, or the bucket, does not answer."""

@@ -50,3 +50,8 @@ class Settings:
     def own(self) -> Path:
         """The directory of what is the server's alone: its database, its secret, uploads that are not finished."""
         return self.directory / "server"
+
+    @property
+    def making(self) -> Path:
+        """The directory of what is being made; what a killed process has left there is deleted some time."""
+        return self.own / "making"
