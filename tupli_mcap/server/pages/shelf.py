@@ -102,7 +102,7 @@ class LibraryShelf:
     def address_of(self, recording: str) -> str | None:
         if self._readable(recording)[1] is not None:
             return None  # what is made while it is sent cannot be read in pieces
-        ticket = self._library.tokens.ticket(self._caller.name, recording=recording)
+        ticket = self._library.tokens.ticket(self._caller, recording=recording)
         return f"/v1/files/{quote(recording)}?ticket={ticket}"
 
     def benchmarks(

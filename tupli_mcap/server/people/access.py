@@ -52,11 +52,15 @@ DEFAULT_ROLES: Final[Mapping[str, frozenset[Right]]] = {
 
 
 class Caller(NamedTuple):
-    """Who asks: a user, or a guest; the rights in each group, and whether the token at hand may change anything."""
+    """Who asks: a user, or a guest; the rights in each group, and whether the token at hand may change anything.
+
+    epoch: how often the user's password was changed.
+    """
 
     name: str
     rights: Mapping[str, frozenset[Right]]
     may_write: bool = True
+    epoch: int = 0
 
     @property
     def is_guest(self) -> bool:

@@ -3,7 +3,7 @@
 access    short-lived, signed (JWT), void after a change of the password
 refresh   kept as a digest, used once for a new pair; used twice, the whole sign-in is ended
 API       kept as a digest, for machines: reading, or reading and writing
-ticket    signed, for one recording or query
+ticket    signed, for one recording or query, void after a change of the password
 """
 
 from __future__ import annotations
@@ -159,9 +159,12 @@ class Tokens:
 
     # --- tickets ---
 
-    def ticket(self, user: str, **what: Any) -> str:
-        """What opens a `recording`, or what a `query` means, as this user may read it, for a while."""
-        return self._signed("ticket", self._settings.ticket_seconds, sub=user, **what)
+    def ticket(self, caller: Caller, **what: Any) -> str:
+        """What opens a `recording`, or what a `query` means, as this caller may read it, for a while, or until their
+        password is changed."""
+        return self._signed(
+            "ticket", self._settings.ticket_seconds, sub=caller.name, epoch=caller.epoch, **what
+        )
 
     def of_ticket(self, ticket: str) -> tuple[str, dict[str, Any]]:
         """Who was given a ticket, and what it opens. Raises SignInError if it is none, or has expired."""

@@ -91,7 +91,7 @@ def _holder(
     user, what = library.tokens.of_ticket(ticket)
     with library.database.reading() as connection:
         found = accounts.caller_named(connection, user) or accounts.guest(connection)
-    if found.is_guest and not library.settings.guests:
+    if what.get("epoch") != found.epoch or (found.is_guest and not library.settings.guests):
         raise SignInError("the ticket is not valid any more")
     request.state.user = found.name
     return Holder(found, what)

@@ -21,6 +21,7 @@ from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder
 from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.selection import EpisodeQuery, Selected, opened, select_episodes
@@ -52,7 +53,7 @@ def open_query(library: Served, caller: Reader, told: Annotated[EpisodeQuery, Bo
     """The manifest of a query, as this caller may read it, for programs that cannot sign in."""
     with library.database.reading() as connection:
         select_episodes(connection, caller, library.items, told)
-    ticket = library.tokens.ticket(caller.name, query=told.model_dump(mode="json", exclude_none=True))
+    ticket = library.tokens.ticket(caller, query=told.model_dump(mode="json", exclude_none=True))
     if len(ticket) > _LONGEST_TICKET:
         raise StorageError("the query is too long for an address; ask for the same by a shorter filter")
     return Address(path=f"/v1/manifest?ticket={ticket}")
@@ -97,7 +98,7 @@ def manifest(
         if file.whole and len(each.numbers) == file.episodes:
             told = {"version": file.digest[:16]}  # what a loader keeps it by
             if asked.ticket is not None:
-                told["ticket"] = library.tokens.ticket(asked.caller.name, recording=file.name)
+                told["ticket"] = library.tokens.ticket(asked.caller, recording=file.name)
             sources.append(
                 {"url": f"files/{quote(file.name)}?{urlencode(told)}", "supportsRangeRequests": True}
             )
@@ -111,7 +112,7 @@ def manifest(
     return {"name": name, "sources": sources}
 
 
-@router.get("/data", response_class=StreamingResponse)
+@router.get("/data", response_class=StreamingResponse, responses=MADE)
 def data(library: Served, asked: _Wanted, id: Annotated[str, Query(max_length=64)]) -> StreamingResponse:
     """The bytes of a source that a manifest has named."""
     with library.database.reading() as connection:

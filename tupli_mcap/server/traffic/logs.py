@@ -1,6 +1,7 @@
 """The log of a server: a line for each request and each failure, JSON unless somebody reads it in a terminal.
 
-Nothing of a request is written but its route, so that no token, password, ticket or name gets there.
+Nothing of a request is written but its route, so that no token, password, ticket or name gets there. What an error says
+may have come from a stranger: nothing in a line acts on a terminal, or looks like another line.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ _SECRET: Final = re.compile(
     r"(?i)((?:ticket|token|password|secret|signature|credential|authorization|bearer)\w*[\"']?(?:\s*[=:]\s*|\s+)[\"']?)"
     r"[^\s\"'&,;}]{6,}|(?<=://)[^/\s@]+:[^/\s@]+(?=@)"
 )
+_CONTROL: Final = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 def set_up() -> None:
@@ -39,6 +41,7 @@ def set_up() -> None:
                 structlog.processors.TimeStamper(fmt="iso", utc=True),
                 structlog.processors.format_exc_info,
                 _without_secrets,
+                _harmless,
             ],
             processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, shown],
         )
@@ -53,5 +56,13 @@ def set_up() -> None:
 def _without_secrets(_logger: object, _method: str, event: MutableMapping[str, Any]) -> dict[str, Any]:
     return {
         key: _SECRET.sub(lambda found: f"{found[1] or ''}…", value) if isinstance(value, str) else value
+        for key, value in event.items()
+    }
+
+
+def _harmless(_logger: object, _method: str, event: MutableMapping[str, Any]) -> dict[str, Any]:
+    """Shows control characters, but the ends of the lines of a traceback, as Python writes them."""
+    return {
+        key: _CONTROL.sub(lambda found: repr(found[0])[1:-1], value) if isinstance(value, str) else value
         for key, value in event.items()
     }

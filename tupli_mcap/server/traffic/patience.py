@@ -1,5 +1,5 @@
 """Connections whose clients keep the server waiting are ended: who never finishes the head of a request, stops in the
-middle of a body, or does not take the answer."""
+middle of a body, or does not take the answer; and those whose heads do not end."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 __all__ = ["PatientProtocol"]
 
 _EVERY: Final = 4  # looks, while a client may be silent
+_MOST_HEAD: Final = 128 << 10  # bytes; a piece of the body may have come with it
 
 
 class PatientProtocol(HttpToolsProtocol):
@@ -21,6 +22,7 @@ class PatientProtocol(HttpToolsProtocol):
         super().__init__(*args, **kwargs)
         self._patience = head_seconds, stall_seconds
         self._head_since: float | None = None  # a request has begun then, and its head is not there
+        self._head_size = 0  # what has come of it
         self._moved = 0.0  # when the client has sent or taken something
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -35,8 +37,12 @@ class PatientProtocol(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         self._moved = self.loop.time()
         if self._head_since is None and (self.cycle is None or self.cycle.response_complete):
-            self._head_since = self._moved
+            self._head_since, self._head_size = self._moved, 0
         super().data_received(data)
+        if self._head_since is not None:
+            self._head_size += len(data)
+            if self._head_size > _MOST_HEAD:
+                self.transport.abort()
 
     def on_headers_complete(self) -> None:
         self._head_since = None
