@@ -33,7 +33,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 
 FOR_ALL = {
-    ("GET", "/"), ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
+    ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
     ("POST", "/v1/tokens/end"), ("POST", "/access/users/token"),
 }  # fmt: skip
 OTHERWISE = {

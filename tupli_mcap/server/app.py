@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from typing import Any, Final
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
@@ -38,7 +39,16 @@ __all__ = ["create_app"]
 # Recordings are compressed already. A page may repeat what a stranger's link says beside what only its reader may see;
 # the size of both compressed would tell the one from the other.
 _AS_THEY_ARE = ("application/octet-stream", "text/html", "font/*", "image/*", "video/*")
-_REFUSALS = {status: {"model": Error} for status in (400, 401, 403, 404, 409, 413)}
+_Answers = dict[int | str, dict[str, Any]]
+_TOLD: Final[dict[str, Any]] = {"model": Error}
+_FAILURES: Final[_Answers] = {
+    503: _TOLD,
+    507: {**_TOLD, "description": "The caller keeps as much as they may."},
+}
+_REFUSALS: Final[_Answers] = {**_FAILURES, "4XX": {**_TOLD, "description": "Why this is refused."}}
+_REFUSALS_OF_PYTUPLI: Final[_Answers] = _FAILURES | dict.fromkeys(
+    (400, 401, 403, 404, 409, 412, 413, 416, 429), _TOLD
+)
 
 
 def create_app(library: Library) -> FastAPI:
@@ -64,8 +74,9 @@ def create_app(library: Library) -> FastAPI:
     app.state.library = library
     app.state.metrics = Metrics()
     app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
-    for routes in (operation, accounts, items, episodes, query, recordings, viewers, foxglove, pytupli):
-        app.include_router(routes.router, responses=_REFUSALS)  # type: ignore[arg-type]
+    for routes in (operation, accounts, items, episodes, query, recordings, viewers, foxglove):
+        app.include_router(routes.router, responses=_REFUSALS)
+    app.include_router(pytupli.router, responses=_REFUSALS_OF_PYTUPLI)
     tell_errors(app)
     app.state.shelf_of, app.state.kept, app.state.told = shelf_of, OpenedRecordings(), told
     for router in (*pages.PAGES, *PAGES):

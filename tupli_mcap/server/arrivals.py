@@ -41,7 +41,7 @@ def stored_already(connection: Connection, caller: Caller, digest: str) -> str |
     """The name of the caller's recording with these bytes; None if there is none."""
     own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.digest == digest)
     found: str | None = connection.execute(own).scalar()
-    return found
+    return None if found is None else unescape_text(found)
 
 
 def register(

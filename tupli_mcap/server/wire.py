@@ -12,6 +12,7 @@ from fastapi.exception_handlers import request_validation_exception_handler
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import AfterValidator, BaseModel, Field
+from starlette.exceptions import HTTPException
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import (
@@ -24,6 +25,7 @@ from tupli_mcap.errors import (
     StorageError,
     TupliError,
 )
+from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import BaseFilter, FilterType
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.server.blobs import LostError
@@ -39,6 +41,7 @@ from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLa
 __all__ = ["AskedFilter", "Error", "Found", "Listing", "answer", "listed", "paged", "tell_errors", "told"]
 
 _MOST_VALUES: Final = 20_000
+_MOST_OFFSET: Final = 1 << 53  # beyond it, programs disagree on what a number of JSON is
 
 _STATUS: Final[dict[type[TupliError], int]] = {
     SignInError: 401,
@@ -53,6 +56,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     TooManyUploadsError: 429,
     UnavailableError: 503,
     TooLongError: 400,
+    UnmergeableError: 400,
     RecordingError: 503,  # a file that is kept cannot be opened
     FullError: 507,
     LostError: 500,
@@ -95,7 +99,7 @@ class Listing(BaseModel):
 
     filter: AskedFilter | None = None
     limit: int | None = Field(default=None, ge=0)
-    offset: int = Field(default=0, ge=0)
+    offset: int = Field(default=0, ge=0, le=_MOST_OFFSET)
     cursor: str | None = None
 
 
@@ -152,6 +156,11 @@ def tell_errors(app: FastAPI) -> None:
         where = ".".join(str(part) for part in first["loc"][1:])
         detail = f"expected another request: {where or 'its body'}: {first['msg']}"
         return JSONResponse({"detail": detail, "error": "StorageError"}, 400)
+
+    @app.exception_handler(HTTPException)
+    async def _tell_refusal(request: Request, err: HTTPException) -> JSONResponse:
+        kind = "NotFoundError" if err.status_code in (404, 412) else "StorageError"
+        return JSONResponse({"detail": err.detail, "error": kind}, err.status_code, err.headers)
 
     @app.exception_handler(TupliError)
     def _tell(request: Request, err: TupliError) -> JSONResponse:

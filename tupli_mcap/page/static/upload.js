@@ -88,7 +88,8 @@ async function send(form, file, row) {
 }
 
 function linkTo(recording) {
-  return `/episodes?${new URLSearchParams({ filter: `recording == ${JSON.stringify(recording)}` })}`;
+  const name = JSON.stringify(decodeURIComponent(recording));
+  return `/episodes?${new URLSearchParams({ filter: `recording == ${name}` })}`;
 }
 
 function digestOf(file, tell) {

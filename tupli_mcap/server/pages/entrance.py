@@ -22,7 +22,7 @@ from tupli_mcap.server.wire import told
 
 __all__ = ["router"]
 
-router = APIRouter(route_class=PageRoute)
+router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Next = Annotated[str, Form(alias="next")]
 
 
@@ -35,7 +35,7 @@ def root(request: Request, q: str = "", number: Annotated[int, Query(alias="page
     return lists.datasets(request, session.shelf_of(request), q, number)
 
 
-@router.get("/sign-in", include_in_schema=False)
+@router.get("/sign-in")
 def show_sign_in(request: Request, visit: Visitor, next: str = "/") -> Response:
     """The form for name and password."""
     if visit.is_signed_in:
@@ -43,7 +43,7 @@ def show_sign_in(request: Request, visit: Visitor, next: str = "/") -> Response:
     return _sign_in_page(request, visit.library, next)
 
 
-@router.post("/sign-in", include_in_schema=False)
+@router.post("/sign-in")
 def sign_in(
     request: Request,
     visit: Visitor,
@@ -69,7 +69,7 @@ def sign_in(
     return response
 
 
-@router.post("/sign-out", include_in_schema=False)
+@router.post("/sign-out")
 def sign_out(visit: Code) -> Response:
     """Ends the sign-in."""
     with visit.library.database.writing() as connection:

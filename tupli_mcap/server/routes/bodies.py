@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import AsyncIterator
-from typing import Final
+from typing import Any, Final
 from urllib.parse import quote
 
 from fastapi import HTTPException, Request, Response
@@ -21,10 +21,19 @@ from starlette.concurrency import run_in_threadpool
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
-__all__ = ["body_of"]
+__all__ = ["BODY", "MADE", "body_of"]
 
 _MEDIA: Final = "application/octet-stream"
 _SIGNED_SECONDS: Final = 3600
+MADE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {_MEDIA: {}}}}
+"""What the document tells of bytes that are made while they are sent."""
+BODY: Final = {
+    **MADE,
+    206: {"description": "The range that was asked for.", "content": {_MEDIA: {}}},
+    304: {"description": "The caller has this version."},
+    307: {"description": "The bytes are at another address."},
+}
+"""What the document tells of the answers of `body_of`."""
 _RANGE: Final = re.compile(r"bytes=(\d{0,19})-(\d{0,19})")
 
 

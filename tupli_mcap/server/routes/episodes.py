@@ -7,7 +7,7 @@ import json
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ
@@ -20,6 +20,8 @@ from tupli_mcap.storage.catalog.queries import After
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
+_LONGEST_KEY = 200
+_MOST_KEYS = 100  # each is a row for every episode that has it
 
 
 class Chosen(BaseModel):
@@ -38,7 +40,7 @@ class Shown(Chosen):
 class Key(BaseModel):
     """A key of episodes' metadata, such as `metadata.score`."""
 
-    key: str
+    key: str = Field(max_length=_LONGEST_KEY)
 
 
 @router.post("/list", response_model=Found)
@@ -83,6 +85,11 @@ def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Bod
 def declare_key(library: Served, caller: Writer, told: Key) -> None:
     """Indexes a key, so that filters on it stay fast."""
     with library.database.writing() as connection:
+        known = queries.declared_keys(connection)
+        if told.key not in known and len(known) >= _MOST_KEYS:
+            raise StorageError(
+                f"expected at most {_MOST_KEYS} keys that are declared; filter without this one"
+            )
         queries.declare_key(connection, told.key)
 
 
@@ -118,6 +125,8 @@ def _after(cursor: str | None) -> After | None:
         return None
     try:
         recording, episode = json.loads(base64.urlsafe_b64decode(cursor))
-        return After(str(recording), int(episode))
-    except (ValueError, TypeError) as err:
+        if not isinstance(recording, str) or not isinstance(episode, int) or not 0 <= episode < 1 << 63:
+            raise ValueError("another cursor")
+        return After(recording, episode)
+    except (ValueError, TypeError, RecursionError) as err:
         raise StorageError("expected the cursor of the page before; list from the beginning") from err

@@ -13,7 +13,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.items import artifact_key
-from tupli_mcap.server.routes.bodies import body_of
+from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.wire import Found, Listing, answer, paged
 from tupli_mcap.storage.benchmark_json import restored
@@ -94,7 +94,7 @@ def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Bod
     return paged(found, told, library.settings.max_page)
 
 
-@router.get("/artifacts/{uri}")
+@router.get("/artifacts/{uri}", response_class=Response, responses=BODY)
 def load_artifact(library: Served, caller: Reader, request: Request, uri: str) -> Response:
     """The bytes of an artifact; their SHA-256 is the `ETag`, and 304 the answer to an `If-None-Match` with it."""
     with library.database.reading() as connection:

@@ -33,7 +33,7 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
-from tupli_mcap.server.routes.bodies import body_of
+from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
 from tupli_mcap.server.wire import AskedFilter, answer
 from tupli_mcap.storage.texts import first_defect
@@ -146,6 +146,7 @@ def change_password(library: Served, caller: Changing, told: Credentials) -> Non
     """Changes a password, and ends all that was signed in with the old one."""
     caller.demand(Right.USER_UPDATE, told.username)
     with library.database.writing() as connection:
+        accounts.demand_over(connection, caller, told.username)
         accounts.change_password(connection, told.username, told.password)
 
 
@@ -323,7 +324,7 @@ def store_artifact(
     return answer(library.store_artifact(caller, data, told))
 
 
-@router.get("/artifacts/download")
+@router.get("/artifacts/download", response_class=Response, responses=BODY)
 def load_artifact(library: Served, caller: Reader, request: Request, artifact_id: str) -> Response:
     """The bytes of an artifact; what is known of it is JSON in `X-Metadata`."""
     with _hidden(caller, "Artifact does not exist"), library.database.reading() as connection:

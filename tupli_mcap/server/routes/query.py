@@ -10,6 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from tupli_mcap.page import copies
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served
 from tupli_mcap.server.selection import EpisodeQuery, Selected, opened, select_episodes
 
@@ -18,7 +19,7 @@ __all__ = ["router", "streamed"]
 router = APIRouter(prefix="/v1", tags=["episodes"])
 
 
-@router.post("/query", response_class=StreamingResponse)
+@router.post("/query", response_class=StreamingResponse, responses=MADE)
 def query_episodes(
     library: Served, caller: Reader, told: Annotated[EpisodeQuery, Body()]
 ) -> StreamingResponse:

@@ -18,7 +18,7 @@ from tupli_mcap.errors import StorageError
 from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, Right
-from tupli_mcap.server.routes.bodies import body_of
+from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.selection import EpisodeQuery, select_episodes
@@ -29,7 +29,6 @@ __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
 _TUS = {"Tus-Resumable": "1.0.0"}
-_MEDIA = "application/octet-stream"
 _FOR_VIEWERS = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
@@ -59,7 +58,14 @@ class Ticket(BaseModel):
 # --- sending ---
 
 
-@router.post("/uploads", status_code=201)
+@router.post(
+    "/uploads",
+    status_code=201,
+    response_class=Response,
+    responses={
+        200: {"description": "The caller has stored these bytes; `Recording` is their name, as URLs have it."}
+    },
+)
 def begin_upload(
     library: Served,
     caller: Writer,
@@ -82,12 +88,12 @@ def begin_upload(
         raise StorageError("expected Upload-Metadata with `sha256`: 64 lower-case hex digits, in base64")
     upload = library.begin_upload(caller, upload_length, digest, _number(told.get("sent_before", "0")))
     if isinstance(upload, str):
-        return Response(status_code=200, headers={**_TUS, "Recording": upload})
+        return Response(status_code=200, headers={**_TUS, "Recording": quote(upload)})
     headers = {**_TUS, "Location": f"/v1/uploads/{upload.id}", "Upload-Offset": str(upload.offset)}
     return Response(status_code=201, headers=headers)
 
 
-@router.head("/uploads/{upload_id}")
+@router.head("/uploads/{upload_id}", response_class=Response)
 def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     """How much of an upload has come."""
     upload = _find(library, caller, upload_id)
@@ -103,7 +109,7 @@ async def go_on_with_upload(
     upload_id: str,
     upload_offset: Annotated[int, Header(ge=0)],
 ) -> Response:
-    """Adds bytes to an upload. With the last ones it is stored, and `Recording` is its name."""
+    """Adds bytes to an upload. With the last ones it is stored, and `Recording` is its name, as URLs have it."""
     upload = await run_in_threadpool(_find, library, caller, upload_id)
     with library.uploads.writing(upload) as incoming:
         if incoming.offset != upload_offset:
@@ -113,7 +119,7 @@ async def go_on_with_upload(
         await _append(incoming, request.stream())
         told = {**_TUS, "Upload-Offset": str(incoming.offset)}
         if incoming.offset == upload.length:
-            told["Recording"] = await run_in_threadpool(library.take_in, caller, incoming)
+            told["Recording"] = quote(await run_in_threadpool(library.take_in, caller, incoming))
     return Response(status_code=204, headers=told)
 
 
@@ -174,13 +180,13 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
     """An address at which programs that cannot sign in may read a recording for a while, and as long as it stays."""
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, told.recording)
-    ticket = library.tokens.ticket(caller.name, recording=found.name, digest=found.digest)
+    ticket = library.tokens.ticket(caller, recording=found.name, digest=found.digest)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
     return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
 
 
-@router.get("/files/{name:path}")
-@router.head("/files/{name:path}")
+@router.get("/files/{name:path}", response_class=Response, responses=BODY)
+@router.head("/files/{name:path}", response_class=Response)
 def read_recording(library: Served, holder: TicketHolder, name: str, request: Request) -> Response:
     """The bytes of a recording, or ranges of them; their SHA-256 is the `ETag`, and `If-Match` is heeded.
 

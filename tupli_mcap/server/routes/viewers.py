@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import FileResponse
 
 from tupli_mcap.page.copies import replay_file, sent
 from tupli_mcap.page.shelf import find_episode
 from tupli_mcap.server.pages.shelf import LibraryShelf
+from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Served, TicketHolder
+from tupli_mcap.server.wire import Error
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["viewers"])
 
 
-@router.get("/episodes/{uri}.rrd", responses={501: {"description": "The server has no rerun-sdk."}})
+_RRD = {**MADE, 501: {"model": Error, "description": "The server has no rerun-sdk."}}
+
+
+@router.get("/episodes/{uri}.rrd", response_class=Response, responses=_RRD)
 def show_episode(request: Request, library: Served, holder: TicketHolder, uri: str) -> FileResponse:
     """An episode with its blueprint, for the Rerun viewer; a ticket for its recording will do."""
     shelf = LibraryShelf(library, holder.caller, "", request.app.state.kept)

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
+from urllib.parse import unquote, urlsplit
 
 from tupli_mcap.storage.api.answers import UnreachableError
 from tupli_mcap.storage.api.session import TIMEOUT, Session
@@ -58,7 +58,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
         tell(offset - shown)
         shown = offset
         if "Recording" in begun:
-            return str(begun["Recording"])
+            return unquote(str(begun["Recording"]))
         fruitless, reached = (fruitless, reached) if offset <= reached else (0, offset)
         try:
             done = session.send(
@@ -73,7 +73,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
                 },
                 timeout=TIMEOUT + size / _CHECKED,
             )
-            return str(done.headers["Recording"])
+            return unquote(str(done.headers["Recording"]))
         except UnreachableError:
             fruitless += 1
             if fruitless == _FRUITLESS:
