@@ -1,0 +1,100 @@
+"""Requests that are made up from the OpenAPI document: a sample of tools/server_fuzz.py, and that it can fail."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import httpx
+import pytest
+from persons import Person
+from serving import serving
+
+from tupli_mcap import Recording
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.routes import items
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.wire import answer
+from tupli_mcap.wrappers.rollout import record_rollouts
+
+TOOL = Path(__file__).parents[1] / "tools" / "server_fuzz.py"
+
+
+@functools.cache
+def tool() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("server_fuzz", TOOL)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("engine", ["sqlite", "postgresql"])
+def test_every_route_answers_as_the_document_says(
+    engine: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    if engine == "postgresql":
+        request.getfixturevalue("postgres")  # skips where it is not installed
+    with tool().fuzzer(engine, tmp_path, seed=1) as fuzzer:
+        fuzzer.run(3)
+    assert fuzzer.findings == {}
+    assert fuzzer.statuses["200"] > 30
+
+
+def test_a_failure_and_an_answer_of_another_shape_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: object) -> list[str]:
+        raise RuntimeError("a defect")
+
+    with tool().fuzzer("sqlite", tmp_path, seed=1) as fuzzer:
+        monkeypatch.setattr(accounts, "list_users", broken)
+        fuzzer.run(10, only="GET /v1/users")
+        monkeypatch.setattr(items, "paged", lambda *_: answer(["no page"]))
+        fuzzer.run(10, only="POST /v1/benchmarks/list")
+    found = {tuple(what.split(": ")[:3]) for what in fuzzer.findings}
+    assert ("GET /v1/users", "500") in found
+    assert ("POST /v1/benchmarks/list", "200", "Response violates schema") in found
+
+
+# --- what it has found ---
+
+
+def test_a_recording_of_two_users_is_cut_once(tmp_path: Path) -> None:
+    """Both have published it: a query that means both copies gives each episode once."""
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=100, seed=1)
+    data = (tmp_path / "run.mcap").read_bytes()
+    with serving(Settings(tmp_path / "served")) as url:
+        people = [Person(url, "admin")]
+        people[0].ask("POST", "/v1/users", {"username": "ann", "password": "ann's password"})
+        people.append(Person(url, "ann"))
+        for person in people:
+            person.send(data)
+            person.ask("POST", "/v1/episodes/publish", {"filter": None, "group": "global"})
+        for person in people:
+            cut = person.call("POST", "/v1/query", {})
+            assert cut.status_code == 200, cut.text
+            (tmp_path / "cut.mcap").write_bytes(cut.content)
+            with Recording(tmp_path / "cut.mcap") as one, Recording(tmp_path / "run.mcap") as whole:
+                assert (one.uuid, len(one)) == (whole.uuid, len(whole))
+
+
+def test_what_cannot_be_one_recording_is_the_request_s_fault(tmp_path: Path) -> None:
+    with serving(Settings(tmp_path / "served")) as url:
+        admin = Person(url, "admin")
+        for name in ("CartPole-v1", "MountainCar-v0"):
+            record_rollouts(name, tmp_path / f"{name}.mcap", steps=100, seed=1)
+            admin.send((tmp_path / f"{name}.mcap").read_bytes())
+        refused = admin.call("POST", "/v1/query", {})
+        assert (refused.status_code, refused.json()["error"]) == (400, "SpaceError")
+
+
+def test_refusals_have_one_shape(tmp_path: Path) -> None:
+    with serving(Settings(tmp_path / "served")) as url:
+        for method, path, body in (("POST", "/v1/tokens", b"\xff"), ("GET", "/v1/nothing", b"")):
+            told = httpx.request(
+                method, url + path, content=body, headers={"Content-Type": "application/json"}
+            )
+            assert set(told.json()) == {"detail", "error"}, path
