@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 from fuzzing.model import Model, Part
 
-__all__ = ["find_step", "set_flags"]
+__all__ = ["Model", "find_step", "set_flags"]
 
 _MESSAGE = 5
 _EPISODE = 35  # the offset of the episode and the step in the record of a message
