@@ -733,6 +733,8 @@ class TestConstruction:
             FilterError, match=r"'n_tuple' \(did you mean 'n_tuples'\?\); the keys are .*, steps,"
         ):
             compile_predicate(misspelt, EpisodeHeader)
+        with pytest.raises(FilterError, match=r"'length' \(did you mean 'steps'\?\)"):
+            compile_predicate(F("length") > 1, EpisodeHeader)
         with (
             Catalog(None) as catalog,
             pytest.raises(FilterError, match=r"'n_tuple' \(did you mean 'n_tuples'\?\)"),

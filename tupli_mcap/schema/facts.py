@@ -33,6 +33,7 @@ __all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "p
 TIME_KEY: Final = "created_at"
 TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
 _MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
+_LIKE: Final = {"length": "steps", "reward": "return", "rewards": "return", "date": "ended", "time": "ended"}
 _INSIDE: Final = ("run.name", "run.tags", "run.split", "run.environment", "run.started", "metadata.success")
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
@@ -75,7 +76,9 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
     if name not in (fields.model_fields if isinstance(fields, type) else fields):
         known = filter_keys(fields)
         inside = [there for there in _INSIDE if there.endswith(f".{name}") and there.split(".")[0] in known]
-        similar = did_you_mean(inside[0] if inside else name, [*known, *_MEANT.values(), *inside])
+        similar = did_you_mean(
+            inside[0] if inside else _LIKE.get(name, name), [*known, *_MEANT.values(), *inside]
+        )
         raise FilterError(f"unknown filter key {key!r}{similar}; the keys are {', '.join(known)}")
     return (name, *inside)
 
