@@ -35,27 +35,33 @@ class _FailOn(StrEnum):
     never = "never"
 
 
+_Paths = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),
+]
+_Checks = Annotated[
+    list[str] | None, typer.Option("--check", metavar="ID", help="Run only this check (repeatable).")
+]
+_Skipped = Annotated[
+    list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out (repeatable).")
+]
+_Thresholds = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="ID.NAME=N", help="Change a threshold; --list --json names them."),
+]
+
+
 def doctor(
-    paths: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),
-    ] = None,
+    paths: _Paths = None,
     episodes: Episodes = None,
     filter_text: FilterText = None,
     fail_on: Annotated[
         _FailOn, typer.Option(help="Exit with 1 if there is a finding as bad as this.")
     ] = _FailOn.error,
     level: Annotated[_Level, typer.Option(help="Print findings as bad as this, or worse.")] = _Level.info,
-    check: Annotated[
-        list[str] | None, typer.Option("--check", metavar="ID", help="Run only this check (repeatable).")
-    ] = None,
-    skip: Annotated[
-        list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out (repeatable).")
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="ID.NAME=N", help="Change a threshold; --list --json names them."),
-    ] = None,
+    check: _Checks = None,
+    skip: _Skipped = None,
+    settings: _Thresholds = None,
     list_checks: Annotated[bool, typer.Option("--list", help="List the checks instead.")] = False,
     as_json: Json = False,
 ) -> None:

@@ -53,6 +53,9 @@ _FrameFormat = Annotated[
 _Trust = Annotated[
     bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
 ]
+_Rerun = Annotated[
+    bool, typer.Option("--rerun", help="Take the episodes again, even if pictures were recorded.")
+]
 _Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
 
@@ -65,9 +68,7 @@ def render(
     width: _Width = None,
     frame_format: _FrameFormat = _Format.png,
     trust: _Trust = False,
-    rerun: Annotated[
-        bool, typer.Option("--rerun", help="Take the episodes again, even if pictures were recorded.")
-    ] = False,
+    rerun: _Rerun = False,
     force: _Force = False,
     as_json: Json = False,
 ) -> None:
@@ -96,11 +97,7 @@ def render(
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         if output.suffix.lower() != ".mcap" and not rerun and all(map(has_pictures, chosen)):
-            count = film(chosen, output, overwrite=force).pictures
-            if as_json:
-                print_json({"path": output, "frames": count, "recorded": True, "ok": True})
-            else:
-                say(f"{output}: {counted(count, 'recorded picture')}")
+            _print_film(output, film(chosen, output, overwrite=force).pictures, as_json=as_json)
             return
         report = render(
             recording,
@@ -119,6 +116,13 @@ def render(
         _print(report)
     if not report.ok:
         raise typer.Exit(1)
+
+
+def _print_film(path: Path, pictures: int, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"path": path, "frames": pictures, "recorded": True, "ok": True})
+    else:
+        say(f"{path}: {counted(pictures, 'recorded picture')}")
 
 
 @contextlib.contextmanager
@@ -184,36 +188,42 @@ def _print(report: RenderReport) -> None:
         fail(f"{report.divergence}; no frames from there on, {kept}{hint}")
 
 
+_Plotted = Annotated[
+    list[str], typer.Argument(metavar="FILE|STORAGE", help="Recordings, directories, storages, URLs.")
+]
+_Drawing = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="FILE",
+        help="A .png, .svg, .pdf or .html; by default FILE's name with .png.",
+    ),
+]
+_Shown = Annotated[
+    str,
+    typer.Option(
+        "--episodes",
+        "--episode",
+        metavar="N|best|worst|...",
+        help="The episode whose steps are shown: a number, best, worst, first, last.",
+    ),
+]
+_Axis = Annotated[
+    _X | None,
+    typer.Option(
+        "--x", help="The horizontal axis; by default episodes of one recording, or steps of several."
+    ),
+]
+
+
 def plot(
-    paths: Annotated[
-        list[str], typer.Argument(metavar="FILE|STORAGE", help="Recordings, directories, storages, URLs.")
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            help="A .png, .svg, .pdf or .html; by default FILE's name with .png.",
-        ),
-    ] = None,
-    episode: Annotated[
-        str,
-        typer.Option(
-            "--episodes",
-            "--episode",
-            metavar="N|best|worst|...",
-            help="The episode whose steps are shown: a number, best, worst, first, last.",
-        ),
-    ] = "best",
-    x: Annotated[
-        _X | None,
-        typer.Option(
-            "--x", help="The horizontal axis; by default episodes of one recording, or steps of several."
-        ),
-    ] = None,
+    paths: _Plotted,
+    output: _Drawing = None,
+    episode: _Shown = "best",
+    x: _Axis = None,
     filter_text: FilterText = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    force: _Force = False,
     as_json: Json = False,
 ) -> None:
     """Draw a report of recordings as a picture or a page.

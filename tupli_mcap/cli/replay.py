@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -79,33 +79,17 @@ def replay(
     from tupli_mcap.viewer.sdk import import_quickly
 
     form: viewer.Form = "compare" if compare else "split" if split else "joined"
-    wanted = filter_of(filter_text)
     import_quickly()
     notes: list[str] = []
+    shown: dict[str, Any] = {"filter": filter_of(filter_text), "form": form, "note": notes.append}
     if save is not None:
         commands: list[str] = []
-        path = viewer.save(
-            sources,
-            save,
-            episode,
-            filter=wanted,
-            form=form,
-            force=force,
-            tell=commands.append,
-            note=notes.append,
-        )
+        path = viewer.save(sources, save, episode, force=force, tell=commands.append, **shown)
         say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}", *notes)
     elif web:
-        viewer.serve(
-            sources,
-            episode,
-            filter=wanted,
-            form=form,
-            tell=lambda url: _tell(url, *notes),
-            note=notes.append,
-        )
+        viewer.serve(sources, episode, tell=lambda url: _tell(url, *notes), **shown)
     else:
-        viewer.show(sources, episode, filter=wanted, form=form, connect=connect, note=notes.append)
+        viewer.show(sources, episode, connect=connect, **shown)
         say(*notes)
 
 
