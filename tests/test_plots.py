@@ -864,7 +864,9 @@ def test_a_file_is_written_whole_or_not_at_all(tiny: Path, tmp_path: Path) -> No
     made = report(tiny)
     goal = tmp_path / "report.png"
     goal.write_bytes(b"old")
-    with pytest.raises(RecordingError, match=r"report.png exists; choose another name, or overwrite it"):
+    with pytest.raises(
+        RecordingError, match=r"report.png exists; choose another name, or pass overwrite=True"
+    ):
         made.save(goal)
     assert goal.read_bytes() == b"old"
     assert made.save(goal, overwrite=True) == goal

@@ -542,6 +542,20 @@ class TestCommands:
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output
 
+    def test_filter_takes_a_directory(self, tmp_path: Path) -> None:
+        for i in range(2):
+            record(tmp_path / "runs" / f"{i}.mcap", episodes=i + 2, name=f"run-{i}")
+        target = str(tmp_path / "o.mcap")
+        words = "filter", str(tmp_path / "runs"), "run.name in ['run-0', 'run-1']", "-o", target
+        assert command(*words, "--dry-run").startswith(f"would write {target}: 5 episodes")
+        assert not Path(target).exists()
+        command(*words)
+        assert {e.run.name for e in Recording(target).episodes} == {"run-0", "run-1"}
+        again = CliRunner().invoke(app, words)
+        assert again.exit_code == 1
+        assert "o.mcap exists; choose another path, or pass overwrite=True (--force)" in again.output
+        command(*words, "--force")
+
     def test_tag_and_edit(self, tmp_path: Path, capsys: Any) -> None:
         path = str(record(tmp_path / "r.mcap"))
         command("tag", path, "--episodes", "0,2", "success=true", "note=gripper slipped", "grade=1.5")

@@ -22,6 +22,7 @@ from tupli_mcap.cli.terminal import say
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
+    from tupli_mcap.dataset import FilterReport
     from tupli_mcap.recording import RecoveryReport
 
 __all__ = ["edit", "filter_", "merge", "recover", "split", "tag", "trim"]
@@ -199,7 +200,9 @@ def edit(
 
 
 def filter_(
-    file: File,
+    source: Annotated[
+        Path, typer.Argument(metavar="FILE|DIRECTORY", help="A recording, or a directory.", parser=local_path)
+    ],
     filter_text: Annotated[
         str,
         typer.Argument(metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."),
@@ -211,11 +214,12 @@ def filter_(
 ) -> None:
     """Write the episodes that match a filter into a file.
 
-    They keep their ids. A signature is dropped.
+    They keep their ids; those of several recordings get new ones. A signature is dropped.
     """
     from tupli_mcap.dataset import filter_recording
 
-    report = filter_recording(file, output, filter_text, overwrite=force, dry_run=dry_run)
+    make = _filter_directory if source.is_dir() else filter_recording
+    report = make(source, output, filter_text, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, **report._asdict()})
         return
@@ -259,6 +263,20 @@ def trim(
         print_json({"dry_run": dry_run, **report._asdict()})
         return
     _print_made(report, dry_run)
+
+
+def _filter_directory(
+    source: Path, output: Path, filter: str, *, overwrite: bool, dry_run: bool
+) -> FilterReport:
+    from tupli_mcap import open as open_dataset
+    from tupli_mcap.dataset import FilterReport
+
+    found = open_dataset(source)
+    kept = found.filter(filter)
+    report = FilterReport(output, len(kept), kept.n_steps, len(found) - len(kept))
+    if dry_run:
+        return report
+    return report._replace(size=kept.save(output, overwrite=overwrite).stat().st_size)
 
 
 def _print_made(report: Any, dry_run: bool) -> None:

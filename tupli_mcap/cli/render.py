@@ -238,10 +238,7 @@ def plot(
     from tupli_mcap.plots import check_goal, report
 
     goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")
-    try:
-        check_goal(goal, overwrite=force)
-    except RecordingError as err:
-        raise type(err)(str(err).replace("overwrite it", "replace it with --force")) from err
+    check_goal(goal, overwrite=force)
     made = report(
         paths, episode=episode, episode_filter=filter_of(filter_text), x=None if x is None else x.value
     )

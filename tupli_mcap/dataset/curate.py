@@ -68,7 +68,9 @@ def filter_recording(
             if recording.path is not None and target.samefile(recording.path):
                 raise RecordingError(f"{target} is the recording itself; write to another path")
             if not overwrite:
-                raise RecordingError(f"{target} exists; choose another path, or overwrite it")
+                raise RecordingError(
+                    f"{target} exists; choose another path, or pass overwrite=True (--force)"
+                )
         positions = candidates(recording, wanted)
         if not len(positions):
             raise RecordingError(f"{recording.name} has no episode that matches {wanted}")
@@ -97,7 +99,7 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) ->
     if not chosen:
         raise DatasetError("expected episodes to save, found none")
     if target.exists() and not overwrite:
-        raise DatasetError(f"{target} exists; choose another path, or overwrite it")
+        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     sources = [dataset._open(name).path for name in chosen]
     if target.exists() and any(source is not None and target.samefile(source) for source in sources):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
@@ -148,7 +150,7 @@ def trim(
 def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, overwrite: bool) -> Path:
     """Has `target` made out of one recording that has all episodes of a dataset."""
     if target.exists() and not overwrite:
-        raise DatasetError(f"{target} exists; choose another path, or overwrite it")
+        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
         chosen = save(dataset, Path(folder) / target.name, overwrite=False)

@@ -186,7 +186,7 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
         raise RecordingError(f"there is no directory {str(goal.parent)!r}; make it first")
     if goal.is_dir() or (goal.exists() and not overwrite):
         what = "is a directory" if goal.is_dir() else "exists"
-        raise RecordingError(f"{goal} {what}; choose another name, or overwrite it")
+        raise RecordingError(f"{goal} {what}; choose another name, or pass overwrite=True (--force)")
     return goal
 
 

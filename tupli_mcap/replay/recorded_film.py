@@ -85,7 +85,7 @@ def _write(
         raise RecordingError(f"{goal}: expected a name that ends in {' or '.join(_KINDS)}")
     if goal.exists() and not overwrite:
         raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or allow it with --force"
+            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
         )
     if fps is not None and not 0 < fps <= 1000:
         raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")

@@ -137,7 +137,7 @@ def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
         raise RecordingError(f"{goal} is the recording, which is never written over; give another name")
     if goal.exists() and not overwrite:
         raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or allow it with --force"
+            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
         )
     if not goal.absolute().parent.is_dir():
         raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it")

@@ -275,7 +275,7 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
         if any(source.path is not None and target.samefile(source.path) for source in sources):
             raise RecordingError(f"{target} is one of the recordings to merge; write to another path")
         if not overwrite:
-            raise RecordingError(f"{target} exists; choose another path, or overwrite it")
+            raise RecordingError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
 
 
 def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:

@@ -53,7 +53,7 @@ def trim_recording(
             exists (and not `overwrite`), or cannot be written.
     """
     if target.exists() and not overwrite:
-        raise RecordingError(f"{target} exists; choose another path, or overwrite it")
+        raise RecordingError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     if target.exists() and source.path is not None and target.samefile(source.path):
         raise RecordingError(f"{target} is the recording itself; write to another path")
     by_number = {episode.number: episode for episode in source.episodes}

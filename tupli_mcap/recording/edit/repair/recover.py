@@ -186,7 +186,7 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
         raise RecordingError(f"{path} is never overwritten; give another file to write to")
     if goal.exists() and not overwrite:
         raise RecordingError(
-            f"{goal} exists and is not overwritten; give another file, or allow it with --force"
+            f"{goal} exists and is not overwritten; give another file, or pass overwrite=True (--force)"
         )
 
 
