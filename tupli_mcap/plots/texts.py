@@ -29,7 +29,7 @@ margin:0 auto;padding:12px}
 .tupli-report h1{font-size:22px;margin:.2em 0 .5em;overflow-wrap:anywhere}
 .tupli-report table{border-collapse:collapse;margin:.5em 0}
 .tupli-report td,.tupli-report th{padding:1px 14px 1px 0;text-align:left;vertical-align:top;overflow-wrap:anywhere}
-.tupli-report th{font-weight:normal;color:#767676}
+.tupli-report th{font-weight:normal;color:#767676;min-width:5.5em}
 .tupli-report .n td+td,.tupli-report .n th+th{text-align:right;font-variant-numeric:tabular-nums}
 .tupli-report svg{max-width:100%;height:auto;display:block} .tupli-report summary{cursor:pointer}
 """
