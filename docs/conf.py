@@ -30,7 +30,7 @@ extensions = [
     "api",
     "console",
 ]
-exclude_patterns = ["_*", "**.ipynb_checkpoints"]
+exclude_patterns = ["_*", "changes", "**.ipynb_checkpoints"]
 suppress_warnings = ["mystnb.unknown_mime_type"]  # a cell may show more than a page of HTML can
 nitpicky = True
 nitpick_ignore_regex = [  # what other projects document is not linked: a build needs no network

@@ -25,8 +25,11 @@ import api  # noqa: E402
 import built  # noqa: E402
 import generated  # noqa: E402
 
+CHANGES = ROOT / "docs" / "changes"
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "schemas").glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+PAGES = [path for path in PAGES if path.parent != CHANGES]  # whose code may be of an earlier version
 RUN_BY_TESTS = {("README.md", "python"), ("README.md", "text")}  # test_readme
+EARLIER = {("CHANGELOG.md", "python"), ("CHANGELOG.md", "console")}  # before a change, or after it
 NO_CODE = {"", "text"}  # drawings, grammars, what a program prints
 DIRECTIVE = re.compile(r"\{(code-cell|literalinclude|include|toctree|grid|grid-item-card|eval-rst|raw)\}")
 _FENCE = re.compile(r"^ *```([^\n`]*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
@@ -39,7 +42,7 @@ def unexplained(page: str, text: str) -> list[str]:
     for block in _FENCE.finditer(text):
         language, body = block[1].strip(), block[2]
         where = f"{page}:{text.count(chr(10), 0, block.start()) + 1}: {language}"
-        if DIRECTIVE.match(language) or language in NO_CODE or (page, language) in RUN_BY_TESTS:
+        if DIRECTIVE.match(language) or language in NO_CODE or (page, language) in RUN_BY_TESTS | EARLIER:
             continue
         if language == "json":
             for line in body.splitlines():
@@ -197,3 +200,30 @@ def test_foreign_hosts_and_dead_links_are_found(tmp_path: Path) -> None:
         "b.html: loads //fonts.example/f",
         "b.html: links to gone.html, which is not there",
     ]
+
+
+def wrong_change(path: Path) -> str:
+    """What is wrong with a fragment of the changelog; empty if nothing is."""
+    name = re.fullmatch(r"\+[a-z0-9-]+\.(breaking|added|changed|fixed)\.md", path.name)
+    if name is None:
+        return f"{path.name}: expected a name such as +short-words.added.md"
+    blocks = _FENCE.findall(path.read_text(encoding="utf-8"))
+    if name[1] == "breaking" and len(blocks) != 2:
+        return f"{path.name}: expected two blocks, code before and after, found {len(blocks)}"
+    return ""
+
+
+def test_changes_are_named_and_what_breaks_shows_how() -> None:
+    assert [problem for path in sorted(CHANGES.glob("[!R]*")) if (problem := wrong_change(path))] == []
+
+
+def test_wrong_changes_are_found(tmp_path: Path) -> None:
+    for name, text, problem in [
+        ("12.added.md", "A thing.", "expected a name"),
+        ("+a-thing.bugfix.md", "A thing.", "expected a name"),
+        ("+a-thing.breaking.md", "A thing.", "expected two blocks, code before and after, found 0"),
+        ("+a-thing.breaking.md", "A.\n\n```python\na\n```\n\nis now\n\n```python\nb\n```\n", ""),
+    ]:
+        (tmp_path / name).write_text(text)
+        assert problem in wrong_change(tmp_path / name)
+        assert bool(problem) == bool(wrong_change(tmp_path / name))

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 
 import api
+import changes
 import commands
 import house
 import routes
@@ -15,6 +16,7 @@ from sphinx.application import Sphinx
 _MARK = re.compile(r"^<!-- generated: (\w+)(?: (\S+))? -->$", re.MULTILINE)
 _MAKERS: dict[str, Callable[..., str]] = {
     "api": api.documented,
+    "changes": changes.unreleased,
     "commands": commands.documented,
     "keys": words.filter_keys,
     "checks": words.checks,
