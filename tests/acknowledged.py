@@ -17,16 +17,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import httpx
 import numpy as np
 from gymnasium import spaces
-from persons import Person, announced
+from persons import Person, announced, cart_benchmark
 
 from tupli_mcap import EpisodeData, write_recording
-from tupli_mcap.environment import capture
-from tupli_mcap.schema import BenchmarkMetadata
-from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, pack
 
 __all__ = ["Thing", "UnexpectedError", "User"]
 
@@ -66,10 +62,7 @@ class User:
         self._rng = random.Random(seed)
         self._folder = folder
         self._recorded: list[str] = []
-        record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
-        told = {"serialized": pack(record, ()), "metadata": {"name": "cart"}}
-        told["hash"] = benchmark_hash(BenchmarkContent(record, ()), metadata)
-        self._benchmark: str = self.person.ask("POST", "/v1/benchmarks", told)["id"]
+        self._benchmark: str = self.person.ask("POST", "/v1/benchmarks", cart_benchmark())["id"]
 
     def work(self, stop: threading.Event) -> None:
         """Does one thing after the other until it is told to stop."""
@@ -170,6 +163,8 @@ class User:
     def _store(self, thing: Thing) -> None:
         if not thing.data:
             return  # it is gone for good
+        if False in thing.here:  # stored anew, it is published nowhere
+            thing.shown |= {False}
         thing.here |= {True}
         with _asking(thing, "store"):
             if thing.count:

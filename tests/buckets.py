@@ -34,8 +34,8 @@ class Bucket:
     def names(self) -> list[str]:
         """The names of all objects."""
         with contextlib.closing(boto3.client("s3")) as client:
-            found = client.list_objects_v2(Bucket=self.name)
-        return [each["Key"] for each in found.get("Contents", [])]
+            pages = client.get_paginator("list_objects_v2").paginate(Bucket=self.name)
+            return [each["Key"] for page in pages for each in page.get("Contents", [])]
 
 
 @contextlib.contextmanager

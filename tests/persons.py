@@ -7,10 +7,15 @@ import hashlib
 from typing import Any
 from urllib.parse import unquote
 
+import gymnasium as gym
 import httpx
 from serving import PASSWORD
 
-__all__ = ["Person", "RefusedError", "announced"]
+from tupli_mcap.environment import capture
+from tupli_mcap.schema import BenchmarkMetadata
+from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, pack
+
+__all__ = ["Person", "RefusedError", "announced", "cart_benchmark"]
 
 
 class RefusedError(Exception):
@@ -24,6 +29,13 @@ def announced(data: bytes, length: int | None = None) -> dict[str, str]:
         "Upload-Length": str(len(data) if length is None else length),
         "Upload-Metadata": f"sha256 {digest}",
     }
+
+
+def cart_benchmark() -> dict[str, Any]:
+    """CartPole as a benchmark, as a request has it."""
+    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
+    digest = benchmark_hash(BenchmarkContent(record, ()), metadata)
+    return {"hash": digest, "serialized": pack(record, ()), "metadata": {"name": "cart"}}
 
 
 class Person:

@@ -4,6 +4,7 @@ forgotten."""
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import time
 from collections.abc import Iterator
@@ -87,6 +88,7 @@ PARAMETERS = {
     **dict.fromkeys(("group", "publish_in", "unpublish_from"), "global"),
     "id": "x",
 }
+BOTH = pytest.mark.parametrize("users", ["sqlite", "postgresql"], indirect=True)
 HEADERS = {
     "Artifact-Metadata": base64.b64encode(b'{"name": "x"}').decode(),
     "Upload-Length": "5",
@@ -115,8 +117,12 @@ def client(url: str, name: str, place: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.fixture
-def users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Users]:
-    with serving(Settings(tmp_path / "served")) as url:
+def users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Users]:
+    with contextlib.ExitStack() as stack:
+        database = ""
+        if getattr(request, "param", "sqlite") == "postgresql":
+            database = stack.enter_context(request.getfixturevalue("postgres").database())
+        url = stack.enter_context(serving(Settings(tmp_path / "served", database=database)))
         admin = client(url, "admin", tmp_path, monkeypatch)
         for name in ("ann", "bob", "eve"):
             admin.signup(name, f"{name}-password")
@@ -157,6 +163,7 @@ def call(url: str, method: str, path: str, headers: dict[str, str], **names: str
 # --- every route ---
 
 
+@BOTH
 def test_without_a_token_nothing_is_shown(users: Users) -> None:
     for method, path in routes(users.url):
         status = call(users.url, method, path, {}).status_code
@@ -166,6 +173,7 @@ def test_without_a_token_nothing_is_shown(users: Users) -> None:
             assert status == OTHERWISE.get((method, path), 401), (method, path, status)
 
 
+@BOTH
 def test_a_token_that_may_read_changes_nothing(users: Users) -> None:
     made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "laptop", "scope": "read"})
     token = {"Authorization": f"Bearer {made['token']}"}

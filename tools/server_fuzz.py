@@ -26,7 +26,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import hypothesis
 import requests
 from hypothesis import HealthCheck, Phase
@@ -39,13 +38,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import buckets
 import postgres
-from persons import Person, RefusedError, announced
+from persons import Person, RefusedError, announced, cart_benchmark
 from serving import serving
 
-from tupli_mcap.environment import capture
-from tupli_mcap.schema import BenchmarkMetadata
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, pack
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 ENGINES = ("sqlite", "postgresql")
@@ -80,9 +76,7 @@ class Stock:
         self._users = 0
         record_rollouts("CartPole-v1", folder / "run.mcap", steps=30, seed=1)
         self._recording = (folder / "run.mcap").read_bytes()
-        record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
-        digest = benchmark_hash(BenchmarkContent(record, ()), metadata)
-        self._benchmark = {"hash": digest, "serialized": pack(record, ()), "metadata": {"name": "cart"}}
+        self._benchmark = cart_benchmark()
         self.askers = {role: self._asker(role) for role in ROLES}
         self._owner = self._person()
 
