@@ -18,7 +18,15 @@ from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import FileStorage, FormatError, RecordEpisodes, Recording, RecordingError, TupliEnvWrapper
+from tupli_mcap import (
+    FileStorage,
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    TupliEnvWrapper,
+    write_rollout,
+)
 from tupli_mcap.cli.app import app
 from tupli_mcap.errors import FilterError
 from tupli_mcap.recording import (
@@ -541,6 +549,14 @@ class TestCommands:
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output
+
+    def test_info_leaves_out_bounds_that_say_nothing(self, tmp_path: Path) -> None:
+        states, actions = np.zeros((3, 4)), np.zeros(3, np.int64)
+        write_rollout(tmp_path / "w.mcap", states, actions, np.ones(3))
+        told = command("info", str(tmp_path / "w.mcap"))
+        assert re.search(
+            r"^observation +4 numbers \(float64\)\naction +1 number \(int64\)$", told, re.MULTILINE
+        )
 
     def test_filter_takes_a_directory(self, tmp_path: Path) -> None:
         for i in range(2):

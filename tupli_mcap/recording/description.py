@@ -239,6 +239,8 @@ def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
     if not leaf.size:
         return [what + kind]
     alike = bool((low == low[0]).all() and (high == high[0]).all())
+    if alike and leaf.path not in labels.dimensions and _is_unbounded(leaf, low[0], high[0]):
+        return [what + kind]
     if leaf.size > _MOST_BOUNDS or (alike and leaf.path not in labels.dimensions):
         between = "," if leaf.size == 1 else ", each" if alike else ", of"
         return [f"{what}{between} {_range(low.min(), high.max())}{kind}"]
@@ -246,6 +248,18 @@ def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
     widest = max(map(len, names))
     bounds = map(_range, low, high)
     return [what + kind, *(f"{text:<{widest}}  {ends}" for text, ends in zip(names, bounds, strict=True))]
+
+
+def _is_unbounded(leaf: Leaf, low: Any, high: Any) -> bool:
+    """Whether the bounds say no more than the dtype; those of bytes are worth saying."""
+    dtype = np.dtype(leaf.dtype)
+    if dtype.kind == "f":
+        return bool(low == -np.inf and high == np.inf)
+    return (
+        dtype.kind in "iu"
+        and dtype.itemsize > 1
+        and (low, high) == (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    )
 
 
 def _range(low: Any, high: Any) -> str:
