@@ -56,6 +56,10 @@ class Process:
             assert self._process.poll() is None, self.log_file.read_text()
             time.sleep(0.02)
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     def _is_ready(self) -> bool:
         with contextlib.suppress(httpx.TransportError):
             return httpx.get(f"{self.url}/ready", verify=False, timeout=60).status_code in (200, 503)
