@@ -252,7 +252,8 @@ class User:
                 yield f"{told}: expected to be there: {thing.here}, found {found}"
             if found and thing.count and recordings[name] != thing.count:
                 yield f"{told}: {recordings[name]} of {thing.count} episodes are there"
-            if (seen := shown.get(name, 0)) not in (0, max(1, thing.count)) or bool(seen) not in thing.shown:
+            seen, may = shown.get(name, 0), thing.shown if found else {False}
+            if seen not in (0, max(1, thing.count)) or bool(seen) not in may:
                 yield f"{told}: expected to be published: {thing.shown}, found {seen} of {thing.count}"
             if found and thing.data and self._rng.random() < 0.2 and _content(me, thing, name) != thing.data:
                 yield f"{told}: has other bytes"
