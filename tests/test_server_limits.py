@@ -6,6 +6,7 @@ import base64
 import contextlib
 import hashlib
 import json
+import os
 import socket
 import time
 from collections.abc import Iterator
@@ -22,7 +23,11 @@ from test_storage import episode, query
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
 from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT
 from tupli_mcap.server.database import Database, TooLongError
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.tables import UPLOAD
+from tupli_mcap.server.uploads import GoneError, Upload
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.rows import EpisodeRow
@@ -274,3 +279,28 @@ def test_who_does_not_take_the_answer_is_cut_off(tmp_path: Path) -> None:
                 time.sleep(0.1)
                 metrics = httpx.get(f"{admin.url}/metrics", headers=token_of(admin))
             assert len(ended(connection)) < 64 << 20
+
+
+def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: Path) -> None:
+    with contextlib.closing(Library(Settings(tmp_path / "served"))) as library:
+        library.first_password()
+        with library.database.reading() as connection:
+            admin = accounts.caller_named(connection, "admin")
+        assert admin is not None
+        old, fresh, touched = (library.begin_upload(admin, 9, each * 64, 0) for each in "abc")
+        long_ago = int(time.time()) - 8 * 24 * 3600
+        assert isinstance(old, Upload) and isinstance(fresh, Upload) and isinstance(touched, Upload)
+        for upload in (old, fresh, touched):
+            upload.path.write_bytes(b"some")
+        os.utime(old.path, (long_ago, long_ago))
+        stray = old.path.with_name("of-nobody")
+        stray.write_bytes(b"x")
+        with library.database.writing() as connection:
+            begun = UPLOAD.update().where(UPLOAD.c.id.in_([old.id, touched.id])).values(since=long_ago)
+            connection.execute(begun)
+        library.look_after()
+        assert {path.name for path in old.path.parent.iterdir()} == {fresh.id, touched.id}
+        with library.database.reading() as connection:
+            assert library.uploads.find(connection, admin, touched.id).offset == 4
+            with pytest.raises(GoneError, match="no such upload"):
+                library.uploads.find(connection, admin, old.id)
