@@ -36,6 +36,7 @@ from tupli_mcap.errors import MissingExtraError, RecordingError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
+from tupli_mcap.viewer.live import session
 from tupli_mcap.viewer.live.follow import Follower, follow
 from tupli_mcap.viewer.live.new_rows import NewSteps
 from tupli_mcap.viewer.live.rerun_panels import LivePanels
@@ -67,6 +68,12 @@ def answers(port: int) -> bool:
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 0.2):
         return True
     return False
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine may need longer for the rest of a view than closing waits for it."""
+    monkeypatch.setattr(session, "_FAREWELL", 120.0)
 
 
 @contextlib.contextmanager
