@@ -34,6 +34,7 @@ class _Passed:
     is_file = False
 
 
+_ON_ITS_WAY = 1 << 16  # bytes to a client, which a reset throws away although they are counted
 _FILES = (b"PATCH ", b"GET /v1/files/", b"GET /v1/artifacts/")
 _REQUESTS = (b"GET ", b"POST ", b"PUT ", b"PATCH ", b"DELETE ", b"HEAD ")
 
@@ -92,6 +93,7 @@ class Between:
                 client, _ = listener.accept()
             except OSError:
                 return
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ON_ITS_WAY)
             fault = self.faults.popleft() if self.faults else Fault()
             threading.Thread(target=self._serve, args=(client, fault), daemon=True).start()
 

@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -285,12 +285,12 @@ class Busy(FileStorage):
         self.happens: Callable[[FileStorage], Any] | None = happens
         self.then: Callable[[FileStorage], Any] = lambda storage: None
 
-    def open_recording(self, recording: str) -> Recording:
+    def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         happens, self.happens = self.happens, None
         if happens is not None:
             happens(self)
             self.then(self)
-        return super().open_recording(recording)
+        return super().open_recording(recording, episodes)
 
 
 class TestImporting:

@@ -43,7 +43,7 @@ def add(path: Path, data: bytes) -> None:
         metadata = dict(recording.metadata)
     old, new = dict(metadata), {**metadata, "uuid": uuid.uuid4().hex}
     for before, after in zip(with_crc(old).values(), with_crc(new).values(), strict=True):
-        data = data.replace(before.encode(), after.encode(), 1)
+        data = data.replace(before.encode(), after.encode())  # at the end it stands again
     path.write_bytes(data)
 
 

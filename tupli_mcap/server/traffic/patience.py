@@ -20,6 +20,7 @@ class PatientProtocol(HttpToolsProtocol):
 
     def __init__(self, *args: Any, head_seconds: float, stall_seconds: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.access_log = False  # whoever listens: its lines hold addresses with tickets
         self._patience = head_seconds, stall_seconds
         self._head_since: float | None = None  # a request has begun then, and its head is not there
         self._head_size = 0  # what has come of it
