@@ -79,8 +79,9 @@ class Process:
         return self._process.wait(120)
 
     def log(self) -> list[dict[str, Any]]:
-        """The lines of its log."""
-        return [json.loads(line) for line in self.log_file.read_text().splitlines()]
+        """The lines of its log; one that is being written is left out."""
+        whole = self.log_file.read_text().rpartition("\n")[0]
+        return [json.loads(line) for line in whole.splitlines()]
 
 
 @contextlib.contextmanager
