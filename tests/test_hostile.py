@@ -365,6 +365,16 @@ def test_nothing_follows_the_frame_of_a_chunk(name: str) -> None:
             decompress(name, memoryview(plain + more), len(data), "here")
 
 
+@pytest.mark.parametrize("damaged", [b"\0\x40\0\0", b"\0\0"])
+def test_an_lz4_frame_has_its_end(damaged: bytes) -> None:
+    """Other readers refuse a chunk without it, or read on in what follows."""
+    data = bytes(range(250)) * 4
+    plain = lz4.frame.compress(data)
+    assert plain.endswith(bytes(4))
+    with pytest.raises(FormatError, match="here: expected the end of the lz4 frame"):
+        decompress("lz4", memoryview(plain[:-4] + damaged), len(data), "here")
+
+
 @pytest.mark.parametrize(
     "name", [b"../../x", b"/etc/passwd", b"a\0b", b"CON", b"", b"\xff", b"x" * 70_000, b"artifacts/../../x"]
 )

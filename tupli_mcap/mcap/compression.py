@@ -47,6 +47,8 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
                 raise FormatError(
                     f"{where}: expected one lz4 frame, found {len(frame.unused_data)} bytes behind it"
                 )
+            if len(found) == size and not frame.eof:
+                raise FormatError(f"{where}: expected the end of the lz4 frame, found more of it")
         elif name == "":
             found = data
         else:
