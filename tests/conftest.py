@@ -13,8 +13,11 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
+    from between import Between
     from postgres import Cluster
     from viewing import HeadlessViewer
+
+    from tupli_mcap.storage.api import TupliAPIClient
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -62,6 +65,30 @@ def postgres() -> Iterator[Cluster]:
         if os.environ.get("CI"):
             raise
         pytest.skip(str(err))
+
+
+@pytest.fixture
+def proxy(tmp_path: Path) -> Iterator[Between]:
+    """A server, with what counts bytes and breaks connections before it."""
+    from between import between
+    from serving import serving
+
+    from tupli_mcap.server.settings import Settings
+
+    with serving(Settings(tmp_path / "served")) as url, between(url) as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def admin(proxy: Between) -> Iterator[TupliAPIClient]:
+    """Its admin, signed in."""
+    from serving import PASSWORD
+
+    from tupli_mcap.storage.api import TupliAPIClient
+
+    with TupliAPIClient(proxy.url) as client:
+        client.login("admin", PASSWORD)
+        yield client
 
 
 def pytest_configure() -> None:

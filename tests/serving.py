@@ -6,8 +6,10 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import pytest
 import uvicorn
 
 from tupli_mcap.server.app import create_app
@@ -41,11 +43,24 @@ def serving(settings: Settings, listening: Listening | None = None) -> Iterator[
         thread.join(30)
 
 
+ENGINES = ("sqlite and a directory", "postgresql and s3")
+
+
+@contextlib.contextmanager
+def settings_of(engine: str, request: pytest.FixtureRequest, directory: Path) -> Iterator[Settings]:
+    """What a server of an engine keeps, for as long as a block runs."""
+    if engine != ENGINES[1]:
+        yield Settings(directory)
+        return
+    import buckets  # not where d3rlpy is
+
+    with request.getfixturevalue("postgres").database() as database, buckets.bucket() as bucket:
+        yield Settings(directory, database=database, blobs=bucket.url)
+
+
 @contextlib.contextmanager
 def pytest_environment(name: str, value: str) -> Iterator[None]:
     """Sets a variable of the environment for a block."""
-    import pytest
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(name, value)
         yield

@@ -5,18 +5,15 @@ The routes come from the OpenAPI document: one that names an item, and that this
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import buckets
 import httpx
 import pytest
 from persons import Person, cart_benchmark
-from serving import serving
+from serving import ENGINES, serving, settings_of
 
-from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -105,16 +102,11 @@ class Lab:
         return ids
 
 
-@pytest.fixture(scope="module", params=["sqlite and a directory", "postgresql and s3"])
+@pytest.fixture(scope="module", params=ENGINES)
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     root = tmp_path_factory.mktemp("lab")
-    with contextlib.ExitStack() as stack:
-        database = blobs = ""
-        if "postgresql" in request.param:
-            database = stack.enter_context(request.getfixturevalue("postgres").database())
-            blobs = stack.enter_context(buckets.bucket()).url
-        settings = Settings(root / "served", database=database, blobs=blobs)
-        yield Lab(stack.enter_context(serving(settings)), root)
+    with settings_of(request.param, request, root / "served") as settings, serving(settings) as url:
+        yield Lab(url, root)
 
 
 @pytest.mark.parametrize("published", [False, True], ids=["private", "published"])

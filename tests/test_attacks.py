@@ -33,7 +33,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
 
-import buckets
 import httpx
 import jwt
 import psutil
@@ -43,7 +42,7 @@ from crafted import Model
 from pages import EVIL, robot
 from persons import Person, announced
 from served import served
-from serving import serving
+from serving import ENGINES, serving, settings_of
 
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -88,15 +87,10 @@ class Lab(NamedTuple):
     episodes: list[str]
 
 
-@pytest.fixture(scope="module", params=["sqlite and a directory", "postgresql and s3"])
+@pytest.fixture(scope="module", params=ENGINES)
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     root = tmp_path_factory.mktemp("lab")
-    with contextlib.ExitStack() as stack:
-        database = blobs = ""
-        if "postgresql" in request.param:
-            database = stack.enter_context(request.getfixturevalue("postgres").database())
-            blobs = stack.enter_context(buckets.bucket()).url
-        url = stack.enter_context(serving(Settings(root / "served", database=database, blobs=blobs)))
+    with settings_of(request.param, request, root / "served") as settings, serving(settings) as url:
         admin = Person(url, "admin")
         ann, eve = people(admin, "ann", "eve")
         record_rollouts("CartPole-v1", root / "run.mcap", steps=60, seed=1)

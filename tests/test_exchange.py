@@ -13,9 +13,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import web_server
-from between import Between, Fault, between
+from between import Between, Fault
 from malicious import MODULE, _store as store, pickles, specs
-from serving import PASSWORD, serving
 from typer.testing import CliRunner
 
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
@@ -23,23 +22,9 @@ from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, StorageError, UntrustedError
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, F
-from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.exchange import copy_episodes
-
-
-@pytest.fixture
-def proxy(tmp_path: Path) -> Iterator[Between]:
-    with serving(Settings(tmp_path / "served")) as url, between(url) as proxy:
-        yield proxy
-
-
-@pytest.fixture
-def admin(proxy: Between) -> Iterator[TupliAPIClient]:
-    with TupliAPIClient(proxy.url) as client:
-        client.login("admin", PASSWORD)
-        yield client
 
 
 def fill(lab: Path, episodes: int = 12) -> str:

@@ -11,28 +11,13 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from between import Between, between
-from serving import PASSWORD, serving
+from between import Between
 
 from tupli_mcap import TupliEnvWrapper
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import F
-from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Outbox
-
-
-@pytest.fixture
-def proxy(tmp_path: Path) -> Iterator[Between]:
-    with serving(Settings(tmp_path / "served")) as url, between(url) as proxy:
-        yield proxy
-
-
-@pytest.fixture
-def admin(proxy: Between) -> Iterator[TupliAPIClient]:
-    with TupliAPIClient(proxy.url) as client:
-        client.login("admin", PASSWORD)
-        yield client
 
 
 @pytest.fixture

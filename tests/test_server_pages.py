@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-import buckets
 import httpx
 import pytest
 from pages import carts, robot
-from serving import PASSWORD, serving
+from serving import ENGINES, PASSWORD, serving, settings_of
 
 import tupli_mcap
 from tupli_mcap.page.routes import PAGES
@@ -60,15 +59,10 @@ class Api:
         self.post("/v1/episodes/publish", filter=wanted, group="global", published=published)
 
 
-@pytest.fixture(scope="module", params=["sqlite and a directory", "postgresql and s3"])
+@pytest.fixture(scope="module", params=ENGINES)
 def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     root = tmp_path_factory.mktemp("server")
-    with contextlib.ExitStack() as stack:
-        database = blobs = ""
-        if "postgresql" in request.param:
-            database = stack.enter_context(request.getfixturevalue("postgres").database())
-            blobs = stack.enter_context(buckets.bucket()).url
-        url = stack.enter_context(serving(Settings(root / "kept", database=database, blobs=blobs)))
+    with settings_of(request.param, request, root / "kept") as settings, serving(settings) as url:
         for name in ("ann", "bob"):
             Api(url, "admin").post("/v1/users", username=name, password=f"{name}'s password")
         (root / "ann").mkdir()
