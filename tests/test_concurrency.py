@@ -154,7 +154,7 @@ class TestTheCatalog:
         release = threading.Event()
 
         def hold() -> None:
-            with storage._lock, storage._recordings._catalog._database._lock:
+            with storage._lock, storage._catalog._catalog._database._lock:
                 held.set()
                 release.wait(120)
 

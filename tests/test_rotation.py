@@ -413,7 +413,7 @@ class TestStorage:
         roll(env, 1000)
         paths = sorted((tmp_path / "lab").glob("recordings/**/*.mcap"))
         assert len(paths) > 2
-        catalogued = storage._recordings._catalog.recordings()
+        catalogued = storage._catalog._catalog.recordings()
         assert {Path(name).name for name in catalogued} >= {path.name for path in paths[:-1]}
         env.close()
         assert len(storage.list_episodes()) == sum(len(Recording(path)) for path in paths)

@@ -20,7 +20,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import F
 from tupli_mcap.storage import FileStorage
-from tupli_mcap.storage.bundles import from_recording
+from tupli_mcap.storage.bundles import bundle_recording
 from tupli_mcap.storage.listing import compactable, list_recordings
 from tupli_mcap.storage.sidecar import Deletion, Sidecar, sidecar_path
 from tupli_mcap.storage.verify import verify_storage
@@ -83,7 +83,7 @@ class TestAReplacedRecording:
         assert [item.episodes for item in list_recordings([storage.root])] == [4]
         with Recording(run) as recording:
             assert len(choose_episodes(recording, "all")) == 4
-        from_recording(run, tmp_path / "bundle.mcap")
+        bundle_recording(run, tmp_path / "bundle.mcap")
         with Recording(tmp_path / "bundle.mcap") as bundle:
             assert len(bundle) == 4
         assert compactable(storage.root) == []

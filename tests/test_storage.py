@@ -52,7 +52,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
-from tupli_mcap.storage.bundles import from_recording
+from tupli_mcap.storage.bundles import bundle_recording
 from tupli_mcap.storage.catalog import database
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
@@ -884,7 +884,7 @@ class TestFileStorage(StorageContract):
             with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap") as env:
                 env.reset(seed=1)
                 env.step(0)
-            from_recording(tmp_path / f"{name}.mcap", tmp_path / f"{name}-bundle.mcap")
+            bundle_recording(tmp_path / f"{name}.mcap", tmp_path / f"{name}-bundle.mcap")
         ids = {storage.import_bundle(tmp_path / f"{name}-bundle.mcap") for name in ("a", "b")}
         (header,) = storage.list_benchmarks()
         assert ({header.id}, header.metadata.name) == (ids, "CartPole-v1")
@@ -895,7 +895,7 @@ class TestFileStorage(StorageContract):
             writer.begin()
             writer.step(np.zeros(2, np.float32), 0, 0.0)
         with pytest.raises(StorageError, match="carries no environment"):
-            from_recording(tmp_path / "robot.mcap", tmp_path / "never.mcap")
+            bundle_recording(tmp_path / "robot.mcap", tmp_path / "never.mcap")
 
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())

@@ -29,6 +29,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.base import episode_id
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
 
@@ -285,7 +286,7 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
             continue
         yield unchecked_header(
             {
-                "id": f"{uuid}-{number}",
+                "id": episode_id(uuid, number),
                 "created_by": "",
                 "published_in": [],
                 "created_at": ended,

@@ -32,7 +32,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
-from tupli_mcap.storage.benchmarks import document_of, name_in
+from tupli_mcap.storage.files.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["Items", "Kind", "artifact_key"]

@@ -1,17 +1,17 @@
 """Where benchmarks, artifacts and recordings live.
 
-base                                the contract of a storage, and who sees what is in it
-files, api/                         `FileStorage`: a directory; `TupliAPIClient`: a server
-at, exchange                        which of them a path or URL stands for; from one to another
-benchmarks, artifacts, recordings   the parts of the directory
-sidecar                             what is noted beside recordings: deletions, publications
-catalog/                            the database that finds episodes
-listing                             recordings below any directory: found, listed, read by episodes
-from_values                         episodes made of values: their spaces, and the form that these ask for
-benchmark_json                      a benchmark as text
-bundles                             a benchmark with all that it needs in one file
-verify                              whether all of it is whole
-atomic, texts                       whole files, the lock between processes, and the texts in files
+base             the contract of a storage, and who sees what is in it
+files/, api/     `FileStorage`: a directory; `TupliAPIClient`: a server
+at, exchange     which of them a path or URL stands for; from one to another
+bundles/         a benchmark with all that it needs in one file
+catalog/         the database that finds episodes
+listing          recordings below any directory: found, listed, read by episodes
+sidecar          what is noted beside recordings: deletions, publications
+benchmark_json   a benchmark as text
+from_values      episodes made of values: their spaces, and the form that these ask for
+downloads        files fetched from elsewhere, kept for a while
+verify           whether all of it is whole
+atomic, texts    whole files, the lock between processes, and the texts in files
 """
 
 from tupli_mcap.storage.api import TupliAPIClient

@@ -28,6 +28,7 @@ __all__ = [
     "TupliStorage",
     "TupliStorageError",
     "anew",
+    "episode_id",
     "published_in",
 ]
 
@@ -189,6 +190,11 @@ def published_in(groups: Sequence[str], group: str) -> list[str]:
     if not isinstance(group, str) or not group or not group.isprintable():
         raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
     return [*groups, *([] if group in groups else [group])]
+
+
+def episode_id(uuid: str, episode: int) -> str:
+    """The id of an episode: its recording's UUID and its number."""
+    return f"{uuid}-{episode}"
 
 
 def anew(read: Callable[[], _T]) -> _T:

@@ -24,12 +24,12 @@ from tupli_mcap.schema import (
     FilterEQ,
     FilterIN,
 )
-from tupli_mcap.storage import bundles
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
+from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.files import FileStorage
 
 __all__ = [
@@ -177,10 +177,10 @@ def _vouch(target: FileStorage, uri: str) -> None:
     }:
         with target.open_recording(name) as recording:
             if SIGNATURE_NAME in recording.attachments and DOCUMENT_NAME in recording.attachments:
-                digest = bundles.incoming(recording, target.root / name)[0].digest
+                digest = carried_benchmark(recording, target.root / name)[0].digest
                 if trust.is_trusted(digest):
                     return
-                signature = bundles.checked_signature(recording, required=False)
+                signature = checked_signature(recording, required=False)
                 if signature is not None and signature.trusted:
                     trust.vouch(digest, signature.public_key)
                     return
@@ -196,8 +196,8 @@ def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False)
     with Recording(path) as recording:
         carries = bool(recording.benchmark_id) and DOCUMENT_NAME in recording.attachments
         if carries and not client.list_benchmarks(FilterEQ(key="id", value=recording.benchmark_id)):
-            record, _, query = bundles.incoming(recording, path)
-            for data, metadata in bundles.carried_artifacts(recording, record, path):
+            record, _, query = carried_benchmark(recording, path)
+            for data, metadata in carried_artifacts(recording, record, path):
                 if not dry_run:
                     client.store_artifact(data, metadata)
             if not dry_run:

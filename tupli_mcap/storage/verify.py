@@ -17,11 +17,11 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.remote import copied, is_url, shown
-from tupli_mcap.storage import bundles
-from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock
-from tupli_mcap.storage.benchmarks import BenchmarkFiles
+from tupli_mcap.storage.bundles import carried_benchmark
 from tupli_mcap.storage.files import FileStorage
+from tupli_mcap.storage.files.artifacts import ArtifactFiles
+from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.listing import is_storage, scan
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
@@ -165,7 +165,7 @@ def _benchmark(path: Path, findings: Findings) -> None:
         if "id" not in (recording.benchmark.record.benchmark or {}):
             return
         try:
-            bundles.incoming(recording, path)
+            carried_benchmark(recording, path)
         except TupliError as err:
             findings.error("benchmark", str(err).removeprefix(f"{path}: "))
 

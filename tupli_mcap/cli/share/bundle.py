@@ -65,13 +65,13 @@ def bundle(
     if is_url(source) or source.endswith(".mcap") or Path(source).is_file():
         if filter_text is not None:
             raise typer.BadParameter("a filter goes with a benchmark id, not with a file")
-        from tupli_mcap.storage import bundles
+        from tupli_mcap.storage.bundles import bundle_recording
 
         with (
             open_storage(storage_path) if storage_path.is_dir() else nullcontext() as known,
             _local(source) as path,
         ):
-            bundles.from_recording(path, output, known, key)
+            bundle_recording(path, output, known, key)
     else:
         with open_storage(storage_path) as storage:
             storage.bundle(full_id(storage, source), output, filter_of(filter_text), sign=key)
@@ -127,7 +127,7 @@ def import_(
     """
     from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key
-    from tupli_mcap.storage import bundles
+    from tupli_mcap.storage.bundles import checked_signature, preview_import
 
     required = require_signature or bool(signers)
     keys = [find_key(text).public_key for text in signers or ()]
@@ -135,10 +135,10 @@ def import_(
     with _local(file) as path:
         if required:
             with Recording(path) as recording:
-                signature = bundles.checked_signature(recording, required, keys)
+                signature = checked_signature(recording, required, keys)
                 signed_by = None if signature is None else signature.fingerprint
         with open_storage(storage_path, create=True) as storage:
-            preview = bundles.preview(storage, path)
+            preview = preview_import(storage, path)
             if not dry_run:
                 storage.import_bundle(path, trust=trust, require_signature=required, signers=keys)
     if as_json:

@@ -16,6 +16,7 @@ from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.schema.values import classify
+from tupli_mcap.storage.base import episode_id
 from tupli_mcap.storage.catalog.tables import EPISODE_BITS
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -123,7 +124,7 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
 def header(row: StoredRow, uuid: str, benchmark_id: str, path: str, run: dict[str, Any]) -> EpisodeHeader:
     """The header of a stored row; the other arguments come from its recording, as stored."""
     values = {
-        "id": f"{uuid}-{row.episode}",
+        "id": episode_id(uuid, row.episode),
         "created_by": unescape_text(row.created_by),
         "published_in": list(_published_in(row.published_in)),
         "created_at": iso_utc(row.created_at),

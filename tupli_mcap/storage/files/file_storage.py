@@ -1,14 +1,4 @@
-"""`FileStorage`: benchmarks, artifacts and recordings in a directory.
-
-benchmarks/<id>.json, <id>.cloudpickle     the environment, as data or as trusted code
-artifacts/<sha256>, <sha256>.json          bytes, and what is known of them
-recordings/<benchmark id>/<name>.mcap      episodes; `<name>.mcap.json` notes deletions and publications
-storage.json                               declared keys
-deleting.json                              a deletion from several recordings, while it is done
-
-The catalog, an index of the recordings, lies in this user's cache directory and may be deleted at any time. Listing,
-filtering and reading write nothing into the directory.
-"""
+"""`FileStorage`: a storage in a directory."""
 
 from __future__ import annotations
 
@@ -37,15 +27,16 @@ from tupli_mcap.schema import (
     EpisodeItem,
     FilterEQ,
 )
-from tupli_mcap.storage import bundles
-from tupli_mcap.storage.artifacts import ArtifactFiles
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
 from tupli_mcap.storage.base import TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
-from tupli_mcap.storage.benchmarks import BenchmarkFiles
+from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
+from tupli_mcap.storage.files.artifacts import ArtifactFiles
+from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
+from tupli_mcap.storage.files.recordings import RecordingFiles
+from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.from_values import episode_data, episode_spaces
 from tupli_mcap.storage.listing import with_tuples
-from tupli_mcap.storage.recordings import RecordingFiles
 from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
@@ -91,11 +82,12 @@ class FileStorage(TupliStorage):
         self.import_lock = Lock(self.root / ".import.lock")  # two imports of one file would copy it twice
         self._benchmarks = BenchmarkFiles(self.root / "benchmarks", self._lock)
         self._artifacts = ArtifactFiles(self.root / "artifacts", self._lock)
-        self._recordings = RecordingFiles(self.root, self._lock, self._settings().declared_keys)
+        self._catalog = SyncedCatalog(self.root, self._settings().declared_keys)
+        self._recordings = RecordingFiles(self.root, self._lock, self._catalog)
 
     def close(self) -> None:
         """Release the catalog; the storage can still be used, and opens it again."""
-        self._recordings.close()
+        self._catalog.close()
 
     def __enter__(self) -> FileStorage:
         return self
@@ -150,7 +142,7 @@ class FileStorage(TupliStorage):
             if episodes:
                 self._refuse_live(uri)
                 deleted = self._recordings.delete(
-                    self._recordings.headers(FilterEQ(key="benchmark_id", value=uri))
+                    self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
                 )
             self._benchmarks.delete(uri)
             self._recordings.remove_directory(self.root / "recordings" / uri)
@@ -251,35 +243,35 @@ class FileStorage(TupliStorage):
             if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
                 raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
         if not include_tuples:
-            return self._recordings.headers(filter, limit=limit, offset=offset)
+            return self._catalog.headers(filter, limit=limit, offset=offset)
         return anew(
             lambda: list(
-                with_tuples(self._recordings.headers(filter, limit=limit, offset=offset), self.open_recording)
+                with_tuples(self._catalog.headers(filter, limit=limit, offset=offset), self.open_recording)
             )
         )
 
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
-        return self._recordings.count(filter)
+        return self._catalog.count(filter)
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
         """The answer of the catalog, brought up to date, to a question such as those of `catalog.queries`."""
-        return self._recordings.ask(question)
+        return self._catalog.ask(question)
 
     @property
     def skipped(self) -> dict[str, str]:
         """The recordings that the last query left out, and why: damaged ones, and copies of others."""
-        return self._recordings.skipped
+        return self._catalog.skipped
 
     def explain(self, filter: BaseFilter | None) -> str:
         """The SQL that a filter over episodes becomes, and SQLite's plan for it."""
-        return self._recordings.explain(filter)
+        return self._catalog.explain(filter)
 
     def delete_episode(self, uri: str) -> None:
         if not self._recordings.delete([self._recordings.header(uri)]):
             raise NotFoundError(f"episode {uri} was deleted by somebody else meanwhile")
 
     def delete_episodes(self, filter: BaseFilter) -> int:
-        return self._recordings.delete(self._recordings.headers(filter))
+        return self._recordings.delete(self._catalog.headers(filter))
 
     def deleted_episodes(self) -> list[str]:
         """The ids of the episodes that are deleted, as long as `compact` has not freed their space.
@@ -325,7 +317,7 @@ class FileStorage(TupliStorage):
             raise NotFoundError(f"recording {recording!r} was deleted meanwhile") from err
 
     def declare_key(self, key: str) -> None:
-        self._recordings.declare_key(key)
+        self._catalog.declare_key(key)
         with self._lock, os_errors("cannot declare a key in", self.root):
             settings = self._settings()
             if key not in settings.declared_keys:
@@ -338,7 +330,7 @@ class FileStorage(TupliStorage):
 
     def reindex(self) -> None:
         """Make the catalog anew from the recordings."""
-        self._recordings.reindex()
+        self._catalog.reindex()
 
     def compact(self) -> int:
         """Rewrite recordings that hold deleted episodes, and remove the temporary files of killed processes; returns
@@ -358,12 +350,12 @@ class FileStorage(TupliStorage):
         *,
         sign: SigningKey | None = None,
     ) -> Path:
-        """Write one file that holds a benchmark, its artifacts and its episodes, see `bundles.write`."""
-        return bundles.write(self, benchmark_id, Path(target), filter, sign)
+        """Write one file that holds a benchmark, its artifacts and its episodes, see `write_bundle`."""
+        return write_bundle(self, benchmark_id, Path(target), filter, sign)
 
     def export(self, target: str | os.PathLike[str], filter: BaseFilter | None = None) -> Path:
-        """Write episodes of one benchmark, those that match a filter, into one file; see `bundles.export`."""
-        return bundles.export(self, Path(target), filter)
+        """Write episodes of one benchmark, those that match a filter, into one file; see `export_episodes`."""
+        return export_episodes(self, Path(target), filter)
 
     def import_bundle(
         self,
@@ -373,8 +365,8 @@ class FileStorage(TupliStorage):
         require_signature: bool = False,
         signers: Sequence[str] = (),
     ) -> str:
-        """Take in what `bundle` wrote, see `bundles.read`; returns the benchmark's id."""
-        return bundles.read(
+        """Take in what `bundle` wrote, see `read_bundle`; returns the benchmark's id."""
+        return read_bundle(
             self, Path(path), trust=trust, require_signature=require_signature, signers=signers
         )
 

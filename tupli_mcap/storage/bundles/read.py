@@ -1,0 +1,179 @@
+"""Takes what a file carries into a storage: its benchmark, the artifacts, and the episodes that are not there yet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from tupli_mcap import trust as _trust
+from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.files import create
+from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording.sign.sign import episodes_alike
+from tupli_mcap.schema import (
+    FilterIN,
+)
+from tupli_mcap.storage.atomic import fill, os_errors
+from tupli_mcap.storage.base import episode_id
+from tupli_mcap.storage.benchmark_json import (
+    artifacts_of,
+)
+from tupli_mcap.storage.bundles.carried import carried_artifacts, carried_benchmark, checked_signature
+
+if TYPE_CHECKING:
+    from tupli_mcap.storage.files import FileStorage
+
+__all__ = ["ImportPreview", "preview_import", "read_bundle"]
+
+_PIECE = 1 << 22
+
+
+class ImportPreview(NamedTuple):
+    """What a file holds, and how much of it a storage does not have yet."""
+
+    benchmark_id: str
+    name: str
+    episodes: int
+    new_episodes: int
+    artifacts: int
+    new_artifacts: int
+
+
+def read_bundle(
+    storage: FileStorage,
+    path: Path,
+    *,
+    trust: bool = False,
+    require_signature: bool = False,
+    signers: Sequence[str] = (),
+) -> str:
+    """Take a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
+
+    Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
+    needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
+    file twice changes nothing.
+
+    require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
+        else by a key that this user trusts.
+
+    Raises:
+        SignatureError: A signature is required, and missing, not fitting, or of another key.
+        FormatError: The file is damaged, or its contents are not what its benchmark says.
+        StorageError: It carries no benchmark, or lacks an artifact; or the storage holds episodes of this recording
+            already, with other contents.
+    """
+    with Recording(path) as recording:  # what is refused leaves nothing behind
+        signature = checked_signature(recording, require_signature, signers)
+        record, header, query = carried_benchmark(recording, path)
+        _missing(storage, recording)
+        for data, metadata in carried_artifacts(recording, record, path, storage):
+            storage.store_artifact(data, metadata)
+        if trust:
+            _trust.trust(record.digest)
+        elif signature is not None and signature.trusted:
+            _trust.vouch(record.digest, signature.public_key)
+        with storage.import_lock:
+            storage.store_benchmark(query)
+
+            def check(copy: Recording) -> None:
+                if require_signature:
+                    checked_signature(copy, True, signers)
+                if carried_benchmark(copy, path)[1].id != header.id:
+                    raise FormatError(
+                        f"{path} was replaced by another bundle while it was imported; import that"
+                    )
+
+            _copy(storage, recording, header.id, check)
+    return header.id
+
+
+def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
+    """What `read_bundle` would do; checks the whole file but its steps, and writes nothing. Raises as that does.
+
+    storage: None stands for an empty one.
+    """
+    with Recording(path) as recording:
+        record, header, _ = carried_benchmark(recording, path)
+        artifacts = artifacts_of(record, str(path))
+        carried_artifacts(recording, record, path, storage)
+        stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
+        return ImportPreview(
+            benchmark_id=header.id,
+            name=header.metadata.name,
+            episodes=len(recording),
+            new_episodes=len(_missing(storage, recording)),
+            artifacts=len(artifacts),
+            new_artifacts=len(set(artifacts) - stored),
+        )
+
+
+def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
+    """Numbers of the episodes that the storage does not hold yet.
+
+    Raises:
+        StorageError: It holds others under their names.
+    """
+    ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
+    if storage is None:
+        return list(ids.values())
+    stored_numbers: dict[str, list[int]] = {}
+    for header in storage.list_episodes(FilterIN(key="id", value=list(ids))):
+        stored_numbers.setdefault(header.recording, []).append(header.episode)
+    for name, numbers in stored_numbers.items():
+        with storage.open_recording(name) as stored:
+            if not _same_file(recording, stored) and not episodes_alike(
+                recording, stored, numbers, storage.root
+            ):
+                raise StorageError(
+                    f"episodes of the recording {recording.uuid} are in {str(storage.root)!r} already, with other "
+                    f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong"
+                )
+    held = {number for numbers in stored_numbers.values() for number in numbers}
+    return [number for number in ids.values() if number not in held]
+
+
+def _same_file(one: Recording, other: Recording) -> bool:
+    """Whether two finished files have the same bytes."""
+    if not (one.complete and other.complete and one.size == other.size):
+        return False
+    return all(a == b for a, b in zip(_pieces(one), _pieces(other), strict=True))
+
+
+def _pieces(recording: Recording) -> Iterator[bytes]:
+    for start in range(0, recording.size, _PIECE):
+        yield recording.file.source.read(start, min(_PIECE, recording.size - start))
+
+
+class _NothingNewError(Exception):
+    pass
+
+
+def _copy(
+    storage: FileStorage, recording: Recording, benchmark_id: str, check: Callable[[Recording], None]
+) -> None:
+    """Copy the episodes that the storage does not hold yet.
+
+    The file may be changed by others at any time. So what counts is a copy that nobody else can write to: `check` is
+    made on it, and what it holds goes into the storage.
+    """
+    target = storage.new_recording_path(benchmark_id)
+    try:
+        with os_errors("cannot import", target), fill(target) as new:
+            if recording.complete:
+                recording.file.source.refresh()  # as it is now, whole
+                with os.fdopen(create(new), "wb") as file:
+                    file.writelines(_pieces(recording))
+            else:
+                rewrite_recording(recording, new)  # with what is in its journal
+            with Recording(new) as copy:
+                check(copy)
+                missing = _missing(storage, copy)
+                if not missing:
+                    raise _NothingNewError
+                if len(missing) < len(copy):
+                    rewrite_recording(copy, new, episodes=missing)
+    except _NothingNewError:
+        return
+    storage.ingest(target)

@@ -1,0 +1,269 @@
+"""Writes a benchmark, its artifacts and its episodes into one file."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tupli_mcap.errors import FormatError, NotFoundError, StepError, StorageError
+from tupli_mcap.messages.frames import EncodedFrame
+from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.recording.sign.sign import sign_recording
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.recording.write.options import CAMERA
+from tupli_mcap.schema import (
+    BaseFilter,
+    BenchmarkHeader,
+    BenchmarkMetadata,
+    EpisodeHeader,
+    FilterEQ,
+)
+from tupli_mcap.spaces.space_json import space_to_json
+from tupli_mcap.storage.atomic import fill, os_errors
+from tupli_mcap.storage.base import LOCAL_USER, anew
+from tupli_mcap.storage.benchmark_json import (
+    ARTIFACT_PREFIX,
+    DOCUMENT_NAME,
+    PICKLE_NAME,
+    artifacts_of,
+    benchmark_entry,
+    benchmark_hash,
+    declared_spaces,
+    pack,
+    plain,
+    unpack,
+)
+from tupli_mcap.storage.bundles.carried import carried_environment
+from tupli_mcap.storage.sidecar import Notes
+
+if TYPE_CHECKING:
+    from tupli_mcap.signing import SigningKey
+    from tupli_mcap.storage.files import FileStorage
+
+__all__ = ["bundle_recording", "export_episodes", "write_bundle"]
+
+Attachments = dict[str, tuple[str, bytes]]
+
+
+def write_bundle(
+    storage: FileStorage,
+    benchmark_id: str,
+    target: Path,
+    filter: BaseFilter | None = None,
+    sign: SigningKey | None = None,
+) -> Path:
+    """Write a benchmark with its artifacts and its episodes (those that match a filter) into a new file.
+
+    sign: the key to sign it with.
+
+    Raises:
+        NotFoundError: There is no such benchmark, or one of its artifacts is gone.
+        StorageError: The file exists or cannot be written, or the episodes do not fit into one file.
+    """
+    _refuse_existing(target)
+    attachments = _attachments(storage, benchmark_id)
+    of_benchmark: BaseFilter = FilterEQ(key="benchmark_id", value=benchmark_id)
+    wanted = of_benchmark if filter is None else of_benchmark & filter
+
+    def attempt() -> None:
+        headers = storage.list_episodes(wanted)
+        with os_errors("cannot write the bundle", target), fill(target) as temporary:
+            _write_episodes(storage, benchmark_id, headers, temporary, attachments)
+            if sign is not None:
+                sign_recording(temporary, sign)
+
+    anew(attempt)
+    return target
+
+
+def export_episodes(storage: FileStorage, target: Path, filter: BaseFilter | None = None) -> Path:
+    """Write the episodes that match a filter into the new recording `target`, without artifacts.
+
+    Raises:
+        StorageError: There are none, they are of several benchmarks, or the file exists or cannot be written.
+    """
+    _refuse_existing(target)
+    headers = storage.list_episodes(filter)
+    benchmarks = sorted({header.benchmark_id for header in headers})
+    if len(benchmarks) != 1:
+        raise StorageError(
+            "expected episodes of one benchmark to export, "
+            f"found {len(headers)} episodes of {len(benchmarks)}: "
+            f"{', '.join(benchmarks)[:300] or 'nothing matches'}"
+        )
+    with os_errors("cannot export", target), fill(target) as temporary:
+        _write_episodes(storage, benchmarks[0], headers, temporary, None)
+    return target
+
+
+def bundle_recording(
+    path: Path, target: Path, storage: FileStorage | None = None, sign: SigningKey | None = None
+) -> Path:
+    """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
+
+    A recording that was made outside a storage gets a benchmark: its environment, under the name that it has.
+
+    sign: the key to sign it with; without it, a signature stays where nothing it covers changes.
+
+    storage: has what the recording lacks; None if it lacks nothing, as a bundle or a recording of a plain
+    environment does.
+
+    Raises:
+        NotFoundError: The storage does not know the recording's benchmark.
+        StorageError: The recording carries no environment; something is missing and no storage given; or the file
+            exists or cannot be written.
+    """
+    _refuse_existing(target)
+    notes = Notes.read(path)
+    with Recording(path) as recording:
+        deleted = notes.about(recording.metadata).deleted
+        attachments: Attachments = {}
+        benchmark_id = recording.benchmark_id
+        if benchmark_id:
+            record = recording.benchmark.record if DOCUMENT_NAME in recording.attachments else None
+            named = () if record is None else artifacts_of(record, str(path))
+            if record is None or any(ARTIFACT_PREFIX + uri not in recording.attachments for uri in named):
+                if storage is None:
+                    raise StorageError(
+                        f"{str(path)!r} lacks artifacts of its benchmark {recording.benchmark_id}; "
+                        "name the storage that has them"
+                    )
+                attachments = _attachments(storage, recording.benchmark_id)
+        else:
+            benchmark_id, attachments = _own_benchmark(recording, path)
+        kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
+        with os_errors("cannot write the bundle", target), fill(target) as temporary:
+            chosen = kept if len(kept) < len(recording) else None
+            rewrite_recording(
+                recording, temporary, episodes=chosen, attachments=attachments, benchmark_id=benchmark_id
+            )
+            if sign is not None:
+                sign_recording(temporary, sign)
+    return target
+
+
+def _own_benchmark(recording: Recording, path: Path) -> tuple[str, Attachments]:
+    """The id of a benchmark that is a recording's environment and nothing else, and what a file carries of it."""
+    record = carried_environment(recording, path)
+    spaces = {"observation_space": recording.observation_space, "action_space": recording.action_space}
+    facts = {name: space_to_json(space) for name, space in spaces.items()}
+    metadata = BenchmarkMetadata(name=record.name)
+    uri = benchmark_hash(unpack(pack(record)), metadata)
+    header = BenchmarkHeader.create_new(id=uri, hash=uri, metadata=metadata, created_by=LOCAL_USER)
+    document = record.to_json({**facts, "artifacts": [], **benchmark_entry(header)})
+    return uri, {DOCUMENT_NAME: ("application/json", document)}
+
+
+def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
+    benchmark = storage.load_benchmark(benchmark_id)
+    try:
+        content = unpack(benchmark.serialized)
+    except FormatError as err:
+        raise StorageError(f"benchmark {benchmark_id} holds no environment that a bundle can carry") from err
+    items = {uri: storage.list_artifacts(FilterEQ(key="id", value=uri)) for uri in content.artifacts}
+    entry = {
+        **(content.record.benchmark or {}),
+        "artifact_metadata": {uri: plain(listed[0]) for uri, listed in items.items() if listed},
+    }
+    attachments = {DOCUMENT_NAME: ("application/json", content.record.to_json(entry))}
+    if content.record.pickle is not None:
+        attachments[PICKLE_NAME] = ("application/octet-stream", content.record.pickle)
+    for uri in content.artifacts:
+        attachments[ARTIFACT_PREFIX + uri] = ("application/octet-stream", storage.load_artifact(uri))
+    return attachments
+
+
+def _refuse_existing(target: Path) -> None:
+    if target.exists():
+        raise StorageError(f"{str(target)!r} exists and is not overwritten; choose another path or delete it")
+
+
+def _write_episodes(
+    storage: FileStorage,
+    benchmark_id: str,
+    headers: Sequence[EpisodeHeader],
+    target: Path,
+    attachments: Attachments | None,
+) -> None:
+    names = sorted({header.recording for header in headers})
+    if len(names) == 1:
+        with storage.open_recording(names[0]) as recording:
+            numbers = [header.episode for header in headers]
+            rewrite_recording(
+                recording, target, episodes=numbers, attachments=attachments, benchmark_id=benchmark_id
+            )
+        return
+    reward_space = None
+    drawn = False
+    for name in names:
+        with storage.open_recording(name) as recording:
+            drawn = drawn or CAMERA in recording.cameras
+    if names:
+        with storage.open_recording(names[0]) as recording:
+            spaces = [recording.observation_space, recording.action_space]
+            reward_space = recording.layout.reward_space
+            attachments = attachments or _carried(recording)
+    else:
+        spaces = declared_spaces(storage.load_benchmark(benchmark_id).serialized)
+        if not spaces:
+            raise StorageError(f"benchmark {benchmark_id} has no episodes, and its spaces are not known")
+    try:
+        write_recording(
+            target,
+            _episodes(storage, headers),
+            observation_space=spaces[0],
+            action_space=spaces[1],
+            reward_space=reward_space,
+            benchmark_id=benchmark_id,
+            attachments=attachments,
+            frames=drawn,
+        )
+    except StepError as err:
+        raise StorageError(
+            f"the recordings of benchmark {benchmark_id} differ in what they hold, so that one file cannot "
+            f"take them all ({err}); use a filter on `recording`"
+        ) from err
+
+
+def _carried(recording: Recording) -> Attachments:
+    """What a recording carries, without its signature, which is of its own episodes only."""
+    return {
+        name: (info.media_type, recording.read_attachment(name))
+        for name, info in recording.attachments.items()
+        if name != SIGNATURE_NAME
+    }
+
+
+def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
+    """The episodes of several recordings as values, one recording open at a time."""
+    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
+        with storage.open_recording(name) as recording:
+            positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
+            for header in group:
+                if header.episode not in positions:
+                    raise NotFoundError(f"episode {header.id} was deleted meanwhile")
+                episode = recording.episodes[positions[header.episode]]
+                steps = list(episode)
+                yield EpisodeData(
+                    states=[step.state for step in steps],
+                    actions=[step.action for step in steps],
+                    rewards=[step.reward for step in steps],
+                    terminals=[step.terminal for step in steps],
+                    timeouts=[step.timeout for step in steps],
+                    final_state=episode.final_state,
+                    seed=episode.seed,
+                    options=episode.options,
+                    metadata=episode.metadata,
+                    infos=None if episode.infos is None else [info or {} for info in episode.infos],
+                    end=episode.end,
+                    frames=_frames(recording, positions[header.episode]),
+                )
+
+
+def _frames(recording: Recording, position: int) -> list[tuple[int, EncodedFrame]]:
+    if CAMERA not in recording.cameras:
+        return []
+    frames = recording.frames(position, CAMERA)
+    return [(step, frames.encoded(i)) for i, step in enumerate(frames.steps.tolist())]

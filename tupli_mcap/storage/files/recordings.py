@@ -1,0 +1,307 @@
+"""Recordings in a directory: their paths, and what is noted, deleted and freed of their episodes."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import re
+import secrets
+import stat
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+from tupli_mcap import files
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.mcap.lock import is_locked, writers_kept_out
+from tupli_mcap.recording import Recording, journal_path, rewrite_recording
+from tupli_mcap.recording.recover.prefix import metadata_at
+from tupli_mcap.schema import EpisodeHeader, FilterEQ
+from tupli_mcap.storage.atomic import Lock, os_errors
+from tupli_mcap.storage.base import LOCAL_USER, episode_id, published_in
+from tupli_mcap.storage.files.sync import SyncedCatalog
+from tupli_mcap.storage.listing import scan
+from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
+
+__all__ = ["RecordingFiles"]
+
+_OLD_CATALOG = [f"catalog.sqlite{end}" for end in ("", "-wal", "-shm", "-journal", ".lock", ".new")]
+
+_EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
+
+
+class RecordingFiles:
+    """The recordings below a storage's root: where they lie, and what is changed of their episodes.
+
+    Several processes may record, publish and delete at once. The next question to the catalog notices.
+    """
+
+    def __init__(self, root: Path, lock: Lock, catalog: SyncedCatalog) -> None:
+        self._root = root
+        self._lock = lock
+        self._catalog = catalog
+
+    def new_path(self, benchmark_id: str, name: str) -> Path:
+        """A path below the benchmark's directory that nobody else is given: time (UTC), name and random digits."""
+        directory = self._root / "recordings" / benchmark_id
+        with os_errors("cannot make the directory", directory):
+            directory.mkdir(parents=True, exist_ok=True)
+        now = datetime.datetime.now(datetime.UTC)
+        named = f"{files.as_file_name(name)}-" if name else ""
+        return directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+
+    def path(self, recording: str) -> Path:
+        """The file of a catalogued recording.
+
+        Raises:
+            NotFoundError: It is not one, or not below the root.
+        """
+        if not isinstance(recording, str):
+            raise NotFoundError(
+                f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
+            )
+        path = self._root / recording
+        relative = Path(recording)
+        inside = recording.endswith(".mcap") and not relative.is_absolute() and ".." not in relative.parts
+        if not inside or not _is_file(path):
+            raise NotFoundError(f"there is no recording {recording[:200]!r} in {str(self._root)!r}")
+        return path
+
+    def live(self, benchmark_id: str) -> list[Path]:
+        """The recordings of a benchmark that are being written."""
+        found = []
+        for item in sorted(scan(self._root)):
+            path = self._root / item.relative
+            if is_locked(path):
+                with contextlib.suppress(RecordingError, FormatError), Recording(path) as recording:
+                    if recording.benchmark_id == benchmark_id:
+                        found.append(path)
+        return found
+
+    def of_recording(self, path: Path) -> list[EpisodeHeader]:
+        """The episodes of a recording that has just been ingested, without a look at the others."""
+        wanted = FilterEQ(key="recording", value=path.relative_to(self._root).as_posix())
+        return self._catalog.known(wanted) or self._catalog.headers(wanted)
+
+    def header(self, uri: str) -> EpisodeHeader:
+        """The header of an episode.
+
+        Raises:
+            NotFoundError: There is no such episode.
+        """
+        match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
+        if match:
+            # What the catalog knows already may be out of date in all but where the episode is.
+            found = self._catalog.known(FilterEQ(key="id", value=uri), limit=1)
+            if found and self._holds(found[0]):
+                return found[0]
+            found = self._catalog.headers(FilterEQ(key="id", value=uri), limit=1)
+            if found:
+                return found[0]
+        raise NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
+
+    def _holds(self, header: EpisodeHeader) -> bool:
+        path = self._root / header.recording
+        notes = Notes.read(path, self._root)
+        with contextlib.suppress(RecordingError, FormatError):  # gone, or damaged
+            metadata = metadata_at(path)
+            return metadata["uuid"] == _uuid(header) and header.episode not in notes.about(metadata).deleted
+        return False
+
+    def ingest(self, path: Path) -> None:
+        """Catalogue one recording; a finished one without episodes is removed instead.
+
+        Raises:
+            StorageError: It is not below the root.
+            FormatError: It is damaged.
+        """
+        try:
+            relative = path.resolve().relative_to(self._root.resolve()).as_posix()
+        except ValueError as err:
+            raise StorageError(
+                f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
+            ) from err
+
+        with self._lock:
+            # without a step, or deleted since: the next query notices
+            if path.exists() and self._catalog.put(relative) == 0:
+                self._remove(path)
+
+    def publish(self, header: EpisodeHeader, group: str) -> None:
+        with self._lock:
+            path = self.path(header.recording)
+            sidecar = Notes.read(path, self._root).about(metadata_at(path))
+            if sidecar.uuid != _uuid(header):
+                raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
+            groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
+            sidecar.published_in[header.episode] = published_in(groups, group)
+            sidecar.write(path)  # the next query notices
+
+    def delete(self, headers: Sequence[EpisodeHeader]) -> int:
+        """Delete episodes, all of them or none: by notes beside their recordings, or with these where nothing else is
+        left in them.
+
+        Returns how many there still were.
+        """
+        by_recording: dict[tuple[str, str], set[int]] = {}
+        for header in headers:
+            by_recording.setdefault((header.recording, _uuid(header)), set()).add(header.episode)
+        with self._lock:
+            self._finish_deletion()
+            doomed: dict[str, Sidecar] = {}
+            for (relative, uuid), numbers in by_recording.items():
+                with contextlib.suppress(NotFoundError):  # somebody else was first
+                    left = self._left(self.path(relative), uuid) & numbers
+                    if left:
+                        doomed[relative] = Sidecar(uuid=uuid, deleted=left)
+            if len(doomed) > 1:
+                Deletion(
+                    deleted={relative: note.deleted for relative, note in doomed.items()},
+                    uuids={relative: note.uuid for relative, note in doomed.items()},
+                ).write(self._root)
+            self._do_deletion(doomed)
+        return sum(len(note.deleted) for note in doomed.values())
+
+    def deleted(self) -> list[str]:
+        """The ids of the episodes that are deleted and still in their recordings."""
+        found = []
+        for item in sorted(scan(self._root)):
+            notes = Notes.read(self._root / item.relative, self._root)
+            if notes.deleted:
+                with Recording(self._root / item.relative) as recording:
+                    numbers = notes.about(recording.metadata).deleted & set(
+                        recording.index["episode"].tolist()
+                    )
+                    found += [episode_id(recording.uuid, number) for number in sorted(numbers)]
+        return found
+
+    def restore(self, ids: Collection[str]) -> int:
+        """Take back what is noted of deleted episodes; returns how many there were."""
+        restored = 0
+        with self._lock:
+            self._finish_deletion()
+            for item in sorted(scan(self._root)):
+                path = self._root / item.relative
+                notes = Notes.read(path, self._root)
+                if notes.deleted:
+                    sidecar = notes.about(metadata_at(path))
+                    back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
+                    if back:
+                        sidecar.deleted -= back
+                        sidecar.write(path)  # the next query notices
+                        restored += len(back)
+        return restored
+
+    def _finish_deletion(self) -> None:
+        """Do what is left of a deletion that was broken off; only recordings that are listed are touched."""
+        deletion = Deletion.read(self._root)
+        if deletion.deleted:
+            listed = {item.relative for item in scan(self._root)}
+            self._do_deletion(
+                {relative: deletion.of(relative) for relative in deletion.deleted.keys() & listed}
+            )
+
+    def _do_deletion(self, deleted: Mapping[str, Sidecar]) -> None:
+        for relative, note in deleted.items():
+            path = self._root / relative
+            try:
+                metadata = metadata_at(path)
+            except FormatError:  # no more is known of it; a repair may need its note
+                metadata = {"uuid": note.uuid}
+            if not note.is_about(metadata):  # replaced since
+                continue
+            sidecar = Notes.read(path, self._root).about(metadata)
+            sidecar.deleted |= note.deleted
+            # first the note: a crash, or a writer that goes on with the file, must not bring anything back
+            sidecar.write(path)  # the next query notices
+            with contextlib.suppress(FormatError, RecordingError):  # damaged: its note is enough
+                if not self._left(path):
+                    self._remove(path)
+        Deletion().write(self._root)
+
+    def _left(self, path: Path, uuid: str | None = None) -> set[int]:
+        """The numbers of the episodes of a recording that are not deleted; none of another one than that of `uuid`."""
+        notes = Notes.read(path, self._root)
+        with Recording(path) as recording:
+            if uuid not in (None, recording.uuid):
+                return set()
+            deleted = notes.about(recording.metadata).deleted
+            return {int(number) for number in recording.index["episode"]} - deleted
+
+    def _remove(self, path: Path) -> None:
+        """Delete a recording, unless somebody is writing to it; the next query notices."""
+        try:
+            with writers_kept_out(path), os_errors("cannot delete the recording", path):
+                if self._left(path):  # somebody has written to it meanwhile
+                    return
+                for gone in (path, journal_path(path), sidecar_path(path)):
+                    gone.unlink(missing_ok=True)
+        except RecordingError:
+            return
+        self.remove_directory(path.parent)
+
+    def remove_directory(self, directory: Path) -> None:
+        """Remove the directory of a benchmark's recordings if it is empty and the benchmark gone.
+
+        While there is one, somebody may be about to record to it.
+        """
+        if directory.parent != self._root / "recordings":
+            return
+        if not (self._root / "benchmarks" / f"{directory.name}.json").exists():
+            with contextlib.suppress(OSError):  # not empty
+                directory.rmdir()
+
+    def compact(self) -> int:
+        """Rewrite the recordings that hold deleted episodes, and remove the temporary files of killed processes;
+        returns how many bytes that freed.
+
+        Those that are being written are left alone. Episodes that stay keep their ids.
+        """
+        freed = files.remove_left(files.left_below(self._root))
+        with self._lock:
+            self._finish_deletion()
+        for name in _OLD_CATALOG:  # earlier versions kept it here; it is opened no more
+            with contextlib.suppress(OSError):
+                (self._root / name).unlink()
+        for item in sorted(scan(self._root)):
+            path = self._root / item.relative
+            with self._lock:
+                if not path.exists() or not Notes.read(path, self._root).deleted:
+                    continue
+                try:
+                    with writers_kept_out(path):  # nobody appends meanwhile
+                        freed += self._compact(path)
+                except RecordingError:
+                    if path.exists() and not is_locked(path):
+                        raise
+                    continue
+                self.ingest(path)
+        return freed
+
+    def _compact(self, path: Path) -> int:
+        notes = Notes.read(path, self._root)
+        before = path.stat().st_size
+        with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
+            sidecar = notes.about(recording.metadata)
+            if sidecar.deleted:
+                kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
+                rewrite_recording(recording, path, episodes=kept)
+                journal_path(path).unlink(missing_ok=True)
+                groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
+                sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
+        sidecar.write(path)
+        return before - path.stat().st_size
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except OSError as err:
+        if err.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP):
+            return False
+        raise
+
+
+def _uuid(header: EpisodeHeader) -> str:
+    """The UUID of an episode's recording."""
+    return header.id.rpartition("-")[0]

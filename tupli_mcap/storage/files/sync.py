@@ -1,0 +1,295 @@
+"""The catalog of a directory, brought up to date with its recordings before each question."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import functools
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from sqlalchemy import Connection
+
+from tupli_mcap.errors import FormatError, RecordingError, StorageError
+from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.progress import progress
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.base import episode_id
+from tupli_mcap.storage.catalog.catalog import (
+    Catalog,
+    CatalogDamagedError,
+    CatalogMovedError,
+    CatalogUnusableError,
+    RecordingStamp,
+)
+from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
+from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.listing import LIVE, scan, stamp_of
+
+__all__ = ["SyncedCatalog"]
+
+_T = TypeVar("_T")
+_ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
+
+_RESTLESS = f"the catalog of {{!r}} was replaced during each of {_ATTEMPTS} attempts; try again later"
+
+_TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
+
+
+class SyncedCatalog:
+    """What the catalog knows of the recordings below a storage's root. Several processes may ask and record at once.
+
+    The files are the truth. Before each question the catalog is brought up to date with those that have
+    appeared, changed (by size, time stamps and inode) or gone; recordings that are being written are read anew each
+    time. The catalog lies in this user's cache directory, or in memory: a question writes nothing below the root.
+    """
+
+    def __init__(self, root: Path, declared_keys: Iterable[str]) -> None:
+        self._root = root
+        self._declared_keys = list(declared_keys)
+        self._opened: Catalog | None = None
+        self._synced = -1  # the catalog that has been brought up to date
+        self._undeclared = True  # its keys are still to be declared
+        self._warned: set[tuple[str, RecordingStamp]] = set()
+        self.skipped: dict[str, str] = {}
+        """Recordings that are not listed, and why, as of the last question."""
+
+    def close(self) -> None:
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    def known(self, filter: BaseFilter, *, limit: int | None = None) -> list[EpisodeHeader]:
+        """What the catalog knows already, without a look at the files; it may be out of date, or nothing."""
+        with contextlib.suppress(*_TROUBLE):
+            return self._catalog.episodes(filter, limit=limit)
+        return []
+
+    def headers(
+        self, filter: BaseFilter | None, *, limit: int | None = None, offset: int = 0
+    ) -> list[EpisodeHeader]:
+        return self._settled(lambda: self._catalog.episodes(filter, limit=limit, offset=offset))
+
+    def count(self, filter: BaseFilter | None) -> int:
+        return self._settled(lambda: self._catalog.count(filter))
+
+    def ask(self, question: Callable[[Connection], _T]) -> _T:
+        """What a question finds in the tables of the catalog, which is up to date."""
+        return self._settled(lambda: self._catalog.ask(question))
+
+    def explain(self, filter: BaseFilter | None) -> str:
+        def ask() -> str:
+            self._declare_keys()
+            return self._catalog.explain(filter)
+
+        return self._with_usable_catalog(ask)
+
+    def declare_key(self, key: str) -> None:
+        self._with_usable_catalog(lambda: self._catalog.declare_key(key))
+        if key not in self._declared_keys:
+            self._declared_keys.append(key)
+
+    def reindex(self) -> None:
+        """Empty the catalog and fill it from the files."""
+
+        def make() -> None:
+            with self._catalog.alone():  # nobody sees half of it
+                self._catalog.reset()
+                self._warned.clear()
+                self._sync()
+
+        self._with_usable_catalog(make)
+
+    def put(self, relative: str) -> int:
+        """Catalogue one recording; returns how many episodes it holds, -1 where nobody can know yet.
+
+        Raises:
+            FormatError: It is damaged.
+        """
+
+        def put() -> int:
+            alone = self._catalog.alone()
+            with alone, contextlib.suppress(CatalogMovedError), entry_of(self._root, relative) as entry:
+                return self._put(relative, entry)
+            return -1  # the next question fills the new one
+
+        return self._with_usable_catalog(put)
+
+    def _settled(self, ask: Callable[[], _T]) -> _T:
+        """Asks a catalog that is up to date, again if somebody has replaced it meanwhile."""
+
+        def settle() -> _T:
+            for _ in range(_ATTEMPTS):
+                self._sync()
+                with contextlib.suppress(CatalogMovedError):
+                    found = ask()
+                    if self._catalog.identity == self._synced and self._catalog.is_current():
+                        return found
+            raise StorageError(_RESTLESS.format(str(self._root)))
+
+        return self._with_usable_catalog(settle)
+
+    def _with_usable_catalog(self, work: Callable[[], _T]) -> _T:
+        """What `work` returns, done again where the catalog fails: with a new one if it is damaged, then in memory."""
+        try:
+            try:
+                return work()
+            except CatalogDamagedError:
+                self._catalog.reset()
+                return work()
+        except (CatalogDamagedError, CatalogUnusableError) as err:
+            self._use_memory(err)
+            return work()
+
+    @property
+    def _catalog(self) -> Catalog:
+        if self._opened is None:
+            if not self._root.is_dir():
+                return self._empty
+            try:
+                with os_errors("no catalog can be kept in", cache_dir()):
+                    path = catalog_path(self._root)
+                self._opened = Catalog(path)
+            except StorageError as err:
+                return self._use_memory(err)
+        return self._opened
+
+    @functools.cached_property
+    def _empty(self) -> Catalog:
+        """What is listed before the first write makes the directory: nothing."""
+        return Catalog(None)
+
+    def _use_memory(self, err: StorageError) -> Catalog:
+        """Go on with a catalog in memory: what is recorded can be listed even where nothing can be written."""
+        advice = "TUPLI_MCAP_CACHE_DIR names another place; meanwhile the catalog is made in memory"
+        warnings.warn(f"{err}; {advice}", stacklevel=7)
+        self.close()
+        self._opened = Catalog(None)
+        return self._opened
+
+    def _declare_keys(self) -> None:
+        """Declares the keys in a catalog that was opened or made anew, perhaps by another process.
+
+        Done once its rows are in it: making an index of them is quicker than adding each to one.
+        """
+        if self._undeclared:
+            for key in self._declared_keys:
+                self._catalog.declare_key(key)
+            self._undeclared = False
+
+    def _sync(self) -> None:
+        """Bring the catalog up to date with the files."""
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(CatalogMovedError):
+                if self._sync_once():
+                    return
+        raise StorageError(_RESTLESS.format(str(self._root)))
+
+    def _sync_once(self) -> bool:
+        """False if the catalog was replaced meanwhile."""
+        self.skipped = {}  # they are no part of the catalog, and so are met again
+        if not self._changes():
+            self._declare_keys()
+            return True
+        with self._catalog.alone():
+            self._follow(self._changes())
+            self._declare_keys()
+            return self._catalog.identity == self._synced
+
+    def _follow(self, changes: Mapping[str, Path | None]) -> None:
+        """Brings what has changed into the catalog."""
+        present = [relative for relative, path in changes.items() if path is not None]
+        with (
+            progress(len(changes), "Cataloguing recordings") as bar,
+            contextlib.closing(read_ahead(self._root, present)) as entries,
+        ):
+            for relative, path in changes.items():
+                if path is None:
+                    self._catalog.remove_recording(relative)
+                else:
+                    self._try_to_put(relative, next(entries))
+                bar.advance(1)
+
+    def _changes(self) -> dict[str, Path | None]:
+        """Recordings that the catalog does not know as they are; None for those that are gone.
+
+        The latter come first: a file that was moved is no copy of itself.
+        """
+        catalogued = self._catalog.recordings()
+        if self._catalog.identity != self._synced:
+            self._synced = self._catalog.identity
+            self._undeclared = True
+        if catalogued:
+            self._declare_keys()
+        with os_errors("cannot list the recordings below", self._root):
+            listed = sorted(scan(self._root))
+        changes: dict[str, Path | None] = dict.fromkeys(
+            catalogued.keys() - {item.relative for item in listed}
+        )
+        for item in listed:
+            path = self._root / item.relative
+            # What a live writer's journal holds is in no time stamp.
+            if catalogued.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
+                changes[item.relative] = path
+        return changes
+
+    def _try_to_put(self, relative: str, entry: Entry | None) -> None:
+        """Catalogue a recording by its entry, or else read it here."""
+        stamp = RecordingStamp(0, 0, 0)
+        try:
+            if entry is None:
+                stamp = stamp_of(self._root, relative)
+                with entry_of(self._root, relative) as entry:
+                    self._put(relative, entry)
+            else:
+                self._put(relative, entry)
+        except FileNotFoundError:
+            self._catalog.remove_recording(relative)
+        except (FormatError, RecordingError, OSError) as err:
+            if _is_exhausted(err):
+                raise StorageError(f"cannot list the recordings below {str(self._root)!r}: {err}") from err
+            self._catalog.remove_recording(relative)
+            self._skip(relative, stamp, str(err))
+
+    def _skip(self, relative: str, stamp: RecordingStamp, why: str) -> None:
+        self.skipped[relative] = why
+        if (relative, stamp) not in self._warned:
+            self._warned.add((relative, stamp))
+            warnings.warn(f"skipped a recording: {why}", stacklevel=6)
+
+    def _put(self, relative: str, entry: Entry) -> int:
+        """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
+        if not self._is_copy(relative, entry):
+            self._catalog.put_recording(
+                relative,
+                entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
+                uuid=entry.uuid,
+                benchmark_id=entry.benchmark_id,
+                runs=entry.runs,
+                rows=entry.rows,
+            )
+        return len(entry.numbers)
+
+    def _is_copy(self, relative: str, entry: Entry) -> bool:
+        """Whether another recording holds the first or the last episode of this one, which then is left out."""
+        if not self._catalog.copies(relative, entry.uuid):
+            return False
+        for number in {*entry.numbers[:1], *entry.numbers[-1:]}:
+            for header in self._catalog.episodes(FilterEQ(key="id", value=episode_id(entry.uuid, number))):
+                if header.recording != relative:
+                    self._catalog.remove_recording(relative)
+                    path, original = self._root / relative, f"holds episodes of {header.recording} again"
+                    advice = "that one is listed, whatever they hold; verify both, and delete one"
+                    self._skip(relative, entry.stamp, f"{path} {original}; {advice}")
+                    return True
+        return False
+
+
+def _is_exhausted(err: BaseException | None) -> bool:
+    """Whether the process has too many open files or no memory: no fault of the recording that met it."""
+    while err is not None and not isinstance(err, OSError):
+        err = err.__cause__
+    return err is not None and err.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
