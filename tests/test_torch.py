@@ -106,11 +106,21 @@ def test_samples_of_a_batch_are_views_that_pytorch_collates(name: str, tmp_path:
     windows = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES[name], 50)).windows(3)
     samples = MapDataset(windows).__getitems__([4, 2, 9])
     batch = collate(samples)
-    assert batch is samples.batch
+    assert batch["rewards"] is samples.batch["rewards"]
     assert samples[1]["rewards"].data_ptr() == batch["rewards"][1].data_ptr()
     collated = default_collate(samples)
     assert torch.equal(collated["rewards"], batch["rewards"])
     assert [sample["steps"].item() for sample in samples] == batch["steps"].tolist()
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_a_loader_takes_items_as_they_are(num_workers: int, tmp_path: Path) -> None:
+    dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["box"], 50))
+    for items in (dataset.windows(3), dataset.transitions(), dataset.delta_windows({"state": [-1, 0]})):
+        for collate_fn in (None, collate):
+            loader = DataLoader(items, batch_size=16, num_workers=num_workers, collate_fn=collate_fn)
+            for i, batch in enumerate(loader):
+                assert same(as_numpy(batch), items[i * 16 : (i + 1) * 16].asdict())
 
 
 def test_tensors_keep_the_dtypes_that_were_recorded(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
 from tupli_mcap.dataset.items.index import ListedEpisodes
 from tupli_mcap.dataset.items.infos import info_columns
-from tupli_mcap.dataset.items.items import Items
+from tupli_mcap.dataset.items.items import Items, Samples
 from tupli_mcap.dataset.items.order import Numbers, Order
 from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
 from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps, checked_fields
@@ -40,6 +40,7 @@ __all__ = [
     "Pad",
     "RecordedSteps",
     "Sampler",
+    "Samples",
     "SamplingError",
     "Steps",
     "StepsWith",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from tupli_mcap.schema import BaseFilter, F
 __all__ = [
     "Items",
     "Parts",
+    "Samples",
     "StepItems",
 ]
 
@@ -35,6 +36,31 @@ class Parts(SaysWhatIsMeant):
     def asdict(self) -> dict[str, Any]:
         """What there is, by name, without what was not asked for."""
         return {name: value for name, value in vars(self).items() if value is not None}
+
+
+class Samples(Sequence[dict[str, Any]]):
+    """A batch that has been read at once: `batch` (columns of `len` samples), and the samples one by one, as views."""
+
+    def __init__(self, batch: dict[str, Any], size: int) -> None:
+        self.batch = batch
+        self._size = size
+
+    def __len__(self) -> int:
+        return self._size
+
+    @overload
+    def __getitem__(self, i: int) -> dict[str, Any]: ...
+    @overload
+    def __getitem__(self, i: slice) -> list[dict[str, Any]]: ...
+    def __getitem__(self, i: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
+        if isinstance(i, slice):
+            return [self[k] for k in range(*i.indices(self._size))]
+        if not -self._size <= i < self._size:
+            raise IndexError(f"expected a sample from 0 to {self._size - 1}, found {i}")
+        return {name: _sample(column, i) for name, column in self.batch.items()}
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (self[i] for i in range(self._size))
 
 
 class Items(ABC, Generic[T]):
@@ -94,6 +120,12 @@ class Items(ABC, Generic[T]):
 
     def __iter__(self) -> Iterator[T]:
         return map(self._one, range(len(self)))
+
+    def __getitems__(self, indices: Sequence[int]) -> Samples:
+        """The items of a batch, as a PyTorch `DataLoader` asks for them: read together, and dicts, which its own
+        collate function understands."""
+        chosen = self._batch(np.asarray(indices, np.int64))
+        return Samples(chosen.asdict(), len(indices))
 
     # ---- in batches
 
@@ -183,3 +215,11 @@ class StepItems(Items[T]):
     def _episodes(self, steps: Array) -> Array:
         """The places of the steps' episodes in the query."""
         return self._episode_ends.searchsorted(steps, side="right")
+
+
+def _sample(column: Any, i: int) -> Any:
+    if isinstance(column, Mapping):
+        return {key: _sample(part, i) for key, part in column.items()}
+    if isinstance(column, tuple):
+        return tuple(_sample(part, i) for part in column)
+    return column[i]
