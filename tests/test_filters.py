@@ -24,6 +24,7 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     F,
     FilterAND,
+    FilterCONTAINS,
     FilterEQ,
     FilterGEQ,
     FilterGT,
@@ -109,6 +110,8 @@ TEXTS = [
     "é",
     "\U0001f600",
     "'\"\\",
+    "100%_k/",
+    "\u212a\u00df\u00c9s",
 ]
 others = st.integers(-3, 3) | st.floats() | st.integers()
 numbers = st.sampled_from(NUMBERS) | others
@@ -170,8 +173,15 @@ FACTS: dict[str, st.SearchStrategy[Any]] = {
     "published_in": texts | st.just("me"),
 }
 """What each key that is no metadata may be compared with."""
+fragments = texts | st.sampled_from(
+    ["E", "B", "%", "_", "/", "0%", "k", "ss", "-0", "R.MCAP", "'\"", '"$', "a" * 2000]
+)
+"""What may occur in a text. Python's small letter of U+212A, the sign for kelvins, is k, and ß is ss to it."""
 ORDERED = (FilterEQ, FilterNE, FilterGT, FilterGEQ, FilterLT, FilterLEQ)
-operations = st.sampled_from([FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ])
+operations = st.sampled_from(
+    [FilterEQ, FilterNE, FilterIN, FilterGT, FilterGEQ, FilterLT, FilterLEQ, FilterCONTAINS]
+)
+TEXT_FACTS = ("id", "created_by", "benchmark_id", "recording", "published_in")
 
 
 @st.composite
@@ -179,6 +189,10 @@ def leaves(draw: st.DrawFn) -> BaseFilter:
     kind = draw(operations)
     key = draw(metadata_keys | st.sampled_from(sorted(FACTS)))
     given = FACTS.get(key, wanted | own_texts)
+    if kind is FilterCONTAINS and key in FACTS and key not in TEXT_FACTS:
+        kind = FilterEQ
+    if kind is FilterCONTAINS:
+        return FilterCONTAINS(key=key, value=draw(fragments))
     if kind is FilterIN:
         return FilterIN(key=key, value=draw(st.lists(given, max_size=20)))
     if kind not in (FilterEQ, FilterNE):
@@ -208,7 +222,7 @@ rows = st.fixed_dictionaries(
         "end": st.sampled_from(["terminal", "timeout", "interrupted"]),
         "episode_return": st.none() | st.floats() | st.sampled_from([0.0, 1.0, 2.0**63]),
         "seed": st.none() | st.integers(0, 3) | st.integers(-(2**130), 2**130),
-        "created_by": st.sampled_from(["me", "you", "a\x00", "\ud800"]),
+        "created_by": st.sampled_from(["me", "you", "Mo\u212a%", "a\x00", "\ud800"]),
         "created_at": st.sampled_from(MOMENTS),
     }
 )
@@ -296,6 +310,14 @@ class TestOneMeaning:
             ]
             assert catalog.count(again) == len(expected)
 
+    @pytest.mark.parametrize("key", ["created_by", "recording", "benchmark_id", "metadata.a"])
+    def test_sql_looks_for_a_part_of_a_text(self, catalogs: list[Catalog | ServerCatalog], key: str) -> None:
+        headers = [header_of(0, base_row({"a": "Bx%"}, 0))]
+        for catalog in catalogs[::2]:
+            fill(catalog, headers)
+            plan = catalog.explain(F(key).contains("%'; --"))
+            assert "lower(" in plan and "LIKE" in plan and "/%'; --" in plan
+
     @settings(max_examples=300, deadline=None)
     @given(
         key=st.sampled_from([*FACTS, "metadata", "end.x", "n_tuples.x"]),
@@ -382,6 +404,12 @@ class TestTimes:
             ("YESTERDAY", "2026-11-19T23:00:00", 86_400),
             ("last tuesday", "2026-11-16T23:00:00", 86_400),
             ("Saturday", "2026-11-13T23:00:00", 86_400),
+            ("this week", "2026-11-15T23:00:00", 7 * 86_400),
+            ("Last  week", "2026-11-08T23:00:00", 7 * 86_400),
+            ("this month", "2026-10-31T23:00:00", 30 * 86_400),
+            ("last month", "2026-09-30T22:00:00", 31 * 86_400 + 3600),
+            ("this year", "2025-12-31T23:00:00", 365 * 86_400),
+            ("last year", "2024-12-31T23:00:00", 365 * 86_400),
             ("7d ago", "2026-11-14T08:00:00", 1e-6),
             ("2 W ago", "2026-11-07T08:00:00", 1e-6),
             ("3h ago", "2026-11-21T05:00:00", 1e-6),
@@ -393,6 +421,19 @@ class TestTimes:
         found = span_of(value, datetime.datetime.fromisoformat("2026-11-21T09:00:00+01:00"))
         assert found.start == time_ns(first)
         assert found.stop - found.start == round(length * 10**9)
+
+    @pytest.mark.parametrize(
+        "day", [datetime.date(2024, 1, 1), datetime.date(2024, 2, 29), datetime.date(2026, 12, 31)]
+    )
+    @pytest.mark.parametrize("unit", ["week", "month", "year"])
+    def test_this_one_follows_the_last_and_holds_today(self, unit: str, day: datetime.date) -> None:
+        now = datetime.datetime.combine(day, datetime.time(23, 59)).astimezone()
+        last, this = span_of(f"last {unit}", now), span_of(f"this {unit}", now)
+        assert last.stop == this.start <= now.timestamp() * 10**9 < this.stop
+        begin, end = (datetime.datetime.fromtimestamp(ns / 10**9) for ns in this)
+        assert (begin.time(), end.time()) == (datetime.time(), datetime.time())
+        place = {"week": (begin.weekday(), end.weekday()), "month": (begin.day, end.day)}
+        assert place.get(unit, (begin.timetuple().tm_yday, end.timetuple().tm_yday)) in ((0, 0), (1, 1))
 
     def test_what_a_table_shows_is_what_is_found(self) -> None:
         created_at = "2026-11-21T08:30:05.999999+00:00"
@@ -499,6 +540,8 @@ class TestTimes:
                 F("end") > "terminal",
                 r"'end' has no order: expected ==, != or in, found F\(.end.\) > 'terminal'",
             ),
+            (F("n_tuples").contains("1"), "'n_tuples' is a whole number: expected such a value, found '1'"),
+            (F("ended").contains("2026"), "'ended' is a time, in which no text occurs: expected one of = !="),
             (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
             (F("published_in") == 3, "'published_in' is a text: expected such a value, found 3"),
             (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),
@@ -550,6 +593,7 @@ ITEM = {
         "big": 2**53 + 1,
         "nan": math.nan,
         "t": "b",
+        "name": "100%_PPO_Ü",
         "yes": True,
         "no": None,
         "untagged": {"$float": "inf", "x": 1},
@@ -621,6 +665,22 @@ class TestMeaning:
             (F("metadata.huge") < math.inf, True),
             (F("metadata.huge") == 10**3000, False),
             (F("metadata.huge") != 10**3000, True),
+            (F("metadata.t").contains("B"), True),
+            (F("metadata.t").contains(""), True),
+            (F("metadata.t").contains("bb"), False),
+            (F("metadata.n").contains("1"), False),
+            (F("metadata.no").contains(""), False),
+            (F("metadata.missing").contains(""), False),
+            (F("metadata.tags").contains("B"), True),
+            (F("metadata.tags").contains("c"), False),
+            (F("metadata.empty").contains(""), False),
+            (F("metadata.name").contains("%"), True),
+            (F("metadata.name").contains("0%_"), True),
+            (F("metadata.name").contains("0_p"), False),
+            (F("metadata.name").contains("100%o"), False),
+            (F("metadata.name").contains("Ü"), True),
+            (F("metadata.name").contains("ü"), False),
+            (F("metadata.name").contains("PpO"), True),
             (F("metadata.n").isin([]), False),
             (F("metadata.n").isin(["1", 2, 1]), True),
             (F("metadata.nan").isin([math.nan]), False),
@@ -635,7 +695,7 @@ class TestMeaning:
         assert compile_predicate(filter)(ITEM) is expected
         row = header_of(0, base_row(ITEM["metadata"], 0))
         with Catalog(None) as plain, Catalog(None) as declared:
-            for key in ("metadata.l", "metadata.tags", "metadata.empty"):
+            for key in ("metadata.l", "metadata.tags", "metadata.empty", "metadata.name"):
                 declared.declare_key(key)
             for catalog in (plain, declared):
                 fill(catalog, [row])
@@ -769,6 +829,7 @@ class TestParser:
             (r"""a = 'it\'s' and b = "\u00e9" """, (F("a") == "it's") & (F("b") == "é")),
             ("nanor = 1 and metadata.class = 2", (F("nanor") == 1) & (F("metadata.class") == 2)),
             ("(" * 64 + "a = 1" + ")" * 64, F("a") == 1),
+            ("a ~ \"x\" and not b~'y'", F("a").contains("x") & ~F("b").contains("y")),
             ("a = none and android = -inf", (F("a") == None) & (F("android") == -math.inf)),  # noqa: E711
         ],
     )
@@ -779,7 +840,7 @@ class TestParser:
         ("text", "message"),
         [
             ("", "needs a key such as metadata.score at character 0, found the end"),
-            ("a 3", "needs one of = == != > >= < <= in, and, or, or the end at character 2, found '3'"),
+            ("a 3", "needs one of = == != > >= < <= ~ in, and, or, or the end at character 2, found '3'"),
             ("a > ", "needs a value .* at character 4, found the end"),
             ("a > b", "needs a value .* at character 4, found 'b'"),
             ("a > 3 b", "needs and, or, or the end at character 6, found 'b'"),
@@ -792,6 +853,8 @@ class TestParser:
             ("'x' in ['x']", r"needs a key such as run.tags at character 7, found '\['"),
             ("a in [1 2]", "needs ',' at character 8"),
             ("a ; drop", "at character 2, found ';'"),
+            ("a ~ 3", r"CONTAINS \(~\) on 'a' takes a text, found 3 \(at character 0"),
+            ("a ~ ['x']", r"needs a value .* at character 4, found '\['"),
             ("a > true", r"orders numbers or text, found True \(at character 0"),
             ("a..b = 1", "at character 1"),
             ("and = 1", "needs a key .* at character 0, found 'and'"),
@@ -815,6 +878,7 @@ class TestParser:
             ("id = x@y.z or env = 1", "x@y.z", 'id = "x@y.z" or env = 1'),
             ("recording != /lab/a.mcap", "/lab/a.mcap", 'recording != "/lab/a.mcap"'),
             ("metadata.v in [1, 1.2.3]", "1.2.3", 'metadata.v in [1, "1.2.3"]'),
+            ("run.name ~ ppo-seed", "ppo-seed", 'run.name ~ "ppo-seed"'),
             ("metadata.s = truely", "truely", 'metadata.s = "truely"'),
         ],
     )
@@ -828,7 +892,7 @@ class TestParser:
         assert parse_filter("a = 1and b = 2or c = 3") == (F("a") == 1) & (F("b") == 2) | (F("c") == 3)
 
     @settings(max_examples=500, deadline=None)
-    @given(st.text(alphabet="ab.\"'()[]<>=!,12e-+ nortu\\", max_size=25))
+    @given(st.text(alphabet="ab.\"'()[]<>=!~,12e-+ nortu\\", max_size=25))
     def test_any_text_is_a_filter_or_an_error(self, text: str) -> None:
         try:
             parsed = parse_filter(text)

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
         EpisodeMetadataCallback as EpisodeMetadataCallback,
         F as F,
         FilterAND as FilterAND,
+        FilterCONTAINS as FilterCONTAINS,
         FilterEQ as FilterEQ,
         FilterGEQ as FilterGEQ,
         FilterGT as FilterGT,
@@ -93,7 +94,7 @@ _HOMES = {
         "recover_recording rewrite_recording split_recording verify_recording write_recording"
     ),
     "schema": (
-        "EpisodeMetadataCallback F FilterAND FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "
+        "EpisodeMetadataCallback F FilterAND FilterCONTAINS FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "
         "FilterNE FilterOR RLTuple"
     ),
     "storage": "FileStorage TupliAPIClient TupliStorage",

@@ -238,9 +238,10 @@ def episodes(
     """List episodes of recordings, directories and storages.
 
     A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
-    run.<name>, ...) with = != > >= < <= in, and joins comparisons with and, or, not. Times
-    are texts: "2026-11-23", "2026-11-23 03:31:07", "yesterday", "last tuesday", "7d ago";
-    each means the whole time that it names. --sort and --columns take the same keys.
+    run.<name>, ...) with = != > >= < <= in, or ~ for a part of a text (run.name ~ "ppo"),
+    and joins comparisons with and, or, not. Times are texts: "2026-11-23",
+    "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week", "7d ago"; each means
+    the whole time that it names. --sort and --columns take the same keys.
     """
     from tupli_mcap import open as open_dataset
 

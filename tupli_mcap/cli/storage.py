@@ -119,9 +119,8 @@ def list_episodes(
 ) -> None:
     """List the episodes of a storage.
 
-    Filters compare id, benchmark_id, recording, steps, return, end, seed, env, ended,
-    metadata.<name>, ... with = != > >= < <= in, and join with and, or, not. Times are "2026-11-23",
-    "2026-11-23 03:31:07", "yesterday", "7d ago", ...: a text means all of the time that it names.
+    --filter, --sort and --columns take what they take in tupli-mcap episodes, which lists
+    files and directories too.
     """
     with any_storage(place) as storage:
         list_stored(storage, filter_text, sort, columns, limit, as_json)

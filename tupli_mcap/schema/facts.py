@@ -161,6 +161,10 @@ def _in_time(filter: BaseFilter, key: str, now: datetime.datetime) -> BaseFilter
     def within(span: TimeSpan) -> BaseFilter:
         return FilterAND(filters=[FilterGEQ(key=key, value=span.start), FilterLT(key=key, value=span.stop)])
 
+    if filter.type is FilterType.CONTAINS:
+        raise FilterError(
+            f"{filter.key!r} is a time, in which no text occurs: expected one of = != < <= > >= or in"
+        )
     if filter.type is FilterType.IN:
         return FilterOR(filters=[within(_time(filter, value, now)) for value in filter.value])
     span = _time(filter, filter.value, now)

@@ -8,6 +8,7 @@ from typing import NoReturn
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.filters import (
+    FilterCONTAINS,
     FilterEQ,
     FilterGEQ,
     FilterGT,
@@ -55,6 +56,11 @@ class F:
 
     def __le__(self, value: object) -> FilterLEQ:
         return FilterLEQ(key=self.key, value=value)
+
+    def contains(self, text: str) -> FilterCONTAINS:
+        """True where the key's value is a text in which `text` occurs, whatever the case of A to Z; of a list of texts,
+        where it occurs in one of them."""
+        return FilterCONTAINS(key=self.key, value=text)
 
     def isin(self, values: Iterable[object]) -> FilterIN:
         """True where the key's value equals one of `values`."""

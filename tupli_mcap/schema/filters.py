@@ -15,6 +15,8 @@ A filter is true or false of an item (nested mappings of JSON values), never unk
   none of them. GT, GEQ, LT and LEQ are false of lists.
 - A mapping, also one in a list, is EQ to nothing (and so NE to everything); a filter cannot ask for one, nor for a
   list.
+- **CONTAINS** is true of a text in which its value, a text, occurs; A to Z count as a to z there. Of a list, it is
+  true where it is of one of its elements; of anything else it is false.
 - **IN** is true where EQ is true of any of its values. An empty **AND** is true; an empty **OR** or IN is
   false.
 
@@ -60,6 +62,7 @@ class FilterType(StrEnum):
     LT = "LT"
     NE = "NE"
     IN = "IN"
+    CONTAINS = "CONTAINS"
     AND = "AND"
     OR = "OR"
     NOT = "NOT"
@@ -251,6 +254,12 @@ class FilterIN(BaseFilter):
     type: Literal[FilterType.IN] = FilterType.IN
 
 
+class FilterCONTAINS(BaseFilter):
+    """The key's value is a text in which `value` occurs, whatever the case of A to Z."""
+
+    type: Literal[FilterType.CONTAINS] = FilterType.CONTAINS
+
+
 class FilterAND(BaseFilter):
     """All of `filters` are true."""
 
@@ -333,6 +342,8 @@ def _check_value(type: FilterType, key: str, value: Any) -> None:
             raise ValueError(f"{key!r} can be compared with null, bool, numbers and text, found {item!r:.60}")
         if type in ORDERING and kind not in ("number", "nan", "text"):
             raise ValueError(f"{type} on {key!r} orders numbers or text, found {item!r:.60}")
+        if type is FilterType.CONTAINS and kind != "text":
+            raise ValueError(f"{type} (~) on {key!r} takes a text, found {item!r:.60}")
         if isinstance(item, str):
             _check_text(item, "value")
         if isinstance(item, int) and item.bit_length() > _MAX_INT_BITS:
@@ -362,6 +373,8 @@ def _expression(filter: BaseFilter, outer: bool = True) -> str:
     name = f"F({json.dumps(filter.key, ensure_ascii=False)})"
     if filter.type is FilterType.IN:
         return f"{name}.isin({_values(filter.value)})"
+    if filter.type is FilterType.CONTAINS:
+        return f"{name}.contains({_value(filter.value)})"
     text = f"{name} {_SYMBOL[filter.type]} {_value(filter.value)}"
     return text if outer else f"({text})"
 

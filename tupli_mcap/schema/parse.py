@@ -3,14 +3,15 @@
     filter      = conjunction { "or" conjunction }
     conjunction = negation { "and" negation }
     negation    = "not" negation | "(" filter ")" | comparison
-    comparison  = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" ) value
+    comparison  = key ( "=" | "==" | "!=" | ">" | ">=" | "<" | "<=" | "~" ) value
                 | key [ "not" ] "in" "[" [ value { "," value } ] "]"
                 | value [ "not" ] "in" key
                 | key
     value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
-A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true of lists that hold "x". Words are
-case-insensitive (`none` is `null`), keys are not; a name in a key that is no word is quoted: `metadata."a b"`.
+A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true of lists that hold "x".
+`key ~ "x"` is true of texts in which "x" occurs. Words are case-insensitive (`none` is `null`), keys are not; a name in
+a key that is no word is quoted: `metadata."a b"`.
 
 The order of and, or, not and parentheses is Python's, so Python's parser finds it. It sees a key as `k`, a value as `0`
 and a sign as `<`, nothing else of the text, and nothing is evaluated.
@@ -32,6 +33,7 @@ from tupli_mcap.schema.facts import bound, comparisons
 from tupli_mcap.schema.filters import (
     BaseFilter,
     FilterAND,
+    FilterCONTAINS,
     FilterEQ,
     FilterGEQ,
     FilterGT,
@@ -49,17 +51,17 @@ from tupli_mcap.schema.values import tag_float
 _MAX_PARENTHESES: Final = 64
 _TOKEN: Final = re.compile(
     r"""\s*(?:
-      (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|(?:inf|nan)\b))(?=(?:and|or)\b|[\s()\[\],"'=<>!]|\Z)
+      (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|(?:inf|nan)\b))(?=(?:and|or)\b|[\s()\[\],"'=<>!~]|\Z)
     | (?P<text>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')
     | (?P<word>[^\W\d][\w\-]*(?:\.(?:[\w\-]+|"(?:[^"\\]|\\.)*"))*)
-    | (?P<sign>==|!=|>=|<=|[=<>])
+    | (?P<sign>==|!=|>=|<=|[=<>~])
     | (?P<bracket>[()\[\],])
     | (?P<end>\Z)
     | (?P<unknown>.)
     )""",
     re.VERBOSE | re.IGNORECASE | re.DOTALL,
 )
-_UNQUOTED: Final = re.compile(r"""[^\s()\[\],"'=<>!][^()\[\],"']*""")
+_UNQUOTED: Final = re.compile(r"""[^\s()\[\],"'=<>!~][^()\[\],"']*""")
 _AFTER_UNQUOTED: Final = re.compile(r"\s(?:and|or)\b", re.IGNORECASE)
 _COMPARISON: Final[Mapping[str, type[BaseFilter]]] = {
     "=": FilterEQ,
@@ -69,6 +71,7 @@ _COMPARISON: Final[Mapping[str, type[BaseFilter]]] = {
     ">=": FilterGEQ,
     "<": FilterLT,
     "<=": FilterLEQ,
+    "~": FilterCONTAINS,
 }
 _SIGNS: Final = {cls.model_fields["type"].default: sign for sign, cls in _COMPARISON.items()}
 _WORDS: Final = ("and", "or", "not", "in")

@@ -140,7 +140,11 @@ def _mask(filter: BaseFilter, columns: Mapping[str, Any], length: int) -> Mask:
         case FilterType.NOT:
             return ~_mask(filter.filters[0], columns, length)
     leaf = _leaf(filter.key or "", path_of(filter), columns)
-    if isinstance(leaf, np.ndarray) and leaf.dtype.kind in "biufU":
+    if (
+        isinstance(leaf, np.ndarray)
+        and leaf.dtype.kind in "biufU"
+        and not (filter.type is FilterType.CONTAINS and leaf.dtype.kind == "U")
+    ):
         if filter.type is FilterType.IN:
             parts = [_compare_array("EQ", leaf, classify(value)) for value in filter.value]
             return np.logical_or.reduce(parts) if parts else np.zeros(length, np.bool_)

@@ -2,8 +2,8 @@
 
 A text means all of the time that it names: `2026-11-23` is a day, `2026-11-23 03:31` a minute, `2026-11-23 03:31:07`
 a second. So `==` is true within it, `>` after its end, `>=` from its beginning, `<` before it and `<=` up to its end:
-what a table shows is found by `==`. A text without a zone is about local time. The calendar ends with the years 1 and
-9999 in UTC: what lies beyond, in another zone, is its first or last microsecond.
+what a table shows is found by `==`. A text without a zone is about local time. A week begins on Monday. The calendar
+ends with the years 1 and 9999 in UTC: what lies beyond, in another zone, is its first or last microsecond.
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ __all__ = ["TimeSpan", "iso_utc", "iso_utc_each", "local_text", "span_of", "text
 
 EXPECTED: Final = (
     'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", '
-    '"last tuesday", "7d ago" (w, d, h, min), or nanoseconds since 1970'
+    '"last tuesday", "this week", "last month", "7d ago" (w, d, h, min), or nanoseconds since 1970'
 )
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _MICROSECOND: Final = datetime.timedelta(microseconds=1)
+_DAY: Final = datetime.timedelta(days=1)
+_LONGER: Final = {"week": 7, "month": 31, "year": 366}  # days after the first one that lie in the next
 _ISO: Final = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)"
     r"(?:[ T](?P<minute>\d\d:\d\d)(?::(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?)? ?(?P<zone>Z|[+-]\d\d:?\d\d)?)?",
@@ -31,6 +33,7 @@ _ISO: Final = re.compile(
 )
 _AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w) ago", re.ASCII | re.IGNORECASE)
 _WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
+_CALENDAR: Final = re.compile(r"(this|last) (week|month|year)")
 _UNITS: Final = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _EARLIEST_NS: Final = 10**17  # 1973: what is less is no time in nanoseconds, but in seconds or milliseconds
 
@@ -67,6 +70,9 @@ def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
         today = now.astimezone().date()
         back = (today.weekday() - _WEEKDAYS.index(weekday) - 1) % 7 + 1
         return _day(today - datetime.timedelta(days=back))
+    calendar = _CALENDAR.fullmatch(word)
+    if calendar is not None:
+        return _calendar(now.astimezone().date(), calendar[2], back=calendar[1] == "last")
     ago = _AGO.fullmatch(text)
     if ago is not None:
         return _span(now - datetime.timedelta(**{_UNITS[ago[2].lower()]: int(ago[1])}), _MICROSECOND)
@@ -86,11 +92,30 @@ def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
 
 
 def _day(day: datetime.date) -> TimeSpan:
-    """A day in the local zone, of 23 hours or 25 where the clocks are changed."""
+    return _days(day, day)
+
+
+def _calendar(today: datetime.date, unit: str, *, back: bool) -> TimeSpan:
+    """The week, month or year that today lies in, or the one before."""
+    first = _first_of(unit, today)
+    if back:
+        return _days(_first_of(unit, first - _DAY), first - _DAY)
+    return _days(first, _first_of(unit, first + _LONGER[unit] * _DAY) - _DAY)
+
+
+def _first_of(unit: str, day: datetime.date) -> datetime.date:
+    """The first day of the week, month or year that a day lies in."""
+    if unit == "week":
+        return day - day.weekday() * _DAY
+    return day.replace(day=1) if unit == "month" else day.replace(month=1, day=1)
+
+
+def _days(first: datetime.date, last: datetime.date) -> TimeSpan:
+    """Days in the local zone, each of 23 hours or 25 where the clocks are changed."""
     # the last microsecond, after the clocks are set back: the calendar's last day has no following midnight
-    ends = (datetime.time.min, datetime.time.max.replace(fold=1))
-    first, last = (_ns(_utc(datetime.datetime.combine(day, end))) for end in ends)
-    return TimeSpan(first, last + 1000)
+    start = _ns(_utc(datetime.datetime.combine(first, datetime.time.min)))
+    end = _ns(_utc(datetime.datetime.combine(last, datetime.time.max.replace(fold=1))))
+    return TimeSpan(start, end + 1000)
 
 
 def _span(start: datetime.datetime, length: datetime.timedelta) -> TimeSpan:

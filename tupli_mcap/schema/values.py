@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import string
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, NamedTuple
 
@@ -31,6 +32,7 @@ class Scalar(NamedTuple):
 
 
 _OTHER: Final = Scalar("other", None)
+_SMALL: Final = str.maketrans(string.ascii_uppercase, string.ascii_lowercase)
 
 
 def classify(value: object) -> Scalar:
@@ -60,12 +62,19 @@ def classify(value: object) -> Scalar:
     return _OTHER
 
 
+def small_letters(text: str) -> str:
+    """The text with a to z in place of A to Z, as every database can do it; other letters stay what they are."""
+    return text.lower() if text.isascii() else text.translate(_SMALL)
+
+
 def compare(operation: str, found: Scalar, wanted: Scalar) -> bool:
     """The result of one comparison of two scalars; the meaning is in `tupli_mcap.schema.filters`.
 
-    `operation` is EQ, NE, GT, GEQ, LT or LEQ.
+    `operation` is EQ, NE, GT, GEQ, LT, LEQ or CONTAINS.
     """
     same_kind = found.kind == wanted.kind
+    if operation == "CONTAINS":
+        return same_kind and small_letters(wanted.value) in small_letters(found.value)
     if operation in ("EQ", "NE"):
         equal = same_kind and found.kind not in ("nan", "other") and bool(found.value == wanted.value)
         return equal == (operation == "EQ")

@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import and_, case, false, not_, or_, select, true, union_all
+from sqlalchemy import and_, case, false, func, not_, or_, select, true, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.messages.episodes import END_NAMES
@@ -26,8 +26,8 @@ from tupli_mcap.schema import BaseFilter, FilterIN, FilterType
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
 from tupli_mcap.schema.predicate import scalar_test
-from tupli_mcap.schema.values import Scalar, classify
-from tupli_mcap.storage.catalog.metadata_sql import kind_at, value_at
+from tupli_mcap.schema.values import Scalar, classify, small_letters
+from tupli_mcap.storage.catalog.metadata_sql import kind_at, text_at, value_at
 from tupli_mcap.storage.catalog.rows import indexed_text, nearest_float
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE, first_of
 from tupli_mcap.storage.texts import escape_text
@@ -46,6 +46,9 @@ _READ_WITHIN: Final = 1e-12
 _SMALLEST: Final = 1e-300
 _LARGEST: Final = sys.float_info.max
 _LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
+
+_LONGEST_PATTERN: Final = 1000  # databases have limits
+_NOT_INDEXED: Final = (FilterType.NE, FilterType.CONTAINS)
 
 _EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
 _OPERATORS: Final[Mapping[FilterType, Callable[[Any, Any], Any]]] = {
@@ -140,7 +143,7 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
         narrow = _compared(part)
         if negated:
             narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else _ALL
-        elif path_of(part) in indexed and part.type is not FilterType.NE and not few:
+        elif path_of(part) in indexed and part.type not in _NOT_INDEXED and not few:
             near = _near(part, VALUE.c.number, VALUE.c.text)
             values.setdefault(indexed[path_of(part)], []).append(near)
         parts.append(narrow)
@@ -180,7 +183,16 @@ def _compared(filter: BaseFilter) -> Narrowed:
 def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
     if filter.type is FilterType.IN:
         return _one_of(column, [escape_text(value) for value in filter.value])
+    if filter.type is FilterType.CONTAINS:
+        return Narrowed(_occurs(filter.value, column), exact=False)
     return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)), exact=True)
+
+
+def _occurs(wanted: str, column: ColumnElement[Any]) -> Condition:
+    """Where a text occurs in those of a column, as far as SQL can tell; `lower` knows A to Z at least."""
+    if not wanted.isprintable() or len(wanted) > _LONGEST_PATTERN:
+        return column.is_not(None)
+    return func.lower(column).contains(small_letters(wanted), autoescape=True)
 
 
 def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
@@ -237,7 +249,9 @@ def _in_metadata(filter: BaseFilter) -> Condition:
         [EPISODE.c.metadata.contains('"$', autoescape=True)],
     )  # tags stand for other values
     for scalar in wanted:
-        if scalar.kind == "text":
+        if filter.type is FilterType.CONTAINS:
+            parts.append(_occurs(scalar.value, text_at(path)))
+        elif scalar.kind == "text":
             parts.append(value == scalar.value)
         elif scalar.kind == "null":
             parts.append(kind_at(path) == "null")
