@@ -12,11 +12,11 @@ from tupli_mcap.dataset.items.order import Numbers
 from tupli_mcap.dataset.items.steps import SamplingError, checked_count
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.items.items import Items
+    from tupli_mcap.dataset.items.items import Items, Parts
 
 __all__ = ["Batches"]
 
-T = TypeVar("T")
+T = TypeVar("T", bound="Parts")
 
 
 class Batches(Generic[T]):

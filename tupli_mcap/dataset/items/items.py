@@ -25,7 +25,7 @@ __all__ = [
     "StepItems",
 ]
 
-T = TypeVar("T")
+T = TypeVar("T", bound="Parts")
 _MANY = 1 << 20  # items that are looked at together
 
 
