@@ -50,13 +50,14 @@ from tupli_mcap.schema import (
     FilterIN,
     RLTuple,
 )
-from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError, recordings
+from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.bundles import bundle_recording
 from tupli_mcap.storage.catalog import database
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.exchange import copy_episodes
+from tupli_mcap.storage.files import recordings
 from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.verify import verify_storage
