@@ -479,7 +479,7 @@ class TestLook:
             shutil.copy(name, f"b{name[1:]}")
         (told,) = run("ls", "b.mcap", "--json").json
         assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
-        assert "did not finish it; what its chunks and its journal hold is here" in ok("info", "b.mcap")
+        assert "did not finish it; all steps of its chunks and its journal are shown" in ok("info", "b.mcap")
         Path("b.mcap.journal").unlink()
         told = run("info", "b.mcap").out  # with a warning
         assert "did not finish it, and its journal is missing; its chunks are here" in told
@@ -643,7 +643,7 @@ class TestLook:
         assert [item["path"] for item in told["replays"]] == ["a.mcap"]
         none = run("verify", cartpole, "--rerun", "--filter", "steps > 999")
         assert (none.code, none.err.count("\n")) == (1, 1)
-        assert "nothing was replayed" in none.err
+        assert "no episode was run again" in none.err
         assert "go with --rerun" in fails("verify", cartpole, "--filter", "steps > 20", code=2)
 
     def test_info_of_an_empty_recording(self, here: Path) -> None:
@@ -984,7 +984,7 @@ class TestSharing:
         ok("bundle", path, "-o", "b.mcap", "--storage", "lab")
         assert run("import", "b.mcap", "--storage", "other", "--json").json["episodes"] == 1
         assert fails("bundle", path, "-o", "c.mcap", "--filter", "env = 0", code=2).startswith(
-            "Invalid value: a filter goes with a benchmark id, not with a file"
+            "Invalid value: --filter goes with a benchmark id, not with a file"
         )
 
     def test_a_bundle_of_a_plain_recording(self, here: Path, cartpole: Path) -> None:

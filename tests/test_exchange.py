@@ -111,7 +111,7 @@ def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     assert "would publish" in run("publish", uri, "--dry-run")
     assert admin.list_benchmarks(F("published_in") == "global") == []
     run("publish", uri)
-    assert "would not see" in run("unpublish", uri, "--dry-run")
+    assert "would hide" in run("unpublish", uri, "--dry-run")
     assert len(admin.list_episodes(F("published_in") == "global")) == 12
 
 

@@ -33,7 +33,7 @@ def test_a_group_of_two(url: str) -> None:
     for name in ("ann", "bob"):
         run(f"signup {name}")
     run("login ann")
-    assert run("create-group robots --description arms") == f"made the group robots at {url}\n"
+    assert run("create-group robots --description arms") == f"created the group robots at {url}\n"
     assert run("add-members robots bob --role contributor --role member").splitlines() == [
         "group        robots",
         "description  arms",
@@ -52,7 +52,7 @@ def test_a_group_of_two(url: str) -> None:
 
 def test_a_role_and_what_it_cannot_be(url: str) -> None:
     run("login admin")
-    assert run("create-role looker episode_read benchmark_read") == f"made the role looker at {url}\n"
+    assert run("create-role looker episode_read benchmark_read") == f"created the role looker at {url}\n"
     assert re.search(r"^looker +episode_read, benchmark_read", run("list-roles"), re.MULTILINE)
     run("delete-role looker")
     assert "looker" not in run("list-roles")

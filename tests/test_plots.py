@@ -1093,7 +1093,7 @@ def test_info_of_a_damaged_chunk_and_of_none(cartpole: Path, tmp_path: Path) -> 
     cartpole.write_bytes(data)
     code, out, err = run("info", cartpole)
     assert (code, err) == (0, "") and "return " in out
-    assert "no step is shown: " in out
+    assert "distributions cannot be shown: " in out
     assert "sketch" not in run("info", cartpole, "--json")[1]
     write_recording(tmp_path / "empty.mcap", [], observation_space=UNIT, action_space=spaces.Discrete(2))
     assert "FIRST TO LAST" not in run("info", tmp_path / "empty.mcap")[1]

@@ -676,7 +676,7 @@ def test_verify_replay(tmp_path: Path) -> None:
     with Recording(path) as recording:
         episodes = len(recording)
     assert (code, err) == (0, "")
-    assert f"{path}: all {episodes} episodes (100 steps) agree bit for bit\n  replayed in" in out
+    assert f"{path}: all {episodes} episodes (100 steps) agree bit for bit\n  run again in" in out
     assert path.read_bytes() == before
     code, out, err = run("verify", "--replay", "--json", path)
     assert (code, err) == (0, "")

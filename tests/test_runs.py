@@ -587,7 +587,7 @@ class TestCommands:
         command("tag", path, "--undo")
         assert Recording(path).episodes[0].metadata["grade"] == 1.5
         wrong = CliRunner().invoke(app, ["edit", path, "lr=0.5"])
-        assert "lr=0.5 is no recording; to change metadata of the run, --set lr=0.5" in wrong.output
+        assert "lr=0.5 is no recording; to change metadata of the run, give --set lr=0.5" in wrong.output
         command(
             "edit",
             path,

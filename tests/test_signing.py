@@ -609,7 +609,7 @@ def test_on_the_command_line(
     }
     assert ok("trust", "--list") == f"key          {mark} Alice\n"
     assert re.search(
-        rf"signed by +{re.escape(mark)} \(Alice\)\ntrusted +yes, as long as the key of Alice is\n$",
+        rf"signed by +{re.escape(mark)} \(Alice\)\ntrusted +yes, while the key of Alice is trusted\n$",
         ok("trust", bundle, "--show"),
     )
     told = run("trust", bundle, "--show", "--json").json
@@ -617,7 +617,7 @@ def test_on_the_command_line(
     ok("import", bundle, "--storage", "lab", "--require-signature")
     digest = told["digest"]
     assert ok("trust", "--list") == f"environment  {digest}\nkey          {mark} Alice\n"
-    assert ok("untrust", "--key", "Alice") == f"{mark} is trusted no longer\n"
+    assert ok("untrust", "--key", "Alice") == f"{mark} is not trusted any more\n"
     assert ok("trust", "--list") == "nothing is trusted\n"
     assert fails("untrust", "--key", "Alice").startswith("there is no trusted key 'Alice'")
     assert fails("untrust", code=2).startswith("Invalid value: expected either a FILE or DIGEST, or --key")

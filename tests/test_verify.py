@@ -523,7 +523,7 @@ def test_a_missing_file_is_told_with_one_advice(tmp_path: Path) -> None:
     code, out, _ = tell("verify", path)
     assert code == 1
     assert out.splitlines() == [
-        f"{path}: 1 problem (its episodes cannot be read as it is)",
+        f"{path}: 1 problem (its episodes cannot be read)",
         "  error: does not exist",
         "  → give the path of a recording (.mcap)",
     ]
@@ -536,7 +536,7 @@ def test_nothing_to_verify_or_to_replay_is_said(tmp_path: Path) -> None:
     (tmp_path / "empty.mcap").touch()
     code, _, err = tell("verify", "--replay", tmp_path)
     assert (code, err.count("\n")) == (1, 1)
-    assert err.startswith("error: nothing was replayed")
+    assert err.startswith("error: no episode was run again")
 
 
 def test_a_lost_journal_is_not_called_all_there(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""The application: its commands, and the one place where errors become a line and an exit code.
+"""The application: its commands, and the one place that turns an error into a line and an exit code.
 
-Exit codes: 0, 1 (it failed, or found something), 2 (usage), 130 (Ctrl-C). Only light modules are imported here; each
-command imports what it calls, so that help and completion stay quick.
+Exit codes: 0 (success), 1 (the command failed, or found a problem), 2 (wrong usage), 130 (Ctrl-C). Only light modules
+are imported here; each command imports what it calls, so that help and completion are quick.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Group(TyperGroup):
             with warnings_in_one_line(), fetch_progress() if from_servers else contextlib.nullcontext():
                 code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
             flush()
-        except BaseException as err:  # noqa: BLE001 - what is no error of ours is raised again
+        except BaseException as err:  # noqa: BLE001 - _report raises again what is not for the user
             if debug and not isinstance(err, SystemExit):
                 print_traceback(err)
             code = _report(err, as_json=as_json)
@@ -83,7 +83,7 @@ class _Group(TyperGroup):
             return super().invoke(ctx)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The commands in groups, by what they are for."""
+        """Writes the commands in groups."""
         width = max(map(len, _NAMES))
         limit = formatter.width - 6 - width
         for title, commands in _COMMANDS.items():
@@ -98,7 +98,7 @@ class _Group(TyperGroup):
 
 
 class _Command(TyperCommand):
-    """Its help ends with examples."""
+    """A command whose help ends with examples."""
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         lines = _EXAMPLES.get("view" if self.name == "replay" else self.name or "", ())
@@ -109,12 +109,12 @@ class _Command(TyperCommand):
 
 
 class _InterruptedError(TupliError):
-    """The user pressed Ctrl-C; the message is what the command has to say about that, which may be nothing."""
+    """The user pressed Ctrl-C. The message is the command's note on it, and may be empty."""
 
 
 @contextlib.contextmanager
 def _before_typer() -> Iterator[None]:
-    """Takes Ctrl-C down before typer makes something else of it."""
+    """Turns Ctrl-C into our own error, because typer would turn it into an Abort without the message."""
     try:
         yield
     except KeyboardInterrupt as err:
@@ -122,11 +122,11 @@ def _before_typer() -> Iterator[None]:
 
 
 def _report(err: BaseException, *, as_json: bool) -> int:
-    """Print the line of an error, and its JSON; returns the exit code. What is no error of a user's is raised again."""
+    """Prints an error as a line, and as JSON if asked; returns the exit code. Raises a bug of ours again."""
     message = str(err)
     code, kind = FAILED, _kind_of(err)
     if isinstance(err, OSError) and err.errno == errno.EPIPE:
-        # The reader of our output has seen enough. Nothing may be written to it at exit either.
+        # The reader of our output is gone (`| head`). Python must not write to it at exit either.
         stop_writing()
         return FAILED
     if isinstance(err, _InterruptedError | KeyboardInterrupt):
@@ -137,16 +137,16 @@ def _report(err: BaseException, *, as_json: bool) -> int:
         return INTERRUPTED
     if isinstance(err, FilterError):
         code = USAGE  # filters come from the command line only
-    elif isinstance(err, UntrustedError):  # each command that may raise it has the option
+    elif isinstance(err, UntrustedError):  # each command that may raise it has --trust
         message = message.replace("pass trust=True", "pass --trust")
     elif isinstance(err, RecordingError):  # only `record` has modes
         message = message.replace('mode="a"', "--mode a").replace('"w" to replace', "w to replace")
     elif isinstance(err, MemoryError):
-        message = f"there is not enough memory for this ({message or 'out of memory'}); see --debug for where"
+        message = f"not enough memory ({message or 'out of memory'}); --debug shows where"
     elif isinstance(err, OSError):
         name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
         message = f"{name}{err.strerror or err}"
-    elif hasattr(err, "format_message"):  # typer's own, wherever it has its classes from
+    elif hasattr(err, "format_message"):  # an error of typer, whose classes differ between its versions
         message, code, kind = err.format_message(), getattr(err, "exit_code", USAGE), "UsageError"
         context = getattr(err, "ctx", None)
         if context is not None:
@@ -162,7 +162,7 @@ def _report(err: BaseException, *, as_json: bool) -> int:
 
 
 def _kind_of(err: BaseException) -> str:
-    """The name of an error's class that users know: one of `tupli_mcap.errors`, else OSError, else its own."""
+    """The public name of an error: a class of `tupli_mcap.errors`, else OSError, else the name of its own class."""
     known = [kind.__name__ for kind in type(err).__mro__ if kind.__name__ in (*errors.__all__, "OSError")]
     return known[0] if known else type(err).__name__
 
@@ -195,8 +195,8 @@ def _root(
 ) -> None:
     """Record reinforcement-learning episodes as MCAP files, look at them, share them.
 
-    Commands print JSON with --json, errors too. Exit codes: 0, 1 (it failed, or found
-    something), 2 (usage), 130 (Ctrl-C).
+    With --json, commands print results and errors as JSON. Exit codes: 0 (success), 1 (the
+    command failed, or found a problem), 2 (wrong usage), 130 (Ctrl-C).
     """
     if context.invoked_subcommand is None:
         say(*context.get_help().split("\n"))
@@ -213,7 +213,7 @@ def _help(
         str | None, typer.Argument(metavar="[COMMAND]", help="The command to explain.")
     ] = None,
 ) -> None:
-    """Explain a command, or list them all."""
+    """Explain a command, or list all commands."""
     root = context.find_root()
     group: Any = root.command
     if command is None:
@@ -388,16 +388,16 @@ _NAMES = [name for commands in _COMMANDS.values() for name in commands]
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
         app.command(_name, cls=_Command)(_command)
-app.command("replay", cls=_Command, hidden=True)(replay.replay)  # as `view` was called
+app.command("replay", cls=_Command, hidden=True)(replay.replay)  # the earlier name of `view`
 
 
 def main() -> None:
     """The console entry point."""
     try:
         app()
-    except KeyboardInterrupt:  # before a command has begun
+    except KeyboardInterrupt:  # before a command began
         fail("interrupted")
         sys.exit(INTERRUPTED)
-    except Exception as err:  # noqa: BLE001 - a bug of ours, whose message may hold a text of a file
+    except Exception as err:  # noqa: BLE001 - a bug of ours; its message may hold text of a file, which must be escaped
         print_traceback(err)
         sys.exit(FAILED)

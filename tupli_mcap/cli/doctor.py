@@ -1,4 +1,4 @@
-"""The command doctor: looks at recorded data as someone who is about to train on it."""
+"""The command doctor: checks recorded data before training on it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["doctor"]
 
 _INDENT = 9  # columns: the longest severity and a gap
-_OTHERS = 3  # recordings with the same finding that are named
+_OTHERS = 3  # how many recordings with the same finding are named
 _STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}
 
 
@@ -37,17 +37,21 @@ class _FailOn(StrEnum):
 
 _Paths = Annotated[
     list[str] | None,
-    typer.Argument(metavar="PATH", help="Recordings, directories, storages, URLs; here by default."),
+    typer.Argument(
+        metavar="PATH", help="Recordings, directories, storages, URLs; by default, this directory."
+    ),
 ]
 _Checks = Annotated[
-    list[str] | None, typer.Option("--check", metavar="ID", help="Run only this check (repeatable).")
+    list[str] | None, typer.Option("--check", metavar="ID", help="Run only this check. Repeatable.")
 ]
 _Skipped = Annotated[
-    list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out (repeatable).")
+    list[str] | None, typer.Option("--skip", metavar="ID", help="Leave this check out. Repeatable.")
 ]
 _Thresholds = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="ID.NAME=N", help="Change a threshold; --list --json names them."),
+    typer.Option(
+        "--set", metavar="ID.NAME=N", help="Change a threshold; --list --json names them. Repeatable."
+    ),
 ]
 
 
@@ -56,7 +60,7 @@ def doctor(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     fail_on: Annotated[
-        _FailOn, typer.Option(help="Exit with 1 if there is a finding as bad as this.")
+        _FailOn, typer.Option(help="Exit with 1 if a finding is as bad as this, or worse.")
     ] = _FailOn.error,
     level: Annotated[_Level, typer.Option(help="Print findings as bad as this, or worse.")] = _Level.info,
     check: _Checks = None,
@@ -65,15 +69,15 @@ def doctor(
     list_checks: Annotated[bool, typer.Option("--list", help="List the checks instead.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Look at recorded data before training on it.
+    """Check recorded data before training on it.
 
     Finds NaN and infinities, values outside their space, dimensions that never change,
     actions that never occur, missing terminals, episodes of one step, wrong resets,
     duplicates, frozen cameras, reward outliers, clock jumps.
 
-    An error is wrong data, a warning is probably wrong, an info is worth knowing. The command
-    exits with 1 if there is an error (see --fail-on), or a file that cannot be read; the
-    other files are examined all the same.
+    An error is wrong data, a warning is probably wrong data, an info is worth knowing. The
+    command exits with 1 if it finds an error (see --fail-on), or cannot read a file; it
+    examines the other files all the same.
     """
     from tupli_mcap.dataset.which import chosen_from
     from tupli_mcap.doctor import Severity, examine
@@ -105,7 +109,7 @@ def doctor(
 
 
 def _checked(names: list[str] | None) -> list[str] | None:
-    """Ids of checks, all of which there are."""
+    """The ids of checks; BadParameter if there is no such check."""
     from tupli_mcap.doctor import CHECKS
 
     for name in names or ():
@@ -145,7 +149,7 @@ def _print_checks(as_json: bool) -> None:
 def _print(diagnosis: Diagnosis, level: Severity) -> None:
     groups: dict[tuple[object, ...], list[Finding]] = {}
     for finding in diagnosis.at_least(level):
-        # What recordings have in common is said once; why a file cannot be read, of each.
+        # Several recordings with the same finding are printed once; unreadable files one by one, with their reasons.
         path = finding.path if finding.check == "unreadable" else ""
         groups.setdefault((finding.severity, finding.check, finding.leaf, path), []).append(finding)
     for group in groups.values():
@@ -171,7 +175,7 @@ def _print_group(group: Sequence[Finding], *, several: bool) -> None:
     severity = str(first.severity)
     title = first.check if first.leaf is None else f"{first.check} · {first.leaf}"
     say_styled((f"{severity:<{_INDENT}}", _STYLES[severity]), (title, "bold"))
-    if several and first.check != "unreadable":  # which names the file itself
+    if several and first.check != "unreadable":  # whose message names the file
         _print_wrapped(f"{short_ids(first.path)}:")
     _print_wrapped(first.message)
     if first.places:
@@ -185,7 +189,7 @@ def _print_group(group: Sequence[Finding], *, several: bool) -> None:
 
 
 def _at(finding: Finding) -> str:
-    """The places in short: `at episode:step 3:5, 4:0, ...`, `episode 3, 4`; another recording is named."""
+    """The places of a finding: `at episode:step 3:5, 4:0, ...` or `episode 3, 4`; other recordings are named."""
     steps = finding.places[0].step is not None
     texts = []
     for place in finding.places:

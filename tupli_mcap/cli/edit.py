@@ -1,4 +1,4 @@
-"""Commands that change what recordings say (tag, edit), or make new ones of them (merge, split, filter, recover)."""
+"""Commands that change metadata (tag, edit), or write new recordings (merge, split, filter, trim, recover)."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be
 
 
 _NO_JOURNAL = {
-    "missing": "which is not beside the file; if the file was cut off, all that followed too",
-    "stale": "which is not the one beside the file",
-    "damaged": "as far as that cannot be read",
+    "missing": "their journal is not beside the file; if the file was cut off, also all after the cut",
+    "stale": "the journal beside the file belongs to another recording",
+    "damaged": "their journal is damaged",
 }
-_SHOWN = 20  # damaged places, lost episodes: what is beyond is in --json
+_SHOWN = 20  # how many damaged places or lost episodes are shown; --json has all
 
 
 def merge(
@@ -51,10 +51,10 @@ def merge(
 ) -> None:
     """Write the episodes of several recordings into one.
 
-    They keep their times, and get new numbers. Recordings that were made at the same time, or
-    that have different numbers of sub-environments, become sub-environments of one; the run
-    of each episode says where it comes from. The new recording has ids of its own, the
-    environment of the first one, and no signature.
+    Episodes keep their times, and get new numbers and ids. Recordings that were made at the
+    same time, or that have different numbers of sub-environments, become sub-environments of
+    the new one. Each episode keeps its run. The new recording has the environment of the
+    first one, and no signature.
     """
     from tupli_mcap.recording import merge_recordings
 
@@ -70,17 +70,18 @@ def split(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="The first new recording; FILE_0001.mcap, … follow."
+            "--output", "-o", metavar="FILE", help="The first new recording; others are FILE_0001.mcap, …"
         ),
     ],
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes in each file.")] = None,
-    max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes of each file, roughly.")] = None,
+    max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes in each file, roughly.")] = None,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write the episodes of a recording into several.
 
-    Episodes stay whole and keep their numbers; the new recordings have ids of their own, and no signature.
+    Episodes stay whole, and keep their numbers. The new recordings have new ids, and no
+    signature.
     """
     if (episodes is None) == (max_bytes is None):
         raise typer.BadParameter("expected either --episodes or --max-bytes")
@@ -97,7 +98,7 @@ def split(
 
 def tag(
     files: Annotated[
-        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, then what to note.")
+        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, then the values to note.")
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -107,9 +108,9 @@ def tag(
 ) -> None:
     """Note something about episodes, such as success=true.
 
-    A note counts more than the metadata that were recorded, in filters and tables too. Values
-    are JSON if they look like it, else texts; KEY= removes a key. The file keeps who noted it
-    and when. Its steps are not touched. A signature is dropped.
+    Filters and tables use a note in place of recorded metadata of the same key. A value that
+    is JSON is read as JSON, any other as text; KEY= removes a key. The file keeps who noted
+    it and when. Its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.jsonvalue import dumps_any
@@ -120,7 +121,7 @@ def tag(
     values = dict(pair_of(text) for text in files if text not in given)
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
-            "give recordings, and KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
+            "expected recordings, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
         )
     if not undo and episodes is None and filter_text is None:
         raise typer.BadParameter(
@@ -151,35 +152,39 @@ def tag(
 
 def edit(
     files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings.", parser=local_path)],
-    name: Annotated[str | None, typer.Option(help="Of the run.")] = None,
+    name: Annotated[str | None, typer.Option(help="The new name of the run.")] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; KEY= removes it."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; KEY= removes it. Repeatable."),
     ] = None,
     tags: Annotated[
         list[str] | None,
-        typer.Option("--tag", help="The run's tags, in place of those it has; may be repeated."),
+        typer.Option(
+            "--tag", metavar="WORD", help="A tag of the run. Replaces all earlier tags. Repeatable."
+        ),
     ] = None,
     run_split: Annotated[
-        str | None, typer.Option("--split", help="What the run is for: train, eval, …")
+        str | None, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")
     ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit.")] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Change what recordings say about their runs.
+    """Change the name, metadata, tags or split of a run.
 
-    A recording keeps its identity, and its steps are not touched. A signature is dropped.
+    The recording keeps its id, and its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.recording import edit_run, undo_edit
 
     meant = [str(file) for file in files if "=" in str(file) and not file.exists()]
     if meant:
         raise typer.BadParameter(
-            f"{meant[0]} is no recording; to change metadata of the run, --set {meant[0]}"
+            f"{meant[0]} is no recording; to change metadata of the run, give --set {meant[0]}"
         )
     if undo == any(given is not None for given in (name, settings, tags, run_split)):
-        raise typer.BadParameter("give what to change: --name, --set KEY=VALUE, --tag or --split; or --undo")
+        raise typer.BadParameter(
+            "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
+        )
     metadata = dict(pair_of(text) for text in settings or ())
     runs = [
         undo_edit(file, dry_run=dry_run)
@@ -201,7 +206,10 @@ def edit(
 
 def filter_(
     source: Annotated[
-        Path, typer.Argument(metavar="FILE|DIRECTORY", help="A recording, or a directory.", parser=local_path)
+        Path,
+        typer.Argument(
+            metavar="FILE|DIRECTORY", help="A recording, or a directory of recordings.", parser=local_path
+        ),
     ],
     filter_text: Annotated[
         str,
@@ -212,9 +220,10 @@ def filter_(
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write the episodes that match a filter into a file.
+    """Write the episodes that match a filter into a new file.
 
-    They keep their ids; those of several recordings get new ones. A signature is dropped.
+    Episodes of one recording keep their ids; those of several get new ones. A signature is
+    dropped.
     """
     from tupli_mcap.dataset import filter_recording
 
@@ -229,7 +238,7 @@ def filter_(
 def trim(
     file: File,
     steps: Annotated[
-        str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a slice of Python.")
+        str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a Python slice.")
     ],
     output: _Output,
     episodes: Episodes = None,
@@ -240,10 +249,10 @@ def trim(
 ) -> None:
     """Cut steps off the ends of episodes, into a new recording.
 
-    10:-5 leaves out the first ten steps and the last five, :200 all from step 200 on.
-    Episodes that are not chosen stay whole. An episode that loses its end ends as
-    interrupted, and the state that followed becomes its final state. One that loses its
-    beginning has no seed. The new recording has an id of its own, and no signature.
+    10:-5 leaves out the first ten and the last five steps, :200 all steps from 200 on.
+    Episodes that are not chosen stay whole. An episode that loses its end is marked as
+    interrupted, and the state after its last step becomes its final state. An episode that
+    loses its beginning loses its seed. The new recording has a new id, and no signature.
     """
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.recording import Recording, trim_recording
@@ -254,7 +263,7 @@ def trim(
     except ValueError:
         colon = ""
     if not colon:
-        raise typer.BadParameter(f"expected steps such as 10:-5, 10: or :200, found {steps!r:.80}")
+        raise typer.BadParameter(f"--steps: expected a slice such as 10:-5, 10: or :200, found {steps!r:.80}")
     with Recording(file) as recording:
         chosen = choose_episodes(recording, episodes or "all", filter_of(filter_text))
         wanted = {episode.number: kept for episode in chosen}
@@ -289,26 +298,28 @@ def recover(
     file: File,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", metavar="FILE", help="By default FILE.recovered.mcap, beside it."),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The new recording; by default, FILE.recovered.mcap."
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
     in_place: Annotated[
-        bool, typer.Option("--in-place", help="Finish the file itself, if nothing is lost.")
+        bool, typer.Option("--in-place", help="Finish the file itself instead, if nothing of it is lost.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is good in a damaged recording into a new one.
+    """Save what is undamaged in a recording into a new one.
 
-    A recording that its writer did not finish counts as damaged, too. The file itself is only
-    read; with --in-place, it is finished as appending to it would. The command says by
-    episode and step what was lost. An episode that lost steps in the middle becomes several.
-    It exits with 1 only if nothing could be saved, or no step of a recording that had some.
+    Works on damaged recordings, and on those that their writers did not finish. FILE is only
+    read; with --in-place, it is finished instead. The command prints the lost steps of each
+    episode. An episode that lost steps in the middle becomes several. The command exits with
+    1 if nothing could be saved, or if the recording had steps and none could be saved.
     """
     from tupli_mcap.recording import finish_recording, recover_recording
 
     if in_place and (output is not None or force):
-        raise typer.BadParameter("--in-place writes no other file; leave --output and --force out")
+        raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")
     if in_place:
         report = finish_recording(file, dry_run=dry_run)
     else:
@@ -378,7 +389,7 @@ def _lost_nothing(report: RecoveryReport) -> bool:
 
 
 def _losses(report: RecoveryReport) -> list[str]:
-    """What is lost, a line each."""
+    """A line for each kind of loss."""
     found = []
     if report.steps_lost or report.episodes_lost:
         found.append(
@@ -393,11 +404,11 @@ def _losses(report: RecoveryReport) -> list[str]:
             shown = ", ".join(str(n) for n in episodes[:_SHOWN])
             found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
     if report.infos_lost:
-        found.append(f"lost: {counted(report.infos_lost, 'info')} of steps")
+        found.append(f"lost: {counted(report.infos_lost, 'step info')}")
     if report.frames_lost:
         found.append(f"lost: {counted(report.frames_lost, 'frame')}")
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
     if report.journal in _NO_JOURNAL:
-        found.append(f"lost: steps not yet in a chunk, with the journal, {_NO_JOURNAL[report.journal]}")
+        found.append(f"lost: steps not yet in a chunk; {_NO_JOURNAL[report.journal]}")
     return found

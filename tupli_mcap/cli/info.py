@@ -1,4 +1,4 @@
-"""The command info: what is in a recording, or in all of a directory."""
+"""The command info: shows what is in a recording, or in all recordings of a directory."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ __all__ = ["info", "sparkline"]
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLAIN = ".:-=+*#@"  # where blocks cannot be printed
 _WIDEST, _NARROWEST = 40, 8
-_OTHERS = 44  # columns of a line beside its blocks
+_OTHERS = 44  # columns of a line that are not blocks
 _LONGEST_NAME = 24
 
 
 def _print_directory(path: Path, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
-    """Facts about all recordings of a directory, or of some of their episodes."""
+    """Prints facts about the recordings of a directory, or about the chosen episodes of them."""
     from tupli_mcap import open as open_dataset
     from tupli_mcap.dataset.which import chosen_from
     from tupli_mcap.recording.about.success import success_of
@@ -54,7 +54,7 @@ def _print_directory(path: Path, episodes: str | None, wanted: BaseFilter | None
     from tupli_mcap.storage.listing import find_recordings
 
     if not find_recordings(path):
-        raise RecordingError(f"{path} is a directory; it holds no recording (.mcap)")
+        raise RecordingError(f"{path} is a directory; expected a recording (.mcap) in it, found none")
     dataset = open_dataset(path)
     if episodes is not None:
         with chosen_from(path, episodes, wanted) as chosen:
@@ -113,13 +113,13 @@ def info(
     filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
-    """Show what is in a recording, or in all of a directory.
+    """Show what is in a recording, or in a directory of them.
 
-    Of a recording: its run, spaces, benchmark, returns and lengths of episodes, distributions
-    of rewards, actions and states, channels and attachments. Of a long recording, only some
-    of the steps are read; of a URL, none. Of a directory: its runs, environments, episodes
-    and metadata keys. --episodes and --filter choose episodes; channels, attachments and size
-    are always those of the whole file.
+    For a recording: its run, spaces, benchmark, returns and lengths of episodes,
+    distributions of rewards, actions and states, channels and attachments. Distributions of
+    a long recording come from a sample of its steps; for a URL, they are left out. For a
+    directory: its runs, environments, episodes and metadata keys. --episodes and --filter
+    choose episodes; channels, attachments and size are those of the whole file.
     """
     import numpy as np
 
@@ -132,7 +132,7 @@ def info(
         _print_directory(Path(file), episodes, wanted, as_json=as_json)
         return
     with Recording(file) as recording:
-        positions = candidates(recording, wanted)  # without those that are deleted
+        positions = candidates(recording, wanted)  # without deleted episodes
         if episodes is not None or wanted is not None:
             positions = np.array(sorted(named_positions(recording, positions, episodes or "all", wanted)))
         description = describe(recording, positions)
@@ -168,9 +168,10 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
 def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     states = {
         "complete": "complete",
-        "recording": "a writer is at work on it",
-        "recovered": "recovered: its writer did not finish it; what its chunks and its journal hold is here",
-        "incomplete": "incomplete: its writer did not finish it, and its journal is missing; its chunks are here",
+        "recording": "a process is writing to it",
+        "recovered": "recovered: its writer did not finish it; all steps of its chunks and its journal are shown",
+        "incomplete": "incomplete: its writer did not finish it and its journal is missing; the steps of its chunks "
+        "are shown",
     }
     environment = d.environment or "none attached"
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
@@ -213,7 +214,7 @@ def _made_of_text(made_of: dict[str, Any]) -> str:
 
 
 def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
-    """What is known of the run, as far as other lines do not say it."""
+    """The facts about the run that no other line shows."""
     git = run.get("git", {})
     facts = {
         "run": run.get("name", ""),
@@ -258,9 +259,9 @@ def _print_channels(d: RecordingDescription) -> None:
 
 
 def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str = BLOCKS) -> str:
-    """One character a number: a higher one for a larger number, a space for NaN.
+    """Draws each number as one character: the larger, the higher; a space for NaN.
 
-    zero_based: the lowest level is that of 0, which is a space; else that of the smallest number.
+    zero_based: levels start at 0, which is drawn as a space; else at the smallest number.
     """
     finite = [value for value in values if math.isfinite(value)]
     if not finite:
@@ -279,7 +280,7 @@ def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str 
 
 
 def _print_series(recording: Recording, positions: Any, steps: int) -> None:
-    """Returns and lengths over episodes, and how rewards, actions and states are distributed."""
+    """Prints returns and lengths over episodes, and distributions of rewards, actions and states."""
     from tupli_mcap.recording.series import sketch
 
     room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
@@ -301,7 +302,7 @@ def _print_series(recording: Recording, positions: Any, steps: int) -> None:
         if odd:
             print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")
     if summary.error:
-        say(f"no step is shown: {summary.error}")
+        say(f"distributions cannot be shown: {summary.error}")
 
 
 def _print_sparklines(title: str, spark: str, series: Sequence[Series], *, zero_based: bool) -> None:

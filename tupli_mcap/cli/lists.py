@@ -1,4 +1,4 @@
-"""Commands that list: ls lists recordings, episodes lists episodes."""
+"""The commands ls (lists recordings) and episodes (lists episodes)."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ if TYPE_CHECKING:
 
 __all__ = ["episodes", "list_stored", "ls", "print_episodes"]
 
-_ROOMY = 100  # columns of a terminal on which metadata and times fit side by side
+_ROOMY = 100  # columns a terminal needs for metadata and times side by side
 _Cells = Callable[["Sequence[ListedRecording]"], list[str]]
 
 
 class _Listed(NamedTuple):
-    """A column of `ls`: the field of `ListedRecording` that orders by it, and its cells."""
+    """A column of `ls`: the field of `ListedRecording` that it is sorted by, and how its cells are made."""
 
     field: str
     column: Column
@@ -64,7 +64,7 @@ def _means(items: Sequence[ListedRecording]) -> list[str]:
 
 
 def _success(item: ListedRecording) -> str:
-    """The share, and of how many episodes where not all say it."""
+    """The share of successes; with the count of episodes that say it, unless all do."""
     if item.success is None:
         return ""
     known = "" if item.success_known == item.episodes else f" of {number(item.success_known)}"
@@ -104,14 +104,16 @@ _MEANT = {
     "name": "run",
     "metadata": "settings",
 }
-"""What columns may be called."""
+"""Other names for columns, for a hint."""
 
 
 def ls(
     paths: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="PATH", help="Files, directories, storages; here by default.", parser=local_path
+            metavar="PATH",
+            help="Files, directories, storages; by default, this directory.",
+            parser=local_path,
         ),
     ] = None,
     filter_text: FilterText = None,
@@ -119,13 +121,13 @@ def ls(
     columns: ColumnNames = None,
     as_json: Json = False,
 ) -> None:
-    """List recordings in files and directories: their runs.
+    """List the recordings in files and directories.
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
-    state, split, tags, settings. The last three are shown where asked for; settings are the
-    metadata of the run. RETURN is the mean over episodes. STATE is `complete`, `recording`
-    while somebody writes it, or `recovered` if its writer was killed or failed; then all
-    finished steps are there, if its journal is. Deleted episodes are not counted. With
+    state, split, tags, settings. The last three appear only with --columns; settings are the
+    metadata of the run. RETURN is the mean over episodes. STATE is `complete`; `recording`
+    while a process writes the file; `recovered` if its writer was killed or failed: all
+    finished steps are there as long as the journal is. Deleted episodes are not counted. With
     --filter, only the episodes that match are counted.
     """
     from tupli_mcap.storage.listing import list_recordings
@@ -156,7 +158,7 @@ def ls(
 
 
 def _check_there(paths: Sequence[Path], wanted: BaseFilter) -> None:
-    """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none has."""
+    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has."""
     from tupli_mcap import open as open_dataset
     from tupli_mcap.storage.listing import find_recordings
 
@@ -166,7 +168,7 @@ def _check_there(paths: Sequence[Path], wanted: BaseFilter) -> None:
 
 
 def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:
-    """Those without a value, and those that cannot be read, come last."""
+    """Sorts recordings by a field; those without a value, and unreadable ones, come last."""
 
     def key(item: ListedRecording) -> Any:
         value = getattr(item, field)
@@ -181,7 +183,7 @@ def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -
 def _column(name: str) -> _Listed:
     if name.lower() not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
-        raise typer.BadParameter(f"there is no column {name!r}{similar}; there are {', '.join(_COLUMNS)}")
+        raise typer.BadParameter(f"there is no column {name!r}{similar}; columns are {', '.join(_COLUMNS)}")
     return _COLUMNS[name.lower()]
 
 
@@ -195,7 +197,7 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
 
 
 def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
-    """The chosen columns of recordings, or all there is to say."""
+    """The chosen columns of recordings, or all fields."""
     from tupli_mcap.schema.times import iso_utc
 
     if columns is not None:
@@ -239,9 +241,9 @@ def episodes(
 
     A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
     run.<name>, ...) with = != > >= < <= in, or ~ for a part of a text (run.name ~ "ppo"),
-    and joins comparisons with and, or, not. Times are texts: "2026-11-23",
-    "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week", "7d ago"; each means
-    the whole time that it names. --sort and --columns take the same keys.
+    and joins comparisons with and, or, not. Times are texts such as "2026-11-23",
+    "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
+    week stands for all of it. --sort and --columns take the same keys.
     """
     from tupli_mcap import open as open_dataset
 
@@ -265,10 +267,10 @@ def list_stored(
     from tupli_mcap import open as open_dataset
 
     wanted = filter_of(filter_text)
-    if sort is None:  # which looks up so many only
+    if sort is None:  # the storage stops at the limit
         headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
         if wanted is not None and not headers and limit != 0:
-            len(open_dataset(storage).filter(wanted))  # which says so if no episode has such a key
+            len(open_dataset(storage).filter(wanted))  # raises FilterError if no episode has such a key
     else:
         headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
     _print_headers(headers, columns, as_json=as_json)
@@ -294,7 +296,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     from tupli_mcap.schema.facts import path_in
     from tupli_mcap.schema.predicate import MISSING, look_up
 
-    # a run is known by its name, as in other tables
+    # a run is shown by its name, as in other tables
     paths = [path_in("run.name" if key == "run" else key, EpisodeHeader) for key in keys]
     found = [[look_up(header, path) for path in paths] for header in headers]
     for key, column in zip(keys, zip(*found, strict=True), strict=False):

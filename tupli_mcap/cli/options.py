@@ -1,4 +1,4 @@
-"""Options that several commands have in common."""
+"""Options that several commands share."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ __all__ = [
 
 
 def local_path(text: str | Path) -> Path:
-    """A path, also a default one; BadParameter for a URL, which this command neither changes nor lists."""
+    """A path, for commands that take no URL; BadParameter for a URL. Typer passes defaults through it, too."""
     if isinstance(text, str) and is_url(text):
         raise typer.BadParameter(
-            f"expected a path, found {shown(text)}; download the file, or save what you need of it: "
+            f"expected a path, found {shown(text)}; download the file, or save a part of it: "
             "tupli_mcap.open(url).save(path)"
         )
     return Path(text)
@@ -45,13 +45,13 @@ Episodes = Annotated[
 ]
 Sort = Annotated[
     str | None,
-    typer.Option(metavar="KEY", help="Order by a column, such as return; -KEY puts the largest first."),
+    typer.Option(metavar="KEY", help="Sort by a column, such as return; -KEY puts the largest first."),
 ]
 ColumnNames = Annotated[
     str | None,
-    typer.Option("--columns", metavar="A,B,…", help="The columns, such as steps,return."),
+    typer.Option("--columns", metavar="A,B,…", help="The columns to show, such as steps,return."),
 ]
-Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many.")]
+Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many episodes.")]
 FilterText = Annotated[
     str | None,
     typer.Option(
@@ -77,8 +77,8 @@ _SHORTEST_ID = 4
 
 
 def filter_of(text: str | None) -> BaseFilter | None:
-    """The filter that an option's text describes."""
-    if text is None:  # the schema takes a while to import
+    """The filter that an option's text describes; None without a text. FilterError if it is no filter."""
+    if text is None:  # spares the import of the schema
         return None
     from tupli_mcap.schema import parse_filter
 
@@ -86,8 +86,7 @@ def filter_of(text: str | None) -> BaseFilter | None:
 
 
 def pair_of(text: str) -> tuple[str, Any]:
-    """KEY=VALUE; the value is None where there is none, JSON or Python's True or False where it looks like that, else a
-    text."""
+    """Splits KEY=VALUE. An empty value is None, True and False are bools, JSON is read as such, all else is text."""
     from tupli_mcap import jsonvalue
     from tupli_mcap.errors import FormatError
 
@@ -105,7 +104,7 @@ def pair_of(text: str) -> tuple[str, Any]:
 
 
 def open_storage(path: Path, *, create: bool = False) -> FileStorage:
-    """The storage in a directory; only commands that put something into it make the directory."""
+    """The storage in a directory; StorageError if the directory is missing, unless `create` makes it."""
     from tupli_mcap.storage import FileStorage
 
     if not create and not path.is_dir():
@@ -117,17 +116,20 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
 
 
 def any_storage(place: str) -> AbstractContextManager[TupliStorage]:
-    """The storage in a directory that is there, or on a server."""
+    """The storage in an existing directory, or on a server."""
     from tupli_mcap.storage import TupliAPIClient
 
     return TupliAPIClient(place) if is_url(place) else open_storage(Path(place))
 
 
 def full_id(storage: TupliStorage, text: str) -> str:
-    """The benchmark id that starts with `text`, as tables show ids in short; `text` itself if none does."""
+    """The benchmark id that starts with `text`, for ids as tables shorten them; `text` itself if none does.
+
+    NotFoundError if several do.
+    """
     if len(text) < _SHORTEST_ID or len(text) >= 64 or not set(text) <= set("0123456789abcdef"):
         return text
     found = [header.id for header in storage.list_benchmarks() if header.id.startswith(text)]
     if len(found) > 1:
-        raise NotFoundError(f"{len(found)} benchmarks have an id that starts with {text!r}; give more of it")
+        raise NotFoundError(f"{len(found)} benchmarks have an id that starts with {text!r}; give more digits")
     return found[0] if found else text

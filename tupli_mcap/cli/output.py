@@ -1,4 +1,4 @@
-"""How results are printed: tables that fit the terminal, facts, JSON, numbers and times."""
+"""Prints results: tables that fit the terminal, facts, JSON, numbers and times."""
 
 from __future__ import annotations
 
@@ -32,16 +32,18 @@ __all__ = [
 ]
 
 JSON_VERSION: Final = 1
-"""Of what --json prints: another one where a key goes away, or means something else. New keys may come at any time."""
+"""The version of what --json prints. It grows when a key goes away or changes its meaning, not when a key is added."""
 
-_OWN_LEVELS: Final = 6  # of lists and records in a result; what lies deeper is a user's
+_OWN_LEVELS: Final = (
+    6  # nested lists and records of a result; deeper values are a user's, and stay as they are
+)
 _GAP = "  "
 _WIDEST = 100  # columns of running text
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
 
 class Column(NamedTuple):
-    """A column of a table; `shrink` says which end of its values goes where the terminal is too narrow."""
+    """A column of a table; `shrink` says which end of its values is cut if the terminal is too narrow."""
 
     title: str
     align: Literal["left", "right"] = "left"
@@ -56,7 +58,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
     if not cells:
         say(empty)
         return
-    # A column without any value says nothing.
+    # A column without any value is not shown.
     shown = [i for i in range(len(columns)) if any(row[i] for row in cells)]
     columns = [columns[i] for i in shown]
     cells = [[row[i] for i in shown] for row in cells]
@@ -71,7 +73,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
-    """Print `label  value` lines; long values go on below themselves."""
+    """Print `label  value` lines; long values are wrapped."""
     pairs = [(visible(label), visible(value)) for label, value in facts]
     indent = max(len(label) for label, _ in pairs) + len(_GAP)
     width = terminal_width()
@@ -84,7 +86,7 @@ def print_facts(facts: Iterable[tuple[str, str]]) -> None:
 
 
 def print_wrapped(text: str, first: str, others: str) -> None:
-    """Print a text in lines that fit the terminal, at most 100 columns: `first` begins its first, `others` the next."""
+    """Print a text in lines that fit the terminal, at most 100 columns; `first` and `others` begin the lines."""
     width = terminal_width()
     if width is None:
         say(first + text)
@@ -106,7 +108,7 @@ def print_wrapped(text: str, first: str, others: str) -> None:
 
 @dataclass
 class _Document:
-    """The one document of this call of the program."""
+    """The one JSON document that a call of the program prints."""
 
     command: str | None = None
     printed: bool = False
@@ -116,20 +118,20 @@ _document = _Document()
 
 
 def begin_json(command: str | None) -> None:
-    """Name the command whose result, or error, will be printed; None where there is none of that name."""
+    """Name the command whose result or error will be printed; None if the user named no command."""
     _document.command, _document.printed = command, False
 
 
 def print_json(result: Any) -> None:
-    """Print what a command found out as one JSON document: `{"version", "command", "result"}`.
+    """Print the result of a command as one JSON document: `{"version", "command", "result"}`.
 
-    NamedTuples become objects, paths texts, NumPy values numbers and lists, NaN and infinities null.
+    NamedTuples become objects, paths become texts, NumPy values become numbers and lists, NaN and infinities null.
     """
     _print_document({"result": _plain(result, _OWN_LEVELS)})
 
 
 def print_json_error(kind: str, message: str, exit_code: int) -> None:
-    """Print an error as one JSON document: `{"version", "command", "error"}`, unless there is one already."""
+    """Print an error as one JSON document, `{"version", "command", "error"}`, unless one was printed before."""
     if not _document.printed:
         _print_document({"error": {"type": kind, "message": message, "exit_code": exit_code}})
 
@@ -140,7 +142,7 @@ def _print_document(content: dict[str, Any]) -> None:
     from tupli_mcap.jsonvalue import MAX_DEPTH, dumps_plain
 
     value = {"version": JSON_VERSION, "command": _document.command, **content}
-    most = 2 * MAX_DEPTH  # of what was read, and of the lists and objects it is printed in
+    most = 2 * MAX_DEPTH  # for a value that was read, and the lists and objects around it
     try:
         text = dumps_plain(value, max_depth=most)
     except (TypeError, ValueError):
@@ -151,7 +153,7 @@ def _print_document(content: dict[str, Any]) -> None:
 
 
 def _plain(value: Any, levels: int) -> Any:
-    """NamedTuples as dicts, and paths as texts, `levels` deep; what lies deeper stays as it is."""
+    """Makes dicts of NamedTuples and texts of paths, down to `levels`; deeper values stay as they are."""
     if isinstance(value, PurePath):
         return str(value)
     if levels and hasattr(value, "_asdict"):
@@ -164,7 +166,7 @@ def _plain(value: Any, levels: int) -> Any:
 
 
 def _printable(value: Any, levels: int) -> Any:
-    """A value with text in place of what has no JSON, or is nested deeper: it must not hide all the others."""
+    """Replaces by a text what JSON cannot hold, or what is nested deeper than `levels`: the rest is still printed."""
     from tupli_mcap.jsonvalue import dumps_plain, shown
 
     if levels and isinstance(value, dict):
@@ -184,12 +186,12 @@ def _printable(value: Any, levels: int) -> Any:
 
 
 def short_ids(text: str) -> str:
-    """On a terminal, the first 12 digits of every long id in a text; elsewhere the text as it is."""
+    """Shortens every long id in a text to 12 digits on a terminal; elsewhere leaves the text as it is."""
     return text if terminal_width() is None else _LONG_ID.sub(r"\1…", text)
 
 
 def number(value: float | None, decimals: int = 2) -> str:
-    """A number for people: thousands separated, at most so many decimals."""
+    """A number with separated thousands and at most `decimals` decimals; empty for None."""
     if value is None:
         return ""
     if not math.isfinite(value):
@@ -202,7 +204,7 @@ def number(value: float | None, decimals: int = 2) -> str:
 
 
 def short_value(value: object) -> str:
-    """A value of metadata in a table."""
+    """A metadata value as a cell of a table."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, str):
@@ -215,17 +217,17 @@ def short_value(value: object) -> str:
 
 
 def pairs_of(values: Mapping[str, Any]) -> str:
-    """Metadata in a table: `lr=0.0003, algo=ppo`."""
+    """Metadata as a cell of a table: `lr=0.0003, algo=ppo`."""
     return ", ".join(f"{key}={short_value(value)}" for key, value in values.items())
 
 
 def counted(count: int, noun: str) -> str:
-    """A count of things: `1 episode`, `2,000 episodes`."""
+    """A count with its noun: `1 episode`, `2,000 episodes`."""
     return f"{number(count)} {noun}{'' if count == 1 else 's'}"
 
 
 def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:
-    """Numbers of one column: with decimals if one of them has some."""
+    """The numbers of one column: all with decimals, if one of them has some."""
     whole = all(value is None or not math.isfinite(value) or value == int(value) for value in values)
     if whole:
         return [number(value) for value in values]
@@ -247,7 +249,7 @@ def bytes_of(size: int) -> str:
 
 
 def time_of(time_ns: int) -> str:
-    """A wall clock time (ns) in the local time zone, to the second, as filters take it; empty for 0."""
+    """A wall clock time (ns) as local time to the second, in the form that filters take; empty for 0."""
     if not time_ns:
         return ""
     from tupli_mcap.schema.times import local_text
@@ -256,7 +258,7 @@ def time_of(time_ns: int) -> str:
 
 
 def when(created_at: str) -> str:
-    """The same for an ISO 8601 time; one that is none is shown as it is."""
+    """An ISO 8601 time as local time; a text that is no time comes back unchanged."""
     from tupli_mcap.schema.times import time_ns
 
     found = time_ns(created_at)
@@ -264,7 +266,7 @@ def when(created_at: str) -> str:
 
 
 def _fit(columns: Sequence[Column], widths: list[int]) -> None:
-    """Narrow the columns that may shrink until the table fits, the widest first."""
+    """Narrows the columns that may shrink, the widest first, until the table fits."""
     limit = terminal_width()
     if limit is None:
         return
@@ -303,7 +305,7 @@ def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
 
 
 def _print_lines(lines: Sequence[str]) -> None:
-    """The first in bold; rich takes too long for the many others."""
+    """Prints the first line in bold. The others are printed without rich, which is slow for many lines."""
     width = terminal_width()
     if width is not None:
         lines = [_cut(line, width, "end") for line in lines]

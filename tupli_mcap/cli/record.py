@@ -1,4 +1,4 @@
-"""The command record: rollouts of an environment."""
+"""The command record: records rollouts of an environment."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _CaptureEnv(StrEnum):
 
     @property
     def argument(self) -> CaptureEnv:
-        """The same for `record_rollouts`."""
+        """The value that `record_rollouts` takes."""
         return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
 
 
@@ -67,66 +67,73 @@ def _check_policy(value: str | None) -> str | None:
 
 
 _EnvId = Annotated[
-    str, typer.Argument(metavar="ENV_ID", help="What gymnasium.make takes, such as CartPole-v1.")
+    str, typer.Argument(metavar="ENV_ID", help="The id for gymnasium.make, such as CartPole-v1.")
 ]
 _Output = Annotated[
     str,
     typer.Option(
-        "--output", "-o", metavar="FILE|DIR/", help="The recording (.mcap), or a directory for a new one."
+        "--output", "-o", metavar="FILE|DIR/", help="The new recording (.mcap), or a directory for it."
     ),
 ]
 _Steps = Annotated[int, typer.Option(min=1, help="How many steps to record, in total.")]
 _Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the first reset and of random actions.")]
-_NumEnvs = Annotated[int, typer.Option(min=1, help="How many sub-environments to step side by side.")]
+_NumEnvs = Annotated[int, typer.Option(min=1, help="How many sub-environments to step together.")]
 _Policy = Annotated[
     str | None,
     typer.Option(
         metavar="MODULE:FUNCTION",
         callback=_check_policy,
-        help="A function from an observation to an action; without it, actions are random.",
+        help="A function that maps an observation to an action; by default, actions are random.",
     ),
 ]
 _ModeOption = Annotated[
     _Mode,
-    typer.Option(help="If the file exists: x refuses, w replaces, a appends (and makes a missing one)."),
+    typer.Option(help="If the file exists, x refuses, w replaces it, a appends to it."),
 ]
 _CompressionOption = Annotated[_Compression, typer.Option(help="How chunks are compressed.")]
-_RecordInfo = Annotated[bool, typer.Option("--record-info", help="Record the infos of steps too.")]
+_RecordInfo = Annotated[bool, typer.Option("--record-info", help="Also record the info dict of each step.")]
 _DurabilityOption = Annotated[
-    _Durability, typer.Option(help="What survives a power loss: step and chunk wait for the disk.")
+    _Durability,
+    typer.Option(
+        help="When to wait for the disk, for power losses: never (os), at each chunk, or each step."
+    ),
 ]
 _Live = Annotated[
     str | None,
     typer.Option(
-        metavar="VIEWER", help="Show the rollout while it is recorded: rerun, foxglove, or a viewer's URL."
+        metavar="VIEWER", help="Show the rollout during recording in rerun, foxglove, or the viewer at a URL."
     ),
 ]
 _Frames = Annotated[
-    bool, typer.Option("--frames", help="Record what the environment renders (rgb_array) too.")
+    bool, typer.Option("--frames", help="Also record the frames that the environment renders (rgb_array).")
 ]
 _Every = Annotated[int, typer.Option(min=1, help="With --frames: only every n-th step.")]
-_CaptureEnvOption = Annotated[_CaptureEnv, typer.Option(help="What to store of the environment.")]
+_CaptureEnvOption = Annotated[
+    _CaptureEnv,
+    typer.Option(help="What to store of the environment: its spec, also its code (pickle), or none."),
+]
 _MaxBytes = Annotated[
-    int | None, typer.Option(min=1, help="Continue in FILE_0001.mcap, … when a file has this many bytes.")
+    int | None, typer.Option(min=1, help="Continue in FILE_0001.mcap, … after this many bytes.")
 ]
 _MaxSeconds = Annotated[
     float | None,
-    typer.Option(
-        min=0.001, help="Continue in a new file after this many seconds. An episode stays in one file."
-    ),
+    typer.Option(min=0.001, help="Continue in a new file after this many seconds, when the episode is over."),
 ]
 
 _Name = Annotated[str | None, typer.Option(metavar="NAME", help="The name of the run.")]
 _Set = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run; may be repeated.")
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Metadata of the run. Repeatable.")
 ]
 _Tag = Annotated[
-    list[str] | None, typer.Option("--tag", metavar="WORD", help="A tag of the run; may be repeated.")
+    list[str] | None, typer.Option("--tag", metavar="WORD", help="A tag of the run. Repeatable.")
 ]
 _Split = Annotated[str, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")]
 _CaptureOption = Annotated[
     _Capture,
-    typer.Option("--capture", help="What to store about this process: command, commit, host, versions."),
+    typer.Option(
+        "--capture",
+        help="What to store about this process: command, commit, host and versions (all), versions only, or none.",
+    ),
 ]
 
 
@@ -156,18 +163,18 @@ def record(
 ) -> None:
     """Record rollouts of an environment.
 
-    A policy, or an ENV_ID such as my_envs:Maze-v0, may be in a module of the current
-    directory. Ctrl-C ends the recording early: what was recorded stays, and the command says
-    how much that is.
+    The module of a policy, or of an ENV_ID such as my_envs:Maze-v0, may be in the current
+    directory. Ctrl-C ends the recording early: the file keeps all steps until then, and the
+    command says how many.
     """
     if every > 1 and not frames:
-        raise typer.BadParameter("--every says of how many steps frames are recorded; give --frames too")
-    if frames:  # no window is opened: pygame need not look for a screen
+        raise typer.BadParameter("--every thins out frames; give --frames too")
+    if frames:  # nothing is shown on a screen: pygame must not look for one
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
     if policy is not None or ":" in env_id:
-        sys.path.append("")  # last: a file that happens to lie here replaces no installed module
+        sys.path.append("")  # last, so that a file in this directory replaces no installed module
     function = None if policy is None else load_policy(policy)
     with (
         _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode is _Mode.w),
@@ -201,14 +208,14 @@ def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -> Iterator[None]:
-    """Adds to Ctrl-C what the recording holds by now; with a limit, the files it went on in count too."""
+    """Adds to a KeyboardInterrupt how much is recorded; with a `limit`, over all files of the series."""
     before = output.stat().st_ino if replaces and output.exists() else None
     try:
         yield
     except KeyboardInterrupt as err:
         held = _held(output, limit)
         if before is not None and output.exists() and output.stat().st_ino == before:
-            held = f"{held}; this is the file that was there before"
+            held = f"{held}; this is the earlier file, which was not replaced"
         raise KeyboardInterrupt(held) from err
 
 
@@ -235,7 +242,7 @@ def _held(output: Path, limit: float | None) -> str:
 
 
 def _mean_text(summary: RolloutSummary) -> list[str]:
-    """The mean return, and what it leaves out; nothing where no episode was recorded."""
+    """The mean return, and how many NaN it leaves out; empty if no episode was recorded."""
     from tupli_mcap.recording.description import nan_text
 
     odd = nan_text(summary.return_nan, summary.episodes)

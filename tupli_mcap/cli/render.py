@@ -1,4 +1,4 @@
-"""Commands that make pictures: render (of what an environment looked like), plot (of numbers)."""
+"""Commands that make pictures: render (of an environment), plot (of numbers)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _X(StrEnum):
 _Source = Annotated[
     str,
     typer.Argument(
-        metavar="FILE|STORAGE", help="A recording: a path or a URL; or a directory with the recording."
+        metavar="FILE|STORAGE", help="A recording (a path or a URL), or a directory that holds it."
     ),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
@@ -54,7 +54,7 @@ _Trust = Annotated[
     bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
 ]
 _Rerun = Annotated[
-    bool, typer.Option("--rerun", help="Take the episodes again, even if pictures were recorded.")
+    bool, typer.Option("--rerun", help="Run the episodes again, even if they were recorded with pictures.")
 ]
 _Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
@@ -72,25 +72,25 @@ def render(
     force: _Force = False,
     as_json: Json = False,
 ) -> None:
-    """Make a film of episodes, or pictures of those without.
+    """Make a film of episodes, or a copy with frames.
 
-    An MP4 or a GIF shows the pictures that were recorded: frames, or an image of the states.
+    An .mp4 or a .gif shows the pictures in the recording: frames, or an image of the states.
     Nothing is executed.
 
-    If there are none, with --rerun, and for an .mcap, the environment is rebuilt and takes
-    the episodes again. Every step is compared with the recording, bit for bit. The frames go
-    into a copy of the recording (as /camera/render), into an MP4, or into a GIF.
+    If the recording has no pictures, or with --rerun, or for an .mcap, the environment is
+    rebuilt and runs the episodes again. Every step is compared with the recording, bit for
+    bit. The frames go into a copy of the recording (as /camera/render), an MP4, or a GIF.
 
-    In a storage, best and worst are looked for in all recordings; other episodes have to be
-    in one recording.
+    In a storage, best and worst are searched in all recordings; other episodes have to be of
+    one recording.
 
-    Where the environment behaves differently, rendering ends: the frames before that are
-    written, the command names the difference, and exits with 1. It also exits with 1 if an
-    episode cannot be taken again.
+    Where the environment behaves differently, rendering stops: the command writes the frames
+    before that step, names the difference, and exits with 1. It also exits with 1 if an
+    episode cannot be run again.
     """
     from tupli_mcap.replay import film, has_pictures, render
 
-    # no window is opened: pygame need not look for a screen
+    # nothing is shown on a screen: pygame must not look for one
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with (
         _chosen(source, episodes or "best", filter_of(filter_text)) as (recording, chosen),
@@ -129,7 +129,7 @@ def _print_film(path: Path, pictures: int, *, as_json: bool) -> None:
 def _chosen(
     source: str, episodes: str, wanted: BaseFilter | None
 ) -> Iterator[tuple[Recording, list[Episode]]]:
-    """Some episodes, and the one recording that they are of."""
+    """The chosen episodes and their recording. RecordingError if they are of several."""
     from tupli_mcap.dataset.which import choose_episodes, chosen_from
     from tupli_mcap.recording import Recording
 
@@ -141,7 +141,7 @@ def _chosen(
         if len(found) > 1:
             names = ", ".join(Path(item.recording.name).name for item in found[:_MOST_NAMES])
             raise RecordingError(
-                f"expected episodes of one recording to render, found some of {len(found)} in {source} "
+                f"expected episodes of one recording to render, found episodes of {len(found)} in {source} "
                 f"({names}{', …' if len(found) > _MOST_NAMES else ''}); give the path of one of them, or choose with "
                 "--episodes best, worst, first or last"
             )
@@ -170,10 +170,10 @@ def _print(report: RenderReport) -> None:
             f"{bytes_of(report.path.stat().st_size)} in {report.seconds:.1f} s"
         )
     if report.signature_left_out:
-        say("its signature is left out: it is of the recording without these frames")
+        say("the copy has no signature: the recording was signed without these frames")
     for skipped in report.skipped:
         fail(
-            f"{counted(skipped.episodes, 'episode')} cannot be replayed, the first is {skipped.first}: "
+            f"{counted(skipped.episodes, 'episode')} cannot be run again, the first is {skipped.first}: "
             f"{skipped.reason}"
         )
     if report.divergence is not None:
@@ -197,7 +197,7 @@ _Drawing = Annotated[
         "--output",
         "-o",
         metavar="FILE",
-        help="A .png, .svg, .pdf or .html; by default FILE's name with .png.",
+        help="A .png, .svg, .pdf or .html; by default, FILE's name with .png.",
     ),
 ]
 _Shown = Annotated[
@@ -212,7 +212,7 @@ _Shown = Annotated[
 _Axis = Annotated[
     _X | None,
     typer.Option(
-        "--x", help="The horizontal axis; by default episodes of one recording, or steps of several."
+        "--x", help="The horizontal axis; by default, episodes for one recording, steps for several."
     ),
 ]
 
@@ -228,12 +228,12 @@ def plot(
 ) -> None:
     """Draw a report of recordings as a picture or a page.
 
-    It shows returns, lengths, success, numbers of infos and metadata, states, actions,
+    It shows returns, lengths, success, numbers in infos and metadata, states, actions,
     rewards, and one episode step by step. Several recordings are compared. Runs whose names
-    or settings differ by their seeds only are drawn as one: their mean with its 95% interval
-    (percentile bootstrap) as far as all of them go, and a thin line for each. The output's
-    extension says what it is; an .html needs no network. Nothing in a file is executed. Needs
-    the extra `plot` (matplotlib).
+    or settings differ only by their seeds are drawn as one: a thin line for each, and their
+    mean with its 95% interval (percentile bootstrap) as far as all of them go. The extension
+    of the output sets its format; an .html needs no network. Nothing in a file is executed.
+    Needs the extra `plot` (matplotlib).
     """
     from tupli_mcap.plots import check_goal, report
 

@@ -1,4 +1,4 @@
-"""The command replay: recordings in the Rerun viewer, and a layout for Foxglove."""
+"""The command view: shows recordings in the Rerun viewer, or writes a layout for Foxglove."""
 
 from __future__ import annotations
 
@@ -14,30 +14,31 @@ from tupli_mcap.cli.terminal import flush, say
 __all__ = ["replay"]
 
 _Sources = Annotated[
-    list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories of a storage.")
+    list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories, storages.")
 ]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Split = Annotated[
     bool,
-    typer.Option("--split/--joined", help="Each episode on its own, or all on one timeline."),
+    typer.Option("--split/--joined", help="Show each episode on its own, or all on one timeline."),
 ]
 _Save = Annotated[
-    Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead.")
+    Path | None,
+    typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead of opening it."),
 ]
 _Web = Annotated[
-    bool, typer.Option("--web", help="Serve a viewer for the browser on 127.0.0.1, until Ctrl-C.")
+    bool, typer.Option("--web", help="Show it in a browser: serves the viewer on 127.0.0.1 until Ctrl-C.")
 ]
 _Connect = Annotated[
     str | None,
     typer.Option(
-        "--connect", metavar="URL", help="Send to a viewer that runs: rerun+http://HOST:PORT/proxy."
+        "--connect", metavar="URL", help="Send it to a running viewer: rerun+http://HOST:PORT/proxy."
     ),
 ]
-_Force = Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 _Layout = Annotated[
     Path | None,
     typer.Option(
-        "--layout", metavar="FILE.json", help="Write a layout with which Foxglove plots the recording."
+        "--layout", metavar="FILE.json", help="Only write a layout for Foxglove that plots the recording."
     ),
 ]
 
@@ -57,24 +58,25 @@ def replay(
     """Look at recordings in the Rerun viewer.
 
     It shows states, actions, rewards, infos and images over time. Of more than ten episodes,
-    it shows the last, the best and the worst below the returns of all; --episodes all shows
-    every one. Timelines are the step, the episode's time (if the recording knows how long a
-    step takes), and the wall clock. Needs the extra `rerun`.
+    it shows the returns of all, and the steps of the last, the best and the worst one;
+    --episodes all shows the steps of all. Timelines are the step, the time within the episode
+    (if the recording has the duration of a step), and the wall clock. Needs the extra
+    `rerun`.
     """
     goals = sum([web, save is not None, connect is not None])
     if layout is not None:
         if episode or filter_text or compare or split or goals:
-            raise typer.BadParameter("--layout is of a whole recording, and goes with --force only")
+            raise typer.BadParameter(
+                "--layout goes only with --force: a layout is made for a whole recording"
+            )
         _write_layout(sources, layout, force=force)
         return
     if compare and split:
         raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
     if goals > 1:
-        raise typer.BadParameter(
-            "--save, --web and --connect are three places to show episodes; give one of them"
-        )
+        raise typer.BadParameter("--save, --web and --connect exclude each other; give one of them")
     if force and save is None:
-        raise typer.BadParameter("--force replaces the file of --save; give that too")
+        raise typer.BadParameter("--force goes with --save or --layout, whose file it replaces")
     from tupli_mcap import viewer
     from tupli_mcap.viewer.sdk import import_quickly
 
@@ -94,7 +96,7 @@ def replay(
 
 
 def _tell(url: str, *notes: str) -> None:
-    say(url, "open it in a browser; Ctrl-C ends it", *notes)
+    say(url, "open this address in a browser; Ctrl-C ends the viewer", *notes)
     flush()
 
 
@@ -102,4 +104,4 @@ def _write_layout(sources: list[str], target: Path, *, force: bool) -> None:
     from tupli_mcap.viewer.foxglove_layout import write_layout
 
     path = write_layout(sources, target, force=force)
-    say(f"{path}: for Foxglove: open the recording, then import this as a layout")
+    say(f"{path}: open the recording in Foxglove, then import this file as a layout")

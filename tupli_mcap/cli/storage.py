@@ -49,15 +49,23 @@ __all__ = [
     "restore",
 ]
 
-_ROOMY = 100  # columns of a terminal on which benchmarks and their environments fit side by side
+_ROOMY = 100  # columns a terminal needs for benchmarks and their environments side by side
 
 
 def list_benchmarks(
-    place: AnyStorage = str(DEFAULT_STORAGE), filter_text: FilterText = None, as_json: Json = False
+    place: AnyStorage = str(DEFAULT_STORAGE),
+    filter_text: Annotated[
+        str | None,
+        typer.Option(
+            "--filter", metavar="FILTER", help="Which benchmarks, such as 'metadata.difficulty = \"hard\"'."
+        ),
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """List the benchmarks of a storage.
 
-    Filters compare id, environment, created_at, metadata.name, metadata.difficulty, metadata.extra.<name>, ...
+    A filter compares keys: id, environment, created_at, metadata.name, metadata.difficulty,
+    metadata.extra.<name>, ...
     """
     with any_storage(place) as storage:
         headers = storage.list_benchmarks(filter_of(filter_text))
@@ -88,11 +96,16 @@ def list_benchmarks(
 
 
 def list_artifacts(
-    place: AnyStorage = str(DEFAULT_STORAGE), filter_text: FilterText = None, as_json: Json = False
+    place: AnyStorage = str(DEFAULT_STORAGE),
+    filter_text: Annotated[
+        str | None,
+        typer.Option("--filter", metavar="FILTER", help="Which artifacts, such as 'name = \"wind.csv\"'."),
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """List the artifacts of a storage.
 
-    Filters compare id, name, description, created_at, extra.<name>, ...
+    A filter compares keys: id, name, description, created_at, extra.<name>, ...
     """
     with any_storage(place) as storage:
         items = storage.list_artifacts(filter_of(filter_text))
@@ -119,8 +132,8 @@ def list_episodes(
 ) -> None:
     """List the episodes of a storage.
 
-    --filter, --sort and --columns take what they take in tupli-mcap episodes, which lists
-    files and directories too.
+    --filter, --sort and --columns take the same texts as in tupli-mcap episodes, which also
+    lists files and directories.
     """
     with any_storage(place) as storage:
         list_stored(storage, filter_text, sort, columns, limit, as_json)
@@ -137,16 +150,16 @@ def delete(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Remove a recording that has no episode left.")
+        bool, typer.Option("--force", help="Remove recordings whose episodes are all deleted.")
     ] = False,
     dry_run: _DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Delete episodes; restore brings them back.
 
-    A note beside the recording (FILE.json) says that they are deleted; the recording itself
-    is not touched. compact frees their space. Before that, whoever copies the recording alone
-    copies the deleted episodes too.
+    A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
+    is not touched until compact frees their space. A copy of the recording without FILE.json
+    still shows them.
     """
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
@@ -164,8 +177,8 @@ def delete(
             positions = among if episodes is None else named_positions(recording, among, episodes, wanted)
             if len(positions) and len(positions) == len(candidates(recording)) and not force:
                 raise RecordingError(
-                    f"{path}: every episode would be deleted, and the file with them, which nothing brings back; "
-                    "choose fewer, or remove it with --force"
+                    f"{path}: all its episodes would be deleted, and with them the file, which restore cannot bring "
+                    "back; choose fewer episodes, or remove the file with --force"
                 )
             ids = [recording.episodes[position].id for position in positions]
         doomed.setdefault(storage_of(path.absolute()), []).extend(ids)
@@ -185,7 +198,7 @@ def restore(
 ) -> None:
     """Bring deleted episodes back, by default all.
 
-    Those whose space compact has freed are gone.
+    It cannot bring back episodes whose space compact has freed.
     """
     from tupli_mcap.dataset.which import bounds_of
     from tupli_mcap.recording.recover.prefix import metadata_at
@@ -221,9 +234,9 @@ def compact(
 ) -> None:
     """Free the space of deleted episodes.
 
-    Recordings that hold deleted episodes are rewritten without them, and temporary files that killed processes
-    have left are removed.
-    Episodes that stay keep their ids. Recordings that are being written are left alone.
+    Rewrites recordings without their deleted episodes, and removes temporary files of killed
+    processes. Episodes that stay keep their ids. Recordings that a process is writing to are
+    left alone.
     """
     from tupli_mcap.files import left_below
     from tupli_mcap.storage.listing import compactable
@@ -252,7 +265,7 @@ def compact(
 
 def rename(
     benchmark: Annotated[
-        str, typer.Argument(metavar="BENCHMARK_ID", help="The benchmark's id; its first 4 digits are enough.")
+        str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark's id; its first 4 digits are enough.")
     ],
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="The new name.")] = None,
     description: Annotated[str | None, typer.Option(help="The new description.")] = None,
@@ -263,15 +276,15 @@ def rename(
 ) -> None:
     """Give a benchmark another name or description.
 
-    It keeps its id and its episodes; lists, filters and bundles show the new name. The name
-    of a run is changed by edit.
+    It keeps its id and its episodes; lists, filters and bundles use the new name. To rename a
+    run, use edit.
     """
     if Path(benchmark).is_file():
         raise typer.BadParameter(
-            f"{benchmark} is a recording; its run: tupli-mcap edit {benchmark} --name NAME"
+            f"{benchmark} is a recording; to rename its run: tupli-mcap edit {benchmark} --name NAME"
         )
     if undo == (name is not None or description is not None):
-        raise typer.BadParameter("give a name or --description, or --undo")
+        raise typer.BadParameter("expected a NAME or --description, or else --undo")
     with open_storage(storage_path) as storage:
         uri = full_id(storage, benchmark)
         if undo:
@@ -286,9 +299,9 @@ def rename(
 
 
 def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:
-    """Make the catalog of a storage anew.
+    """Rebuild the catalog of a storage.
 
-    The catalog is an index of the recordings, which are the only truth.
+    The catalog is an index of its episodes, made from the recordings.
     """
     with open_storage(storage_path) as storage:
         storage.reindex()

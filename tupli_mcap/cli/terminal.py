@@ -1,10 +1,9 @@
 """The only module of the command line that writes to stdout and stderr.
 
-Names, messages and values come from files, and a file may be a stranger's. A control character in them would move the
-cursor, change colours or hide what stands before it, and a right-to-left override would show a name backwards. So
-whatever is printed here is made visible first: such a character is written as an escape (`\\x1b`), one of our own
-colours is given as a style and never as text, and no markup is looked for. Other modules hand their lines over to
-`say`, `fail` and the like, and do not print.
+Names, messages and values come from files, and a file may be a stranger's. A control character in them could move the
+cursor, change colours or hide text, and a right-to-left override could show a name backwards. So `visible` replaces
+each such character by an escape (`\\x1b`) before anything is printed. Our own colours are given as styles, never as
+text, and markup is not interpreted. Other modules call `say`, `fail` and the like, and never print.
 """
 
 from __future__ import annotations
@@ -45,19 +44,19 @@ _hide_bar: Callable[[], None] | None = None
 
 
 def visible(text: str) -> str:
-    """A text in one line, with an escape for each character that is none to look at."""
+    """Replaces each character of a text that has no visible shape, line breaks too, by an escape."""
     if text.isprintable():
         return text
     return "".join(char if _is_plain(char) else _escaped(char) for char in text)
 
 
 def one_line(text: str) -> str:
-    """The same of a message, whose line breaks become blanks."""
+    """The same for a message whose line breaks become blanks."""
     return visible(" ".join(text.split()))
 
 
 def _is_plain(char: str) -> bool:
-    """Whether a character is one to look at; Python counts blanks other than the usual one among the others."""
+    """Whether a character may be printed. All blanks may; `isprintable` accepts only the usual one."""
     return char.isprintable() or unicodedata.category(char) == "Zs"
 
 
@@ -74,7 +73,7 @@ def say(*lines: str) -> None:
 
 
 def say_styled(*parts: tuple[str, str]) -> None:
-    """Print one line of (text, style as rich names it); where stdout is no terminal, without the styles."""
+    """Print one line of parts (text, style of rich); without styles if stdout is no terminal."""
     from rich.console import Console
     from rich.text import Text
 
@@ -84,7 +83,7 @@ def say_styled(*parts: tuple[str, str]) -> None:
 
 
 def say_json(text: str) -> None:
-    """Print a JSON document, its lines as they are; in its strings, characters become `\\u` escapes."""
+    """Print a JSON document. Unprintable characters, or those that stdout cannot encode, become `\\u` escapes."""
     raw = can_print(text)
     _write(
         sys.stdout,
@@ -98,17 +97,17 @@ def _json_escaped(char: str) -> str:
 
 
 def flush() -> None:
-    """Hand over what was said so far."""
+    """Flush stdout."""
     sys.stdout.flush()
 
 
 def stop_writing() -> None:
-    """Nobody reads stdout any more: what is still to be written, at exit too, goes nowhere."""
+    """Send the rest of stdout to nowhere, because its reader has closed it; Python flushes it at exit, too."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def can_print(text: str) -> bool:
-    """Whether stdout has these characters."""
+    """Whether stdout can encode these characters."""
     try:
         text.encode(sys.stdout.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -117,7 +116,7 @@ def can_print(text: str) -> bool:
 
 
 def terminal_width() -> int | None:
-    """The width that output has to fit (columns); None where it is no terminal: then nothing is cut."""
+    """The width of stdout (columns); None if it is no terminal: then nothing is cut."""
     if os.environ.get("COLUMNS", "").isdecimal():
         return int(os.environ["COLUMNS"])
     try:
@@ -132,13 +131,13 @@ def _write(stream: TextIO, text: str) -> None:
 
 
 def _clear() -> None:
-    """Takes a bar away, beside which what is printed would stand."""
+    """Hides the progress bar, so that text does not end up in its line."""
     if _hide_bar is not None:
         _hide_bar()
 
 
 def _encodable(stream: TextIO, text: str) -> str:
-    """A text with escapes for the characters that the encoding of a stream lacks."""
+    """Replaces characters that a stream cannot encode by escapes."""
     encoding = stream.encoding or "ascii"
     return text.encode(encoding, "backslashreplace").decode(encoding)
 
@@ -147,24 +146,24 @@ def _encodable(stream: TextIO, text: str) -> str:
 
 
 def fail(message: str) -> None:
-    """Print what is wrong: one line on stderr."""
+    """Print an error as one line on stderr."""
     _write(sys.stderr, f"error: {one_line(message)}\n")
 
 
 def say_interrupted(message: str) -> None:
-    """Print that the user pressed Ctrl-C, which is no error: one line on stderr."""
+    """Print a message about Ctrl-C, which is no error, as one line on stderr."""
     _write(sys.stderr, f"{one_line(message)}\n")
 
 
 def print_traceback(err: BaseException) -> None:
-    """Print where an exception comes from, on stderr."""
+    """Print the traceback of an exception on stderr."""
     lines = "".join(traceback.format_exception(err)).rstrip("\n").split("\n")
     _write(sys.stderr, "".join(f"{visible(line)}\n" for line in lines))
 
 
 @contextlib.contextmanager
 def warnings_in_one_line() -> Iterator[None]:
-    """Warnings become `warning: ...` on stderr, each once; those for programmers are not shown."""
+    """Prints each warning once, as `warning: ...` on stderr; hides those meant for programmers."""
     said: set[str] = set()
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
@@ -182,7 +181,7 @@ def warnings_in_one_line() -> Iterator[None]:
 
 
 def ask_secret(question: str) -> str | None:
-    """What the user types in answer, without showing it; None where nobody is there to be asked."""
+    """Ask for a text without showing what is typed; None if stdin is no terminal."""
     if not sys.stdin.isatty():
         return None
     import typer
@@ -193,7 +192,7 @@ def ask_secret(question: str) -> str | None:
 
 @contextlib.contextmanager
 def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
-    """Gives a function to be told of the steps done; None where stderr is no terminal."""
+    """Shows a progress bar; yields a function that takes the number of steps done. None if stderr is no terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -211,7 +210,7 @@ def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int
 
 @contextlib.contextmanager
 def fetch_progress() -> Iterator[None]:
-    """Shows the bytes that come from servers in ranges, where that takes a while."""
+    """Shows a progress bar of bytes fetched from servers, once that takes a while."""
     global _hide_bar
     from tupli_mcap.progress import progress
     from tupli_mcap.remote import watching
@@ -234,7 +233,7 @@ def fetch_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def status(doing: str) -> Iterator[Callable[[str], None] | None]:
-    """Gives a function that shows what is being worked on; None where stderr is no terminal, or a bar shows."""
+    """Yields a function that shows what is being worked on; None if stderr is no terminal, or a bar is shown."""
     if not sys.stderr.isatty() or _hide_bar is not None:
         yield None
         return

@@ -1,4 +1,4 @@
-"""The command verify: checks files for damage, and with --rerun what the environments do now."""
+"""The command verify: checks files for damage, and with --rerun runs their episodes again."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ __all__ = ["verify"]
 
 _STATES = {"unfinished": "not finished", "recording": "being recorded"}
 _NOTHING = "nothing to be done"
-_PROBLEMS = 20  # of a file that are shown; what is beyond is in --json
-_DIVERGING = 5  # episodes beside the first that are shown; what is beyond is in --json
+_PROBLEMS = 20  # how many problems of a file are shown; --json has all
+_DIVERGING = 5  # how many diverging episodes after the first are shown; --json has all
 
 
 def verify(
@@ -35,12 +35,12 @@ def verify(
     replay: Annotated[
         bool,
         typer.Option(
-            "--rerun", "--replay", help="Also take the episodes again, and compare them bit for bit."
+            "--rerun", "--replay", help="Also run the episodes again, and compare them bit for bit."
         ),
     ] = False,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="With --rerun: run code from the files, with all reset options."),
+        typer.Option("--trust", help="With --rerun: allow code and reset options from the files."),
     ] = False,
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -49,14 +49,14 @@ def verify(
     """Check files for damage.
 
     Checks structure, CRCs, indexes, layouts, alignment and digests: every episode has to
-    start, go on and end, without a gap or a repeated step. In a storage, artifacts,
+    have a start and an end, and no missing or repeated step. In a storage, artifacts,
     benchmarks and the catalog are checked too. Nothing is executed, nothing is written. The
     command exits with 1 if something is damaged.
 
-    --rerun rebuilds the environment of each recording, takes every episode again with its
-    seed, options and actions, and says where something differs. It exits with 1 if something
-    does, or if nothing could be checked. --episodes and --filter choose the episodes; those
-    that they depend on are taken again too.
+    --rerun rebuilds the environment of each recording, runs every episode again with its
+    seed, options and actions, and shows where it differs. The command then also exits with 1
+    if an episode differs, or if none could be checked. --episodes and --filter choose the
+    episodes; those that they depend on are run again too.
     """
     replays = _Replays(trust, episodes, filter_of(filter_text)) if replay else None
     if replays is None and (trust or episodes is not None or filter_text is not None):
@@ -78,18 +78,18 @@ def verify(
     elif len(storage_report.files) > 1:
         say(f"{number(len(storage_report.files))} verified, {number(len(storage_report.damaged))} damaged")
     if replays is not None and not replays.tried and not as_json:
-        fail("nothing was replayed: there is no undamaged recording with such an episode")
+        fail("no episode was run again: no undamaged recording has such an episode")
     if not storage_report.ok or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
 
 def _print_verified(report: VerifyReport) -> None:
-    """A line on a file, one on each problem that does not follow from another, and what to do about them."""
+    """Prints a line on the file, one for each problem that is no consequence of another, and what to do about them."""
     from tupli_mcap.recording.check.report import RECOVER
 
     unread = report.kind == "recording" and not (report.ok or report.episodes)
     facts = (
-        "its episodes cannot be read as it is"
+        "its episodes cannot be read"
         if unread
         else {
             "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
@@ -121,10 +121,10 @@ def _print_verified(report: VerifyReport) -> None:
 
 
 class _Replays:
-    """Recordings replayed one after another; one that cannot be stops nothing."""
+    """Runs the episodes of recordings again, and goes on after a recording that fails."""
 
     def __init__(self, trust: bool, episodes: str | None, wanted: BaseFilter | None) -> None:
-        if episodes is not None or wanted is not None:  # the choice takes a while to import
+        if episodes is not None or wanted is not None:  # spares the import
             from tupli_mcap.dataset.which import check_choice
 
             check_choice(episodes or "all", wanted)
@@ -135,23 +135,26 @@ class _Replays:
 
     @property
     def tried(self) -> bool:
-        """Whether there was a recording to replay."""
+        """Whether there was a recording with chosen episodes."""
         return bool(self._found)
 
     @property
     def ok(self) -> bool:
-        """True if something was replayed, and all of it agrees."""
+        """True if at least one recording was run again, and all agree."""
         certificates = [certificate for _, certificate, _ in self._found]
         return bool(certificates) and all(found is not None and found.agrees for found in certificates)
 
     def add(self, path: str, *, quiet: bool) -> None:
-        """Replays a recording; says the outcome unless `quiet`."""
+        """Runs the chosen episodes of a recording again; prints the outcome unless `quiet`."""
         from tupli_mcap.recording import Recording
         from tupli_mcap.replay import certify
 
         began = time.perf_counter()
         try:
-            with Recording(path) as recording, step_progress(recording.num_steps, "replaying") as progress:
+            with (
+                Recording(path) as recording,
+                step_progress(recording.num_steps, "running again") as progress,
+            ):
                 numbers = self._numbers(recording)
                 if numbers == []:
                     return
@@ -169,7 +172,7 @@ class _Replays:
                 print_wrapped(line, "  ", "    ")
 
     def _numbers(self, recording: Recording) -> list[int] | None:
-        """The chosen episodes; None for all, none if the filter leaves all out."""
+        """The numbers of the chosen episodes; None for all, an empty list if the filter matches none."""
         from tupli_mcap.dataset.which import candidates, named_positions
 
         if self._episodes is None and self._wanted is None:
@@ -196,7 +199,7 @@ def _outcome(c: Certificate) -> str:
     if c.first is not None:
         return str(c.first)
     if not c.agrees:
-        return "nothing could be checked" if c.recorded.episodes else "there is no episode to replay"
+        return "no episode could be checked" if c.recorded.episodes else "it has no episodes"
     if c.complete:
         return f"all {counted(c.agreed.episodes, 'episode')} ({counted(c.agreed.steps, 'step')}) agree bit for bit"
     steps = f"{number(c.agreed.steps)} of {counted(c.recorded.steps, 'step')}"
@@ -225,7 +228,7 @@ def _lines(c: Certificate, seconds: float) -> list[str]:
     ]
     versions = ", ".join(f"{name} {version}" for name, version in c.versions.items())
     machine = " ".join(c.platform.get(name, "") for name in ("system", "machine")).strip()
-    lines.append(f"replayed in {seconds:.1f} s on {c.environment} with {versions}, {machine}")
+    lines.append(f"run again in {seconds:.1f} s on {c.environment} with {versions}, {machine}")
     return lines
 
 

@@ -1,11 +1,11 @@
-"""Commands that hand things on.
+"""Commands that share benchmarks and recordings.
 
-bundle     one file with all that a benchmark needs, and back
-exchange   push, pull, publish: between a directory and a server
+bundle     bundle, import, export: files
+exchange   push, pull, publish, unpublish: between a directory and a server
 account    login, logout, whoami, signup, password
 people     users, groups, roles, tokens for machines
-browse     a page of recordings on this machine
-serve      the server
+browse     browse: recordings in a browser
+serve      serve: the server
 upkeep     backup-server, restore-server
-trust      whose code may run
+trust      trust, untrust: whose code may run
 """

@@ -1,4 +1,4 @@
-"""Commands on accounts at a server: login, logout, whoami, signup, password."""
+"""Commands for accounts on a server: login, logout, whoami, signup, password."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Url = Annotated[
     typer.Option(
         envvar="TUPLI_MCAP_URL",
         metavar="URL",
-        help="The server; by default that of the last login, or this machine.",
+        help="The server; by default, that of the last login, or this machine.",
         readable=False,
     ),
 ]
-Username = Annotated[str, typer.Argument(metavar="USER")]
+Username = Annotated[str, typer.Argument(metavar="USER", help="The user's name.")]
 
 
 def login(username: Username, url: Url = None, as_json: Json = False) -> None:
     """Sign in to a server, until logout.
 
-    The password is asked for, or is in TUPLI_MCAP_PASSWORD.
+    The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
     from tupli_mcap.storage import TupliAPIClient
 
@@ -39,7 +39,7 @@ def login(username: Username, url: Url = None, as_json: Json = False) -> None:
 
 
 def logout(url: Url = None, as_json: Json = False) -> None:
-    """Sign out."""
+    """Sign out of a server."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -49,7 +49,7 @@ def logout(url: Url = None, as_json: Json = False) -> None:
 
 
 def whoami(url: Url = None, as_json: Json = False) -> None:
-    """Show who is signed in, and their roles."""
+    """Show which user is signed in, and their roles."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -64,23 +64,26 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
 
 
 def signup(username: Username, url: Url = None, as_json: Json = False) -> None:
-    """Make a user.
+    """Create a user on a server.
 
-    Everybody may where the server was started with --open-signup, else who has the right to.
+    If the server was started with --open-signup, everybody may; else it takes the right
+    user_create. The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
         client.signup(username, _password("Password of the new user: "))
-        _tell(client.url, username, f"made the user {username} at {client.url}", as_json=as_json)
+        _tell(client.url, username, f"created the user {username} at {client.url}", as_json=as_json)
 
 
 def password(
-    username: Annotated[str | None, typer.Argument(metavar="[USER]", help="By default, you.")] = None,
+    username: Annotated[
+        str | None, typer.Argument(metavar="[USER]", help="The user's name; by default, yours.")
+    ] = None,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Change a password, and end all sign-ins.
+    """Change a password, and end all of the user's sign-ins.
 
     Passwords are asked for, or taken from TUPLI_MCAP_PASSWORD (the old one) and
     TUPLI_MCAP_NEW_PASSWORD.
@@ -109,5 +112,5 @@ def _tell(url: str, username: str, line: str, *, as_json: bool) -> None:
 def _password(question: str, variable: str = "TUPLI_MCAP_PASSWORD") -> str:
     found = os.environ.get(variable) or ask_secret(question)
     if not found:
-        raise StorageError(f"a password is needed: nobody is there to be asked, and {variable} is not set")
+        raise StorageError(f"no password: stdin is no terminal to ask on; set {variable}")
     return found

@@ -1,4 +1,4 @@
-"""The command that shows recordings in a browser: browse."""
+"""The command browse: shows recordings in a browser."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ def browse(
         Path,
         typer.Argument(metavar="PATH", help="A directory, a storage, or a recording.", parser=local_path),
     ] = Path(),
-    port: Annotated[int, typer.Option(min=0, max=65535, help="By default, a free one.")] = 0,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Only print the address.")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The port; 0 takes a free one.")] = 0,
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="Only print the address, and open no browser.")
+    ] = False,
 ) -> None:
     """Look through recordings in a browser.
 
-    Datasets, tables of episodes, films and curves. The page is served on 127.0.0.1 until Ctrl-C. It changes nothing,
-    asks no other server for anything, and shows what is new when it is reloaded, also what is being recorded. Every
-    page is JSON too, with ?format=json.
+    Shows datasets, tables of episodes, films and curves. Its pages are served on 127.0.0.1
+    until Ctrl-C. They change no file, and load nothing from other servers. Reload a page to
+    see new recordings, also running ones. With ?format=json, a page is JSON.
     """
     try:
         from tupli_mcap.page.app import browse as serve

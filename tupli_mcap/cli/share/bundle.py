@@ -1,4 +1,4 @@
-"""Commands that hand recordings on and take them in: bundle, import, export."""
+"""Commands that share recordings as files: bundle, import, export."""
 
 from __future__ import annotations
 
@@ -54,17 +54,18 @@ def bundle(
 ) -> None:
     """Write a benchmark with everything it needs to a file.
 
-    The file carries the benchmark, its artifacts and its episodes: nothing else is needed to
-    use it. A benchmark's id takes all its episodes (or those of the filter) from the storage.
-    FILE takes the episodes of that recording, and what it lacks from the storage.
+    The file holds the benchmark, its artifacts and its episodes: nothing else is needed to
+    use it. Give a benchmark's id to take its episodes (all, or those of the filter) from the
+    storage. Give a FILE to take the episodes of that recording; the storage adds what the
+    file lacks.
 
-    --sign takes a key that `ssh-keygen -t ed25519` makes. Its passphrase is asked for, or
-    taken from TUPLI_MCAP_KEY_PASSPHRASE.
+    `ssh-keygen -t ed25519` makes a key for --sign. Its passphrase is asked for, or taken from
+    TUPLI_MCAP_KEY_PASSPHRASE.
     """
     key = None if sign is None else _signing_key(sign)
     if is_url(source) or source.endswith(".mcap") or Path(source).is_file():
         if filter_text is not None:
-            raise typer.BadParameter("a filter goes with a benchmark id, not with a file")
+            raise typer.BadParameter("--filter goes with a benchmark id, not with a file")
         from tupli_mcap.storage.bundles import bundle_recording
 
         with (
@@ -79,7 +80,7 @@ def bundle(
 
 
 def _local(file: str) -> AbstractContextManager[Path]:
-    """A file, or what is at a URL, fetched unless it is kept."""
+    """The path of a file; a URL is downloaded first, unless the cache has it."""
     if not is_url(file):
         return nullcontext(Path(file))
     from tupli_mcap.storage.downloads import fetched_url
@@ -95,8 +96,8 @@ def export(
 ) -> None:
     """Write episodes of a storage to one file.
 
-    They must be of one benchmark; its artifacts stay behind (use bundle to take them along).
-    With several benchmarks in the storage, choose one: --filter 'benchmark_id = "..."'.
+    They must be of one benchmark. If the storage has several, choose one with
+    --filter 'benchmark_id = "..."'. Artifacts are left out; use bundle to include them.
     """
     with open_storage(storage_path) as storage:
         storage.export(output, filter_of(filter_text))
@@ -106,24 +107,30 @@ def export(
 def import_(
     file: Source,
     storage_path: StoragePath = DEFAULT_STORAGE,
-    trust: Annotated[bool, typer.Option("--trust", help="Also trust its environment's code.")] = False,
+    trust: Annotated[bool, typer.Option("--trust", help="Also trust the code of its environment.")] = False,
     require_signature: Annotated[
-        bool, typer.Option("--require-signature", help="Refuse it unless a key you trust has signed it.")
+        bool,
+        typer.Option(
+            "--require-signature", help="Refuse the file unless a key that you trust has signed it."
+        ),
     ] = False,
     signers: Annotated[
         list[str] | None,
         typer.Option(
-            "--from", metavar="KEY", help="The signer: a name, fingerprint or .pub file. Repeatable."
+            "--from",
+            metavar="KEY",
+            help="Who must have signed it: a name, fingerprint or .pub file. Repeatable.",
         ),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only check it and say what is new.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only check the file, and say what is new.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Take a bundle into a storage.
+    """Copy a bundle into a storage.
 
-    A missing storage is made. Importing a file again changes nothing. Nothing in the file is
-    executed. If a key that you trust has signed it, its environment may be rebuilt
-    afterwards.
+    A missing storage is created. Importing a file twice changes nothing. Nothing in the file
+    is executed. If a key that you trust has signed it, its environment may be rebuilt later.
     """
     from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key
@@ -154,7 +161,7 @@ def import_(
 
 
 def _signing_key(path: Path) -> SigningKey:
-    """The private key in a file; asks for its passphrase where it needs one and somebody is there."""
+    """The private key in a file; asks for a passphrase if the key needs one and stdin is a terminal."""
     import os
 
     from tupli_mcap.signing import PassphraseNeededError, SigningKey

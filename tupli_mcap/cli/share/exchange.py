@@ -36,7 +36,8 @@ def push(
         ),
     ] = None,
     benchmark: Annotated[
-        str | None, typer.Option("--benchmark", metavar="BENCHMARK_ID", help="Only this one of the storage.")
+        str | None,
+        typer.Option("--benchmark", metavar="BENCHMARK_ID", help="Only this benchmark of the storage."),
     ] = None,
     filter_text: FilterText = None,
     dry_run: DryRun = False,
@@ -45,15 +46,15 @@ def push(
 ) -> None:
     """Send a storage or a recording to a server.
 
-    All benchmarks of a storage are sent, with their artifacts and episodes. What the server
-    has already is not sent again. Nobody else sees it until you publish it. Without DIR or
-    FILE, recordings to the server that wait here are sent.
+    Sends all benchmarks of a storage, with their artifacts and episodes, except what the
+    server has already. Nobody else sees them until you publish them. Without DIR or FILE, it
+    sends the recordings that could not be sent while they were recorded.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
     from tupli_mcap.storage.exchange import copy_episodes, push_recording
 
     if (source is None or source.is_file()) and (filter_text is not None or benchmark is not None):
-        raise typer.BadParameter("a filter and a benchmark go with a storage")
+        raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
     verb = "would send" if dry_run else "sent"
     with TupliAPIClient(url) as client:
         to = client.url
@@ -130,10 +131,9 @@ def pull(
 ) -> None:
     """Fetch benchmarks and episodes from a server.
 
-    A benchmark comes with all its episodes, or with those of the filter; a filter alone
-    fetches the episodes of all benchmarks that match. Environments are as untrusted as a file
-    from a stranger, unless a key that you trust has signed them. Fetching again brings only
-    what is new.
+    A benchmark comes with all its episodes, or with those of the filter; --filter alone
+    fetches matching episodes of all benchmarks. Only new episodes are fetched. Environments
+    are not trusted, unless a key that you trust has signed them.
     """
     from tupli_mcap.storage import FileStorage, TupliAPIClient
     from tupli_mcap.storage.exchange import copy_episodes
@@ -159,7 +159,7 @@ def pull(
 
 
 def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> BaseFilter:
-    """A filter for one episode. NotFoundError if it is not there."""
+    """A filter for one episode of a server; NotFoundError if the server has none of this id."""
     from tupli_mcap.errors import NotFoundError
     from tupli_mcap.schema import FilterEQ
 
@@ -178,7 +178,7 @@ def publish(
 ) -> None:
     """Let others see a benchmark on a server.
 
-    They see its artifacts, and your episodes of it, too.
+    They also see its artifacts, and your episodes of it.
     """
     from tupli_mcap.storage import TupliAPIClient
     from tupli_mcap.storage.exchange import publish_benchmark
@@ -198,9 +198,10 @@ def unpublish(
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Take a benchmark away from others.
+    """Hide a benchmark on a server from others.
 
-    Your episodes of it go too; its artifacts stay, as other benchmarks may need them.
+    It also hides your episodes of it. Its artifacts stay visible, as other benchmarks may
+    need them.
     """
     from tupli_mcap.storage import TupliAPIClient
     from tupli_mcap.storage.exchange import unpublish_benchmark
@@ -209,7 +210,7 @@ def unpublish(
         uri = full_id(client, benchmark)
         episodes = unpublish_benchmark(client, uri, group, dry_run=dry_run)
         rest = f"{uri[:8]} and {counted(episodes, 'episode')} of yours"
-        line = f"{group} would not see {rest}" if dry_run else f"{group} does not see {rest} any more"
+        line = f"would hide {rest} from {group}" if dry_run else f"hid {rest} from {group}"
         _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
 

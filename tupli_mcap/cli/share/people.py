@@ -1,6 +1,6 @@
-"""Commands on the people of a server: its users, groups and roles, and tokens for machines.
+"""Commands for the people of a server: users, groups, roles, and tokens for machines.
 
-Each calls the method of `TupliAPIClient` of its name.
+Each calls the method of the same name of `TupliAPIClient`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ __all__ = [
     "delete_user", "list_groups", "list_roles", "list_tokens", "list_users", "read_group", "remove_group_members",
 ]  # fmt: skip
 
-Group = Annotated[str, typer.Argument(metavar="GROUP")]
-Users = Annotated[list[str], typer.Argument(metavar="USER")]
-Description = Annotated[str | None, typer.Option(help="Its description.")]
+Group = Annotated[str, typer.Argument(metavar="GROUP", help="The group's name.")]
+Users = Annotated[list[str], typer.Argument(metavar="USER", help="Names of users.")]
+Description = Annotated[str | None, typer.Option(help="A description of it.")]
 
 
 def list_users(url: Url = None, as_json: Json = False) -> None:
@@ -42,11 +42,13 @@ def list_users(url: Url = None, as_json: Json = False) -> None:
 
 
 def delete_user(
-    username: Annotated[str, typer.Argument(metavar="USER")], url: Url = None, as_json: Json = False
+    username: Annotated[str, typer.Argument(metavar="USER", help="The user's name.")],
+    url: Url = None,
+    as_json: Json = False,
 ) -> None:
-    """Delete a user; what they made stays.
+    """Delete a user, and what only they could see.
 
-    Their name stays taken. You may delete yourself.
+    What they published stays. Nobody can take the name again. You may delete yourself.
     """
     from tupli_mcap.storage import TupliAPIClient
 
@@ -56,7 +58,7 @@ def delete_user(
 
 
 def list_groups(url: Url = None, as_json: Json = False) -> None:
-    """List the groups of a server that you may know of."""
+    """List the groups of a server that you may see."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -79,7 +81,7 @@ def read_group(group: Group, url: Url = None, as_json: Json = False) -> None:
 def create_group(
     group: Group, description: Description = None, url: Url = None, as_json: Json = False
 ) -> None:
-    """Make a group of users, which you lead.
+    """Create a group of users, with you as its admin.
 
     `publish --group` lets its members see a benchmark.
     """
@@ -91,13 +93,13 @@ def create_group(
         if as_json:
             print_json(made.model_dump())
         else:
-            say(f"made the group {group} at {client.url}")
+            say(f"created the group {group} at {client.url}")
 
 
 def delete_group(group: Group, url: Url = None, as_json: Json = False) -> None:
     """Delete a group of users.
 
-    What is published in it is seen by its owners only; its name stays taken.
+    Only their owners still see what was published in it. The name cannot be used again.
     """
     from tupli_mcap.storage import TupliAPIClient
 
@@ -111,14 +113,14 @@ def add_group_members(
     users: Users,
     roles: Annotated[
         list[str] | None,
-        typer.Option("--role", metavar="ROLE", help="Their role, member by default; may be repeated."),
+        typer.Option("--role", metavar="ROLE", help="Their role; by default, member. Repeatable."),
     ] = None,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Put users into a group, or give them roles there.
+    """Add users to a group, or give them roles there.
 
-    `list-roles` shows what roles there are. Nobody can give a right that they lack.
+    `list-roles` lists the roles. You cannot give a right that you do not have.
     """
     from tupli_mcap.storage import TupliAPIClient
 
@@ -127,7 +129,7 @@ def add_group_members(
 
 
 def remove_group_members(group: Group, users: Users, url: Url = None, as_json: Json = False) -> None:
-    """Take users out of a group."""
+    """Remove users from a group."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -135,7 +137,7 @@ def remove_group_members(group: Group, users: Users, url: Url = None, as_json: J
 
 
 def list_roles(url: Url = None, as_json: Json = False) -> None:
-    """List the roles that a server knows, and their rights."""
+    """List the roles on a server, and their rights."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -149,13 +151,13 @@ def list_roles(url: Url = None, as_json: Json = False) -> None:
 
 
 def create_role(
-    role: Annotated[str, typer.Argument(metavar="ROLE")],
-    rights: Annotated[list[str], typer.Argument(metavar="RIGHT", help="A right, such as episode_read.")],
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="The role's name.")],
+    rights: Annotated[list[str], typer.Argument(metavar="RIGHT", help="Rights, such as episode_read.")],
     description: Description = None,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Make a role out of rights, for admins."""
+    """Create a role from rights; for admins only."""
     from tupli_mcap.schema import Right, UserRole
     from tupli_mcap.storage import TupliAPIClient
 
@@ -168,13 +170,15 @@ def create_role(
         if as_json:
             print_json(made.model_dump(mode="json"))
         else:
-            say(f"made the role {role} at {client.url}")
+            say(f"created the role {role} at {client.url}")
 
 
 def delete_role(
-    role: Annotated[str, typer.Argument(metavar="ROLE")], url: Url = None, as_json: Json = False
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="The role's name.")],
+    url: Url = None,
+    as_json: Json = False,
 ) -> None:
-    """Delete a role, wherever it was given."""
+    """Delete a role, and take it from all who have it."""
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
@@ -200,16 +204,16 @@ def list_tokens(url: Url = None, as_json: Json = False) -> None:
 
 
 def create_token(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Its name.")],
-    write: Annotated[bool, typer.Option("--write", help="Let it write too, not only read.")] = False,
-    days: Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")] = 90,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A name for the token.")],
+    write: Annotated[bool, typer.Option("--write", help="Allow writing, not only reading.")] = False,
+    days: Annotated[int, typer.Option(min=1, max=3650, help="How many days it is valid.")] = 90,
     forever: Annotated[bool, typer.Option("--forever", help="Keep it valid until it is deleted.")] = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Make a token with which a machine may do what you may.
+    """Create a token that gives a machine your rights.
 
-    It is shown this once. On the machine, put it into TUPLI_MCAP_TOKEN.
+    The token is shown only once. On the machine, put it into TUPLI_MCAP_TOKEN.
     """
     from tupli_mcap.storage import TupliAPIClient
 

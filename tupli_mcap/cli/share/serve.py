@@ -1,4 +1,4 @@
-"""The command that serves a directory: serve."""
+"""The command serve: starts a server on a directory."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from tupli_mcap.errors import missing_extra
 
 __all__ = ["Blobs", "Database", "Served", "serve"]
 
-Served = Annotated[Path, typer.Argument(metavar="DIR", help="Where the server keeps everything.")]
+Served = Annotated[Path, typer.Argument(metavar="DIR", help="The directory of the server's data.")]
 Database = Annotated[
     str,
     typer.Option(
         envvar="TUPLI_MCAP_DATABASE",
         metavar="URL",
-        help="A database's URL, such as postgresql+psycopg://…; by default SQLite in DIR.",
+        help="The database's URL, such as postgresql+psycopg://…; by default, SQLite in DIR.",
     ),
 ]
 Blobs = Annotated[
@@ -26,35 +26,42 @@ Blobs = Annotated[
     typer.Option(
         envvar="TUPLI_MCAP_BLOBS",
         metavar="URL",
-        help="A bucket for recordings and artifacts, such as s3://lab/server; DIR by default.",
+        help="A bucket for recordings and artifacts, such as s3://lab/server; by default, DIR.",
     ),
 ]
 _Presigned = Annotated[
-    bool, typer.Option("--presigned", help="Send clients to the bucket, which they must reach.")
+    bool,
+    typer.Option(
+        "--presigned",
+        help="Let clients fetch files from the bucket itself, which they must be able to reach.",
+    ),
 ]
-_Host = Annotated[str, typer.Option(help="The address to listen at; 0.0.0.0 is all of them.")]
-_Port = Annotated[int, typer.Option(min=0, max=65535)]
+_Host = Annotated[str, typer.Option(help="The address to listen on; 0.0.0.0 means all addresses.")]
+_Port = Annotated[int, typer.Option(min=0, max=65535, help="The port to listen on; 0 takes a free one.")]
 _Signup = Annotated[bool, typer.Option("--open-signup", help="Let everybody sign up.")]
 _Guests = Annotated[
-    bool, typer.Option("--guests", help="Show what is published in 'global' to everybody, without a sign-in.")
+    bool, typer.Option("--guests", help="Show what is published in 'global' without a sign-in.")
 ]
-_Workers = Annotated[int, typer.Option(min=1, max=256, help="How many processes answer.")]
-_Quota = Annotated[float | None, typer.Option(min=0, metavar="GB", help="What each user may keep.")]
-_Seconds = Annotated[float, typer.Option(min=1, help="How long a question may take.")]
-_Metrics = Annotated[bool, typer.Option("--open-metrics", help="Show /metrics to everybody.")]
+_Workers = Annotated[int, typer.Option(min=1, max=256, help="The number of server processes.")]
+_Quota = Annotated[float | None, typer.Option(min=0, metavar="GB", help="How much each user may store.")]
+_Seconds = Annotated[float, typer.Option(min=1, help="How many seconds a database query may take.")]
+_Metrics = Annotated[bool, typer.Option("--open-metrics", help="Show /metrics without a sign-in.")]
 _Certificate = Annotated[
-    Path | None, typer.Option(exists=True, dir_okay=False, help="For TLS: a file in PEM, with --key.")
+    Path | None, typer.Option(exists=True, dir_okay=False, help="The TLS certificate, in PEM; with --key.")
 ]
-_Key = Annotated[Path | None, typer.Option(exists=True, dir_okay=False, help="The key, in PEM.")]
+_Key = Annotated[
+    Path | None, typer.Option(exists=True, dir_okay=False, help="The TLS key, in PEM; with --certificate.")
+]
 _Proxies = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="ADDRESS", help="A proxy that is believed when it says for whom it asks. Repeatable."
+        metavar="ADDRESS",
+        help="A proxy whose X-Forwarded headers are believed. Repeatable.",
     ),
 ]
 _Accel = Annotated[
     str,
-    typer.Option(metavar="PREFIX", help="Let nginx send files: where it has DIR, as an internal location."),
+    typer.Option(metavar="PREFIX", help="Let nginx send files from DIR, its internal location PREFIX."),
 ]
 
 
@@ -78,8 +85,8 @@ def serve(
 ) -> None:
     """Share benchmarks and recordings with others over HTTP.
 
-    The first start makes the user `admin` and prints a password, unless TUPLI_MCAP_ADMIN_PASSWORD names
-    one. Ctrl-C ends the server after the requests that have begun.
+    The first start creates the user `admin`. Its password is TUPLI_MCAP_ADMIN_PASSWORD, or a
+    random one that is printed. Ctrl-C ends the server once running requests are answered.
     """
     try:
         from tupli_mcap.server.run import Listening, run
@@ -87,11 +94,11 @@ def serve(
     except ImportError as err:
         raise missing_extra("`tupli-mcap serve` needs FastAPI and uvicorn", "server") from err
     if (certificate is None) != (key is None):
-        raise typer.BadParameter("expected --certificate and --key, found one of them")
+        raise typer.BadParameter("expected both --certificate and --key, found only one of them")
 
     def tell(address: str, password: str | None) -> None:
         if password is not None:
-            say(f"user admin, password {password} (shown this once; `tupli-mcap password` changes it)")
+            say(f"user admin, password {password} (shown only this once; `tupli-mcap password` changes it)")
         say(f"serving {directory} at {address} (Ctrl-C ends it)")
 
     settings = Settings(

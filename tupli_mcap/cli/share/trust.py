@@ -1,4 +1,4 @@
-"""Commands on trust: which environments in files may be rebuilt on this machine, and what that would run."""
+"""The commands trust and untrust: which environments in files may be rebuilt, and what that would run."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 __all__ = ["trust", "untrust"]
 
-_SHOWN = 40  # entries of a list on the terminal; --json has them all
+_SHOWN = 40  # how many entries of a list are shown; --json has all
 
 
 def trust(
     file: Annotated[
         Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
     ] = None,
-    show: Annotated[bool, typer.Option("--show", help="Only show what the file says about it.")] = False,
-    remove: Annotated[bool, typer.Option("--remove", help="Trust it no longer.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Only show what rebuilding would run.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Stop trusting it.")] = False,
     key: Annotated[
         str | None,
         typer.Option("--key", metavar="KEY", help="Trust what this public key signs (a .pub file)."),
@@ -35,14 +35,14 @@ def trust(
     listed: Annotated[bool, typer.Option("--list", help="Only list what is trusted.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Let the environment in a file be rebuilt.
+    """Allow the environment in a file to be rebuilt.
 
-    Rebuilding it may run code that came with the file, as this user, on this machine. --show
-    tells what the file says about that code, and runs nothing: of a pickle, the names that it
-    imports, which prove nothing. Options of resets that may name files or code are trusted
-    with it. Reading the episodes of a file needs no trust. Only this user's processes trust
-    it from then on; one changed byte of the environment ends that. --key trusts every
-    environment that somebody signs, see bundle --sign.
+    Rebuilding may run code from the file with your rights on this machine; so may reset
+    options that name files or code. --show prints what the file says about that code, and
+    runs nothing. For a pickle, these are the names it imports: they show what it may use, not
+    that it is harmless. Trust is yours only, and ends when a byte of the environment changes.
+    Reading episodes needs no trust. --key trusts every environment that this key signs (see
+    bundle --sign).
     """
     from tupli_mcap.recording.sign.carried_code import carried_code, set_trust
 
@@ -88,10 +88,10 @@ def untrust(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Trust an environment or a key no longer.
+    """Stop trusting an environment or a key.
 
-    FILE is a recording with the environment, DIGEST one that `trust --list` shows. Without a
-    key, everything that only this key has signed is not trusted either.
+    FILE is a recording with the environment; `trust --list` shows each DIGEST. With a key,
+    every environment that only this key signed is not trusted any more either.
     """
     from tupli_mcap import trust
     from tupli_mcap.recording.sign.carried_code import untrust
@@ -109,7 +109,7 @@ def untrust(
     if as_json:
         print_json({"digest": digest, "fingerprint": signer, "was_trusted": was_trusted})
     else:
-        say(f"{digest or signer} {'is trusted no longer' if was_trusted else 'was not trusted'}")
+        say(f"{digest or signer} {'is not trusted any more' if was_trusted else 'was not trusted'}")
 
 
 def _list(*, as_json: bool) -> None:
@@ -158,7 +158,7 @@ def _trusted(code: CarriedCode) -> str:
     if not code.needs_trust:
         return "not needed"
     if code.trusted and code.signer:
-        return f"yes, as long as the key of {code.signer} is"
+        return f"yes, while the key of {code.signer} is trusted"
     return "yes" if code.trusted else "no"
 
 

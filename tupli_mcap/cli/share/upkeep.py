@@ -1,4 +1,4 @@
-"""Commands that copy all that a server keeps: backup-server, restore-server."""
+"""Commands that copy all data of a server: backup-server, restore-server."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ __all__ = ["backup_server", "restore_server"]
 def backup_server(
     directory: Served,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="A directory: a new one, or the backup before.")
+        Path,
+        typer.Option("-o", "--output", help="The backup's directory: a new one, or an earlier backup."),
     ],
     database: Database = "",
     blobs: Blobs = "",
     as_json: Json = False,
 ) -> None:
-    """Copy a server's data into a directory, while it runs.
+    """Back up a server's data into a directory, while it runs.
 
-    Files that the directory has already are not copied again. A backup can be
-    served as it is.
+    Into an earlier backup, only new files are copied. `serve` can serve a backup as it is.
     """
     _copy(directory, output, database, blobs, "backed up", as_json=as_json)
 
 
 def restore_server(
-    backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="What backup-server has written.")],
+    backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The directory that backup-server wrote.")],
     directory: Served,
     database: Database = "",
     blobs: Blobs = "",
     as_json: Json = False,
 ) -> None:
-    """Restore a backup to where a server keeps its data.
+    """Restore a server's data from a backup.
 
-    Nothing may be there yet. It may be another database and another bucket than
-    before, so that this moves a server, too.
+    DIR, the database and the bucket have to be empty. They may be others than those of the
+    backup: this is how to move a server.
     """
     _copy(directory, backup, database, blobs, "restored", as_json=as_json)
 

@@ -55,7 +55,7 @@ class People:
         self._session.ask("PUT", f"/v1/users/{_name(username)}/password", wanted)
 
     def delete_user(self, username: str) -> None:
-        """Delete a user; what they made stays. Nothing happens if there is none."""
+        """Delete a user, and what only they could see; what they published stays. Nothing happens if there is none."""
         self._session.ask("DELETE", f"/v1/users/{_name(username)}")
 
     # --- groups ---
