@@ -640,7 +640,7 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap") as env:
         env.reset(seed=1)
         env.step(0)
-        assert found(examine(tmp_path / "live.mcap"), "unfinished").message == "a writer is at work on it"
+        assert found(examine(tmp_path / "live.mcap"), "unfinished").message == "a process is writing to it"
     assert examine(tmp_path / "live.mcap").of("unfinished") == ()
 
 
@@ -708,7 +708,7 @@ def test_what_cannot_be_examined(tmp_path: Path) -> None:
     assert "holds no recording" in found(examine(tmp_path), "unreadable").message
     with pytest.raises(RecordingError, match="expected a path, Recording, Dataset or storage, found 3"):
         examine(3)  # type: ignore[arg-type]
-    with pytest.raises(RecordingError, match="there is no check 'nam'; there are unfinished, nan, "):
+    with pytest.raises(RecordingError, match="there is no check 'nam'; checks are unfinished, nan, "):
         examine(tmp_path, checks=["nam"])
     with pytest.raises(RecordingError, match="'nan' has no threshold 'least'; it has none"):
         examine(tmp_path, thresholds={"nan": {"least": 3}})
@@ -774,7 +774,7 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "         3 of 99 values are NaN in dimension 2\n"
         "         at episode:step 0:4, 1:4, 2:4\n"
         "         also in b.mcap\n"
-        "         → drop these episodes, or find the division or sensor that made it\n\n"
+        "         → drop these episodes, and find the division or sensor that made NaN\n\n"
         "error    unreadable\n"
         "         c.mcap: expected an MCAP file, found b'no recor"
     )
@@ -790,7 +790,7 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "severity": "error",
         "path": "a.mcap",
         "message": "3 of 99 values are NaN in dimension 2",
-        "suggestion": "drop these episodes, or find the division or sensor that made it",
+        "suggestion": "drop these episodes, and find the division or sensor that made NaN",
         "leaf": "state",
         "dimensions": [[2]],
         "count": 3,

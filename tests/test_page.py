@@ -84,7 +84,7 @@ class TestDatasets:
     def test_search(self, web: httpx.Client) -> None:
         assert [d["name"] for d in told(web, "/", q="CART baseline")["datasets"]] == ["CartPole-v1"]
         assert told(web, "/", q="hopper")["datasets"] == []
-        assert "No dataset holds" in web.get("/?q=hopper").text
+        assert "No dataset matches" in web.get("/?q=hopper").text
 
     def test_a_dataset_opens_with_an_episode(self, web: httpx.Client) -> None:
         facts = told(web, "/dataset/CartPole-v1", show="best")

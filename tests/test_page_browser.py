@@ -206,11 +206,11 @@ class TestTable:
             page.goto("/episodes?dataset=CartPole-v1&sort=-return")
             compare = page.get_by_role("button", name="Compare")
             expect(compare).to_be_disabled()
-            page.get_by_label("Choose episode", exact=False).first.focus()
+            page.get_by_label("Select episode", exact=False).first.focus()
             page.keyboard.press("Space")
-            expect(page.locator("[data-count]")).to_have_text("1 chosen")
+            expect(page.locator("[data-count]")).to_have_text("1 selected")
             expect(compare).to_be_disabled()
-            page.get_by_label("Choose episode", exact=False).nth(1).focus()
+            page.get_by_label("Select episode", exact=False).nth(1).focus()
             page.keyboard.press("Space")
             expect(compare).to_be_enabled()
             compare.focus()
@@ -220,8 +220,8 @@ class TestTable:
     def test_all_of_a_page(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1")
-            page.get_by_label("Choose all of this page").check()
-            expect(page.locator("[data-count]")).to_have_text("12 chosen")
+            page.get_by_label("Select all episodes of this page").check()
+            expect(page.locator("[data-count]")).to_have_text("12 selected")
             expect(page.get_by_role("button", name="Compare")).to_be_disabled()
             page.get_by_role("button", name="Copy Python", exact=True).click()
             expect(page.get_by_role("button", name="Copied")).to_be_visible()
@@ -252,7 +252,7 @@ class TestUpload:
                 )
             rows = page.locator(".uploads li")
             expect(rows.nth(0)).to_contain_text("is here", timeout=PATIENCE)
-            expect(rows.nth(1)).to_contain_text("is here already", timeout=PATIENCE)
+            expect(rows.nth(1)).to_contain_text("the server has it already", timeout=PATIENCE)
             page.evaluate(
                 """() => {
                     const data = new DataTransfer();

@@ -162,7 +162,7 @@ class TestSigningIn:
         with browser(server) as client:
             assert client.post("/sign-in", data=told).status_code == 403
         with serving(Settings(tmp_path, open_signup=True)) as url, browser(url) as client:
-            assert "I am new here" in client.get("/sign-in").text
+            assert "I have no account yet" in client.get("/sign-in").text
             assert client.post("/sign-in", data=told).status_code == 303
             assert client.get("/account").status_code == 200
 

@@ -1,4 +1,4 @@
-"""Looks at recorded data as someone who is about to train on it.
+"""Checks recorded data before training on it.
 
 `examine` reads recordings and returns a `Diagnosis` of `Finding`s. `CHECKS` lists what is checked:
 
@@ -7,7 +7,7 @@
 - episodes: missing terminals, episodes of one step, wrong resets, repeated seeds, duplicates;
 - files that are not finished.
 
-A check and what it needs to have measured of the steps (a `Statistic`) are in the module of their family.
+A check and the `Statistic` that it needs to measure over the steps are in the same module.
 """
 
 from tupli_mcap.doctor.checks import CHECKS, Check

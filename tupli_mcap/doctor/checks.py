@@ -1,4 +1,4 @@
-"""`CHECKS`: everything that is checked, in the order in which findings of one severity and recording are listed."""
+"""`CHECKS`: all checks, in the order in which findings of one severity and recording are listed."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from tupli_mcap.doctor.measurements import Statistic
 
 @dataclass(frozen=True)
 class Check:
-    """A check: its id, what it looks for in one line, and the function that judges.
+    """A check: its id, a line on what it finds, and its function.
 
-    run: called with the `Measurements` of each recording, and with thresholds as keywords. needs: the statistic that
-    has to be measured for it. across: it compares recordings, and is called once, with that statistic of each.
+    run: called with the `Measurements` of each recording, and with thresholds as keywords. needs: the statistic to
+    measure for it. across: if true, `run` compares recordings: it is called once, with that statistic of each.
     """
 
     id: str
@@ -28,7 +28,7 @@ class Check:
 
     @property
     def explanation(self) -> str:
-        """What exactly is judged, and how."""
+        """The docstring of `run`: what exactly is checked, and how."""
         return inspect.cleandoc(self.run.__doc__ or "")
 
     @property

@@ -1,4 +1,4 @@
-"""The check of episodes that are there more than once, in one recording or in several."""
+"""The check for episodes that occur more than once, in one recording or in several."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _SIZE = 16
 class Digests(Statistic):
     """A BLAKE2b-128 of each episode: of its states, actions, rewards and flags, not of its number, seed and times.
 
-    log_choices: the logarithm of how many different actions there are; infinite where states or actions are of floats
-    or of variable size, for chance makes no equal episodes there.
+    log_choices: the logarithm of the number of different actions; infinite if states or actions are floats or of
+    variable size: equal episodes are then no chance.
     """
 
     def __init__(self, measured: Measurements) -> None:
@@ -35,7 +35,7 @@ class Digests(Statistic):
         self.log_choices = _log_choices(measured.layout)
         self._arrays = [leaf.name for leaf in measured.layout.leaves if leaf.kind != "variable"]
         self._variable = measured.layout.variable
-        # Equal bytes of other leaves are other content.
+        # The leaves belong to the content: equal bytes of other leaves are another episode.
         head = repr([(leaf.path, leaf.kind, leaf.shape) for leaf in measured.layout.leaves]).encode()
         self._empty = hashlib.blake2b(head, digest_size=_SIZE)
         self._running = self._empty.copy()
@@ -62,17 +62,17 @@ class Digests(Statistic):
 
     @property
     def digests(self) -> Array:
-        """One 16-byte void an episode, in the order they were read."""
+        """A 16-byte void for each episode, in the order of reading."""
         return np.frombuffer(b"".join(self._digests), np.dtype((np.void, _SIZE)))
 
 
 def duplicate_episodes(recordings: Sequence[Digests], *, rarity: float = 1000) -> Iterator[Finding]:
-    """Episodes that are equal in every state, action, reward and flag, within a recording and across recordings.
+    """Episodes that are equal in every state, action, reward and flag, within a recording or across recordings.
 
-    A learner counts them twice, and a test set with copies of the training set measures nothing. Where states and
-    actions are discrete, short episodes are equal by chance: n episodes of L steps with A choices give about n^2 / A^L
-    pairs (the birthday problem, for uniform actions in a deterministic environment). Copies with `rarity` * n^2 >= A^L
-    are left out.
+    A learner counts them twice, and a test set with copies of training episodes measures nothing. If states and
+    actions are discrete, short episodes may be equal by chance: n episodes of L steps with A choices give about
+    n^2 / A^L pairs (the birthday problem, for uniform actions in a deterministic environment). Copies with
+    `rarity` * n^2 >= A^L are ignored.
     """
     if not recordings:
         return
@@ -98,7 +98,7 @@ def duplicate_episodes(recordings: Sequence[Digests], *, rarity: float = 1000) -
         f"{'is an exact copy' if count == 1 else 'are exact copies'} of another one"
         f"{f', {across:,} of them across recordings' if across else ''}"
     )
-    advice = "keep one of each, or split by content: copies in training and test set make the test worthless"
+    advice = "keep one of each, and no copies of training episodes in a test set"
     path = places[0].path
     yield Finding(
         "duplicate-episodes", Severity.WARNING, path, message, advice, count=count, total=total, places=places

@@ -21,16 +21,16 @@ _STARTS = 4096  # episode starts that are decoded at a time
 
 
 def unfinished(measured: Measurements) -> Iterator[Finding]:
-    """A recording that its writer did not finish, or still works on."""
+    """A recording that its writer did not finish, or is still writing to."""
     state = state_of(measured.recording)
     if state == "recording":
-        message, advice = "a writer is at work on it", "examine it again when the writer is done"
+        message, advice = "a process is writing to it", "examine it again when that has finished"
     elif state == "recovered":
-        message = "its writer did not finish it; what its chunks and its journal hold is there"
+        message = "its writer did not finish it; all steps of its chunks and its journal were examined"
         advice = "finish it with 'tupli-mcap recover'"
     elif state == "incomplete":
-        message = "its writer did not finish it, and its journal is missing; what its chunks hold is there"
-        advice = "copy the journal beside it, if there is one; or finish it with 'tupli-mcap recover'"
+        message = "its writer did not finish it and its journal is missing; only the steps of its chunks were examined"
+        advice = "copy the journal beside it if you have it, or save these steps with 'tupli-mcap recover'"
     else:
         return
     yield measured.finding("unfinished", Severity.INFO, message, advice)
@@ -39,8 +39,8 @@ def unfinished(measured: Measurements) -> Iterator[Finding]:
 def missing_terminals(measured: Measurements) -> Iterator[Finding]:
     """No episode ends in a terminal state.
 
-    Usual where the task goes on for ever (information), if episodes end by timeout; a warning where several episodes
-    have neither flag: a learner takes them for one long episode, or bootstraps from nothing. The last episode of each
+    An info if episodes end by timeout, which is usual for tasks without an end. A warning if several episodes have
+    neither flag: a learner may take them for one long episode, or bootstrap wrongly. The last episode of each
     sub-environment may be interrupted.
     """
     ends: Array = measured.rows["end"]
@@ -51,7 +51,7 @@ def missing_terminals(measured: Measurements) -> Iterator[Finding]:
         return
     if timeouts:
         severity, ended = Severity.INFO, f"{timeouts:,} by timeout"
-        advice = "bootstrap from the final state of each timeout; do not treat it as a terminal"
+        advice = "bootstrap from the final state at each timeout; do not treat a timeout as a terminal"
     else:
         severity, ended = Severity.WARNING, "all are interrupted"
         advice = "record terminated and truncated as the environment returns them, and step until one is true"
@@ -63,10 +63,10 @@ def missing_terminals(measured: Measurements) -> Iterator[Finding]:
 def one_step_episodes(
     measured: Measurements, *, part: float = 0.01, usual_length: float = 10
 ) -> Iterator[Finding]:
-    """Episodes of one step, at least `part` of all, where the median length is `usual_length` or more.
+    """Episodes of one step, if they are at least `part` of all and the median length is `usual_length` or more.
 
-    In card games and bandits, episodes are short anyway. The last episode of a sub-environment does not count if it
-    is interrupted.
+    Short episodes are usual in card games and bandits. The last episode of a sub-environment does not count if it is
+    interrupted.
     """
     one_step = (measured.lengths == 1) & ~_last_interrupted(measured)
     count, total = int(one_step.sum()), len(measured.rows)
@@ -74,9 +74,7 @@ def one_step_episodes(
     if not count or median < usual_length or count < part * total:
         return
     message = f"{count:,} of {plural(total, 'episode')} ({share(count, total)}) have one step; the median is {median:g}"
-    advice = (
-        "look at how these ended: a reset in the wrong place, or an autoreset recorded as a step, makes them"
-    )
+    advice = "look at how they ended: usual causes are a reset in the wrong place, and an autoreset recorded as a step"
     places = measured.episodes(one_step)
     yield measured.finding("one-step-episodes", Severity.WARNING, message, advice, count, total, places)
 
@@ -93,9 +91,9 @@ def _last_interrupted(measured: Measurements) -> Array:
 def repeated_seed(measured: Measurements, *, least: int = 3, part: float = 0.5) -> Iterator[Finding]:
     """The same seed at the start of several episodes.
 
-    A warning where one seed starts `least` or more episodes and `part` of all: `reset(seed=...)` in the loop makes
-    every episode start alike. Else information: evaluations use the same seeds for several policies, but a test set
-    must not share them with a training set.
+    A warning if one seed starts at least `least` episodes and `part` of all: with `reset(seed=...)` in the loop, every
+    episode starts in the same way. Else an info: evaluations use the same seeds for several policies, but a test set
+    must not share seeds with a training set.
     """
     seeded = measured.rows["has_seed"] == HAS_SEED
     seeds, counts = np.unique(measured.rows["seed"][seeded], return_counts=True)
@@ -108,29 +106,32 @@ def repeated_seed(measured: Measurements, *, least: int = 3, part: float = 0.5) 
     if count >= max(least, part * total):
         severity, advice = Severity.WARNING, "pass a seed to the first reset only, so that episodes differ"
     else:
-        severity, advice = Severity.INFO, "keep the episodes of a seed on one side of a split into sets"
+        severity, advice = (
+            Severity.INFO,
+            "put all episodes of a seed into the same set when you split the data",
+        )
     places = measured.episodes(seeded & (measured.rows["seed"] == seed))
     yield measured.finding("repeated-seed", severity, message, advice, count, total, places)
 
 
 def missing_reset(measured: Measurements) -> Iterator[Finding]:
-    """Episodes that began with a step after an end: nobody reset the environment, or it does so by itself.
+    """Episodes that begin with a step after the end of another one: the environment was not reset, or resets itself.
 
-    The first one of a file goes on from another file, in which it was cut when that was full.
+    The first episode of a file does not count: it may continue one of the file before.
     """
     missing = _continued(measured) & (measured.rows["first_row"] > 0)
     count, total = int(missing.sum()), len(missing)
     if not count:
         return
     verb = "begins" if count == 1 else "begin"
-    message = f"{plural(count, 'episode')} of {total:,} {verb} with a step after an end, without a reset"
-    advice = "call reset when terminated or truncated is true; leave these episodes out"
+    message = f"{plural(count, 'episode')} of {total:,} {verb} without a reset after the end of another one"
+    advice = "call reset once terminated or truncated is true; leave these episodes out"
     places = measured.episodes(missing)
     yield measured.finding("missing-reset", Severity.WARNING, message, advice, count, total, places)
 
 
 def _continued(measured: Measurements) -> Array:
-    """Which episodes began without a reset (bool)."""
+    """Whether each episode began without a reset (bool)."""
     parts = (measured.positions[i : i + _STARTS] for i in range(0, len(measured.positions), _STARTS))
     return np.array(
         [start.continued for part in parts for start in measured.recording.episode_starts(part)], np.bool_
@@ -140,14 +141,14 @@ def _continued(measured: Measurements) -> Array:
 class FinalStates(Statistic):
     """Final states that equal the first state of the next episode of the same sub-environment.
 
-    compared: how many pairs were; equal: how many of them are, and the places of the first. Where both episodes start
-    in the same state the pair is left out: an equal final state may be chance there.
+    compared: the number of compared pairs. equal: how many of them are equal; places: the first of these. A pair of
+    episodes that start in the same state is not compared: its states may be equal by chance.
     """
 
     def __init__(self, layout: StepLayout) -> None:
         self._layout = layout
         self._first = b""  # the first state of the running episode
-        # By sub-environment, of the last episode that ended: place of the final state, first and final state.
+        # By sub-environment, for the last episode that ended: place of its final state, first state, final state.
         self._ended: dict[int, tuple[StepPlace, bytes, bytes | None]] = {}
         self.compared = self.equal = 0
         self.places: list[StepPlace] = []
@@ -185,9 +186,9 @@ class FinalStates(Statistic):
 def final_state_is_reset(measured: Measurements, *, least: int = 3, part: float = 0.5) -> Iterator[Finding]:
     """Final states that are the first observation of the next episode.
 
-    An autoreset inside of the recorder makes them: the true last observation is lost, and bootstrapping at a timeout
-    takes the value of a fresh episode. A warning from `least` episodes and `part` of those that can be compared on;
-    episodes that all start in the same state cannot.
+    A wrapper that resets by itself inside of the recorder makes them: the true last observation is lost, and
+    bootstrapping at a timeout takes the value of another episode. A warning if at least `least` episodes and `part` of
+    the compared ones are affected. Episodes that start in the same state are not compared.
     """
     for finals in measured.statistics(FinalStates):
         count, total = finals.equal, finals.compared
@@ -197,7 +198,7 @@ def final_state_is_reset(measured: Measurements, *, least: int = 3, part: float 
             f"the final state of {plural(count, 'episode')} of {total:,} is the first state of the next one"
         )
         advice = (
-            "record inside of the wrapper that resets by itself; do not bootstrap from these final states"
+            "put the recorder inside of the wrapper that resets; do not bootstrap from these final states"
         )
         places = measured.places(finals.places)
         yield measured.finding(

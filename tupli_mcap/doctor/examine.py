@@ -1,4 +1,4 @@
-"""`examine`: recordings in, a diagnosis out."""
+"""`examine`: runs the checks on recordings."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ def examine(
     episode_filter: BaseFilter | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Look at recorded episodes as someone who is about to train on them.
+    """Check recorded episodes before training on them.
 
     Each recording is read once, a few megabytes at a time. Nothing in a file is executed. A file that cannot be read
-    is a finding ("unreadable", an error), and the others are examined all the same.
+    becomes a finding ("unreadable", an error); the other files are examined all the same.
 
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
-            `TupliDataset` (its episodes, whole: tuple filters are for steps), a storage, or several of those.
-            Episodes that a storage has deleted are left out, except of an open `Recording`. What
-            `dataset.which.chosen_from` has chosen is examined as it is.
-        checks: ids of the checks to run (see `CHECKS`); all by default. skip: those to leave out.
-        thresholds: for the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
+            `TupliDataset` (its whole episodes: tuple filters do not count), a storage, or several of these.
+            Deleted episodes are left out, except of an open `Recording`. Episodes chosen by
+            `dataset.which.chosen_from` are examined as chosen.
+        checks: ids of the checks to run (see `CHECKS`); by default, all. skip: ids of those to leave out.
+        thresholds: by the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
         episode_filter: examine only episodes that match it.
         progress: called with the name of each recording before it is read.
 
     Raises:
-        RecordingError: the source is nothing that can be examined, or there is no such check or threshold.
+        RecordingError: the source cannot be examined, or there is no such check or threshold.
         FilterError: the filter names an unknown field.
     """
     _check_names([*_list(checks or ()), *_list(skip)], thresholds or {})
@@ -59,14 +59,14 @@ def examine(
 
 def _list(checks: Collection[str]) -> Collection[str]:
     if isinstance(checks, str):
-        raise RecordingError(f"expected a list of the ids of checks, found the text {checks!r:.80}")
+        raise RecordingError(f"expected a list of ids of checks, found the text {checks!r:.80}")
     return checks
 
 
 def _check_names(checks: Iterable[str], thresholds: Mapping[str, Mapping[str, Any]]) -> None:
     for name in [*checks, *thresholds]:
         if name not in CHECKS:
-            raise RecordingError(f"there is no check {name!r}; there are {', '.join(CHECKS)}")
+            raise RecordingError(f"there is no check {name!r}; checks are {', '.join(CHECKS)}")
     for name, values in thresholds.items():
         for key in values:
             if key not in CHECKS[name].thresholds:
@@ -110,7 +110,7 @@ class _Examination:
 
     def diagnosis(self) -> Diagnosis:
         self._findings += self._run(-1, self._kept, across=True)
-        # Sorting is stable: of one check and recording, findings stay in the order of the leaves.
+        # Sorting is stable: findings of one check and recording stay in the order of the leaves.
         ordered = sorted(self._findings, key=lambda item: (-item[2].severity, item[0], item[1]))
         findings = tuple(finding for _, _, finding in ordered)
         return Diagnosis(findings, self._files, self._episodes, self._steps)
@@ -128,8 +128,8 @@ def _unreadable(name: str, err: TupliError | OSError) -> Finding:
     message = str(err)
     if isinstance(err, OSError) and not isinstance(err, TupliError):
         message = err.strerror or str(err)
-    message, suggestion = " ".join(message.split()), "see what can be saved with 'tupli-mcap recover'"
-    if isinstance(err, RecordingError):  # nothing is wrong with the file, or there is none
+    message, suggestion = " ".join(message.split()), "run 'tupli-mcap recover' to save what is undamaged"
+    if isinstance(err, RecordingError):  # the file is not damaged: its own advice follows the semicolon
         said, _, advice = message.partition("; ")
         message, suggestion = said, advice or "give a recording (.mcap) or a directory of them"
     return Finding(UNREADABLE, Severity.ERROR, name, message, suggestion)

@@ -1,4 +1,4 @@
-"""What `examine` returns: a diagnosis, and the findings in it."""
+"""The result of `examine`: a diagnosis, and its findings."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import enum
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-MAX_PLACES = 5  # examples that a finding names
+MAX_PLACES = 5  # most examples that a finding names
 JSON_VERSION = 1
 
 
 class Severity(enum.IntEnum):
     """How bad a finding is.
 
-    ERROR: the data is wrong, a learner would break on it or learn nonsense (NaN, values outside a Discrete space).
-    WARNING: something is probably wrong, or surprises a learner (a dimension that never changes).
-    INFO: worth knowing, and usual in healthy data too (episodes that all end by timeout).
+    ERROR: the data is wrong; training on it fails or learns nonsense (NaN, values outside a Discrete space).
+    WARNING: the data is probably wrong, or needs care in training (a dimension that never changes).
+    INFO: worth knowing, and usual in healthy data too (all episodes end by timeout).
     """
 
     INFO = 1
@@ -27,9 +27,9 @@ class Severity(enum.IntEnum):
 
 
 class Place(NamedTuple):
-    """Where something was found: the recording, the number of the episode, the step in it (from 0).
+    """The place of a finding: recording, number of the episode, step in it (from 0).
 
-    step: None where it is about the whole episode; the episode's length where it is about its final state.
+    step: None for a whole episode; the episode's length for its final state.
     """
 
     path: str
@@ -42,17 +42,17 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is worth a look.
+    """What a check found in a recording.
 
     check: the id of the check, one of `CHECKS`.
-    path: the recording it is about; where several are, the first one.
+    path: the recording; the first one, if several are affected.
     message: one sentence with numbers.
     suggestion: what to do about it.
-    leaf: the leaf it is about, as its keys in the space lead to it (`state['arm']['angle'][0]`, `action`); None where
-        it is about episodes or files.
-    dimensions: indexes inside the leaf; empty where it is about the whole leaf, or the leaf is a scalar.
+    leaf: the affected leaf by its keys in the space (`state['arm']['angle'][0]`, `action`); None for findings about
+        episodes or files.
+    dimensions: the affected indexes inside the leaf; empty for the whole leaf, and for a scalar.
     count, total: how many values, steps or episodes (the message says which) are affected, and of how many.
-    places: at most `MAX_PLACES` examples, the first ones.
+    places: the first examples, at most `MAX_PLACES`.
     """
 
     check: str
@@ -67,7 +67,7 @@ class Finding:
     places: tuple[Place, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding as a JSON-able object: its fields, with the name of the severity in lower case."""
+        """The fields as values for JSON; the severity is its name in lower case."""
         return {
             **{field.name: getattr(self, field.name) for field in fields(self)},
             "severity": str(self.severity),
@@ -90,16 +90,16 @@ class Diagnosis:
 
     @property
     def worst(self) -> Severity | None:
-        """The worst severity there is; None without a finding."""
+        """The worst severity of the findings; None without findings."""
         return max((finding.severity for finding in self.findings), default=None)
 
     @property
     def healthy(self) -> bool:
-        """True if there is no error and no warning."""
+        """Whether there is neither an error nor a warning."""
         return self.worst in (None, Severity.INFO)
 
     def at_least(self, severity: Severity) -> tuple[Finding, ...]:
-        """The findings that are as bad as `severity`, or worse."""
+        """The findings of this severity, and worse ones."""
         return tuple(finding for finding in self.findings if finding.severity >= severity)
 
     def of(self, check: str) -> tuple[Finding, ...]:
@@ -107,7 +107,7 @@ class Diagnosis:
         return tuple(finding for finding in self.findings if finding.check == check)
 
     def to_dict(self) -> dict[str, Any]:
-        """The diagnosis as a JSON-able object. Keys are only added; a change of meaning changes `version`.
+        """The diagnosis as values for JSON. `version` changes when a key goes away or changes its meaning.
 
         `version` (1), `healthy`, `worst` ("info", "warning", "error" or null), `files`, `episodes`, `steps`, and
         `findings`, a list of objects with the keys of `Finding`; a place has `path`, `episode` and `step` (or null).

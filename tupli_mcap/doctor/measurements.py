@@ -1,4 +1,4 @@
-"""`Measurements`: what is known of one recording once its steps were read, for the checks to judge."""
+"""`Measurements`: the statistics of one recording, from which the checks make findings."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from tupli_mcap.recording.blocks import Block, blocks
 from tupli_mcap.spaces.leaves import Leaf
 
 StepPlace = tuple[int, int]
-"""The number of an episode, and a step in it; its length stands for its final state."""
+"""The number of an episode, and a step in it; the episode's length stands for its final state."""
 
 
 class Statistic:
-    """What is measured while the steps of a recording pass by once, in memory that does not grow with them."""
+    """Measures the steps of a recording in one pass, in memory that does not grow with their number."""
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[Statistic]:
-        """The statistics of this kind for a recording, before its first step: one, or one for each leaf."""
+        """New statistics of this kind for a recording: one, or one for each leaf."""
         raise NotImplementedError
 
     def put(self, block: Block) -> None:
-        """Take the next steps."""
+        """Add the next steps."""
         raise NotImplementedError
 
 
@@ -36,7 +36,7 @@ _S = TypeVar("_S", bound=Statistic)
 
 
 class Measurements:
-    """The chosen episodes of a recording, and what was measured of their steps.
+    """The chosen episodes of a recording, and the statistics of their steps.
 
     path: the recording's name. positions: the episodes, as positions in its index. rows, lengths: their index rows
     and numbers of steps.
@@ -56,7 +56,7 @@ class Measurements:
         return self.recording.layout
 
     def measure(self, kinds: Iterable[type[Statistic]]) -> None:
-        """Read the steps once; without a kind of statistic, or without a step, nothing is read.
+        """Read the steps once for statistics of these kinds; reads nothing if there are no kinds or no steps.
 
         Raises:
             FormatError: the recording is damaged.
@@ -73,11 +73,11 @@ class Measurements:
         return [statistic for statistic in self._statistics if isinstance(statistic, kind)]
 
     def places(self, steps: Iterable[StepPlace]) -> tuple[Place, ...]:
-        """The first different ones of some steps."""
+        """The first different places among some steps, at most `MAX_PLACES`."""
         return tuple(Place(self.path, *step) for step in dict.fromkeys(steps))[:MAX_PLACES]
 
     def episodes(self, mask: Array) -> tuple[Place, ...]:
-        """The first episodes of a mask over `rows`."""
+        """The first episodes of a mask over `rows`, at most `MAX_PLACES`."""
         return tuple(Place(self.path, int(number)) for number in self.rows["episode"][mask][:MAX_PLACES])
 
     def finding(
@@ -92,14 +92,14 @@ class Measurements:
         leaf: Leaf | None = None,
         mask: Array | None = None,
     ) -> Finding:
-        """A finding about this recording, or about the elements of a leaf that are in a mask."""
+        """A finding about this recording, or about the elements of a leaf in a mask."""
         path = None if leaf is None else leaf.path
         indexes = () if leaf is None or mask is None else unravel(leaf, mask)
         return Finding(check, severity, self.path, message, advice, path, indexes, count, total, places)
 
 
 def value_bytes(layout: StepLayout, leaf: Leaf, value: Any) -> bytes:
-    """A value of a leaf as bytes: the same for equal values only."""
+    """A value of a leaf as bytes, which are equal only for equal values."""
     if leaf.kind != "variable":
         return bytes(value.tobytes())
     out = bytearray()

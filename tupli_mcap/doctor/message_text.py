@@ -1,4 +1,4 @@
-"""Numbers, times and dimensions as the text of a message."""
+"""Numbers, times and dimensions as texts for messages."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def duration(ns: float) -> str:
-    """A time in a unit that suits it: `850 ns`, `1.5 ms`, `2.0 h`."""
+    """A duration (ns) in a fitting unit: `850 ns`, `1.5 ms`, `2.0 h`."""
     for unit, size in (("h", 3600e9), ("min", 60e9), ("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
         if ns >= size:
             return f"{ns / size:.1f} {unit}"
@@ -37,7 +37,7 @@ def duration(ns: float) -> str:
 
 
 def unravel(leaf: Leaf, mask: Array) -> tuple[tuple[int, ...], ...]:
-    """The indexes of the elements of a leaf in a mask (C order), at most 100; none for a scalar, or for all."""
+    """The indexes of the elements of a leaf in a mask (C order), at most 100; empty for a scalar or for all."""
     if leaf.shape == () or mask.all():
         return ()
     indexes = np.argwhere(mask.reshape(leaf.shape))[:_LISTED]
@@ -45,7 +45,7 @@ def unravel(leaf: Leaf, mask: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def dimensions(leaf: Leaf, mask: Array) -> str:
-    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty for a scalar, or for all."""
+    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty for a scalar or for all."""
     indexes, count = unravel(leaf, mask), int(mask.sum())
     if not indexes:
         return ""
@@ -57,6 +57,6 @@ def dimensions(leaf: Leaf, mask: Array) -> str:
 
 
 def dimension_text(leaf: Leaf, mask: Array) -> str:
-    """The same with ` in ` before it; empty for a scalar, or for all."""
+    """The same after ` in `; empty for a scalar or for all."""
     text = dimensions(leaf, mask)
     return f" in {text}" if text else ""

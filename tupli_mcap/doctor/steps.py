@@ -1,4 +1,4 @@
-"""Checks of what shows from one step to the next: frozen cameras, reward outliers, clock jumps."""
+"""Checks of the steps of an episode in their order: frozen cameras, reward outliers, clock jumps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAD_TO_STD = 1.4826
 
 
 class Sample:
-    """Every n-th of about `total` values, so that 65,536 are kept at most. seen: how many there were."""
+    """Keeps every n-th of about `total` values, at most 65,536. seen: how many values were put."""
 
     def __init__(self, total: int) -> None:
         self._stride = max(1, -(-total // _SAMPLE_SIZE))
@@ -39,7 +39,7 @@ class Sample:
 
 
 class Largest:
-    """The `k` largest of some values: (value, place), the largest first; of equal ones, those that came first."""
+    """Keeps the `k` largest values with their places, the largest first; of equal values, the first ones."""
 
     def __init__(self, k: int = 64) -> None:
         self._k = k
@@ -98,9 +98,9 @@ class Frames(Statistic):
 
 
 def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Finding]:
-    """A camera that stands still: `frames` or more consecutive frames of an episode equal in every pixel.
+    """A frozen camera: `frames` or more consecutive frames of an episode are equal in every pixel.
 
-    Shorter runs are usual: an action without effect, a game that waits.
+    Shorter runs are usual, for instance after an action without effect, or while a game waits.
     """
     for images in measured.statistics(Frames):
         if images.longest + 1 < frames:
@@ -110,14 +110,14 @@ def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Findi
         message = (
             f"{length:,} frames in a row are equal; {share(count, total)} of all frames repeat the one before"
         )
-        advice = "look whether the camera or the renderer hung, and cut these steps out"
+        advice = "check whether the camera or the renderer hung, and cut these steps out"
         yield measured.finding(
             "frozen-frames", Severity.WARNING, message, advice, count, total, places, images.leaf
         )
 
 
 class Rewards(Statistic):
-    """One scalar reward, either in the last steps of episodes or in the others: a sample, and the extremes."""
+    """A sample and the extremes of one scalar reward, either in the last steps of episodes or in all others."""
 
     def __init__(self, leaf: Leaf, total: int, *, last: bool) -> None:
         self.leaf = leaf
@@ -142,12 +142,12 @@ class Rewards(Statistic):
 
 
 def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[Finding]:
-    """Rewards further than `factor` scales from the median, among the last steps of episodes and the others apart.
+    """Rewards further than `factor` scales from the median.
 
-    A bonus at the end is usual, one reward of a million is not. The scale is 1.4826 times the median absolute
-    deviation; where most rewards are equal, the larger of the median's magnitude and the median of the deviations that
-    are not 0 (if there are three). No judgement where that is 0 too, or below 20 rewards. Median and scale are those of
-    a sample where there are more than 65,536 rewards.
+    The last steps of episodes and all others are judged apart, because a bonus at the end is usual. The scale is 1.4826
+    times the median absolute deviation. If most rewards are equal, it is the larger of the median's magnitude and the
+    median of the deviations that are not 0 (if there are at least three). Nothing is found if the scale is 0, or below
+    20 rewards. Of more than 65,536 rewards, a sample gives the median and the scale.
     """
     for rewards in measured.statistics(Rewards):
         if rewards.sample.seen < _FEWEST_REWARDS:
@@ -169,14 +169,14 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
             f"deviation ({scale:.3g}) from the median ({median:.3g}), {'among' if rewards.last else 'before'} the last "
             f"steps of episodes; the furthest is {outliers[0][0]:g}"
         )
-        advice = "look at these steps; clip or scale rewards if they are right"
+        advice = "look at these steps; if the rewards are right, clip or scale them for training"
         yield measured.finding(
             "reward-outliers", Severity.WARNING, message, advice, count, total, places, rewards.leaf
         )
 
 
 def _scale(values: Array) -> tuple[float, float]:
-    """Median, and how far values usually are from it."""
+    """The median, and the usual distance of values from it."""
     median = float(np.median(values))
     deviations = np.abs(values - median)
     spread = _MAD_TO_STD * float(np.median(deviations))
@@ -187,7 +187,7 @@ def _scale(values: Array) -> tuple[float, float]:
 
 
 class Clock(Statistic):
-    """Times (ns) from one step to the next inside episodes: a sample, and the longest."""
+    """A sample and the longest of the times (ns) from one step to the next inside episodes."""
 
     def __init__(self, total: int) -> None:
         self.gaps = Sample(total)
@@ -213,10 +213,10 @@ class Clock(Statistic):
 def clock_jump(
     measured: Measurements, *, factor: float = 1000, least_s: float = 1.0, warn_s: float = 600.0
 ) -> Iterator[Finding]:
-    """Steps that came `factor` times the median and `least_s` seconds or more after the one before, in one episode.
+    """Long pauses between two steps of an episode: at least `factor` times the median, and `least_s` seconds.
 
-    A policy that is trained between steps pauses too: information. A warning from `warn_s` seconds on: a suspended
-    machine, or a clock that was set.
+    An info, because a policy that is trained between steps pauses too. A warning from `warn_s` seconds on, which points
+    to a suspended machine, or a clock that was set.
     """
     for clock in measured.statistics(Clock):
         if not clock.gaps.seen:
@@ -227,13 +227,13 @@ def clock_jump(
         if not pauses:
             continue
         (longest, _), count, total = pauses[0], len(pauses), clock.gaps.seen
-        # Only the longest gaps are known: where all of these are pauses there may be more.
+        # Only the longest gaps are kept: if all of these are pauses, there may be more.
         more = "at least " if count == len(clock.longest.values) < total else ""
         message = (
             f"{more}{plural(count, 'step')} came after a pause inside an episode, the longest of {duration(longest)}; "
             f"the median is {duration(median)}"
         )
-        advice = "leave these episodes out where timing matters, as on a robot"
+        advice = "leave these episodes out if timing matters, as on a robot"
         severity = Severity.WARNING if longest >= warn_s * _SECOND else Severity.INFO
         places = measured.places(place for _, place in pauses)
         yield measured.finding("clock-jump", severity, message, advice, count, total, places)

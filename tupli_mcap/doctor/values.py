@@ -21,15 +21,16 @@ from tupli_mcap.spaces.leaves import Leaf
 Locate = Callable[[int], StepPlace]
 Role = Literal["state", "action", "reward"]
 _KINDS = ("nan", "infinite", "outside")
-_ROUNDING = 8  # units in the last place that a value may be outside of its space
-_NAMED = 8  # choices that a message names
+_ROUNDING = 8  # so many units in the last place outside of the space are a rounding error
+_NAMED = 8  # most choices that a message names
 
 
 class LeafValues(Statistic):
-    """The values of a leaf, in steps and final states.
+    """Counts bad values of a leaf, in steps and final states.
 
-    seen: how many. counts: how many of each element (int64, C order) are of each of `_KINDS`; a value of variable size
-    is one element. places: the first of each kind. of_elements: more of a leaf of constant size.
+    seen: the number of values. counts: for each of `_KINDS`, how many values of each element are bad (int64, C order);
+    a value of variable size is one element. places: the first of each kind. of_elements: further statistics, only for
+    a leaf of constant size.
     """
 
     of_elements: ElementStatistics | None = None
@@ -58,15 +59,15 @@ class LeafValues(Statistic):
 
     @property
     def constant(self) -> Array:
-        """Which elements had one finite value only (bool), although the space allows others."""
+        """Whether each element had only one finite value (bool), although the space allows others."""
         raise NotImplementedError
 
     def _add(self, values: Any, locate: Locate) -> None:
-        """Take some values; `locate` gives the place of one of them."""
+        """Add values; `locate(i)` gives the place of value i."""
         raise NotImplementedError
 
     def _note(self, kind: str, bad: Array, locate: Locate) -> None:
-        """`bad[element, i]`: that element of value `i` is of this kind."""
+        """Notes the first places. `bad[element, i]`: whether that element of value i is of this kind."""
         missing = MAX_PLACES - len(self.places[kind])
         if missing:
             self.places[kind] += [locate(int(i)) for i in np.flatnonzero(bad.any(axis=0))[:missing]]
@@ -125,7 +126,7 @@ class _VariableValues(LeafValues):
     def __init__(self, leaf: Leaf, role: Role, layout: StepLayout) -> None:
         super().__init__(leaf, role)
         self._layout = layout
-        # Where dtypes are recorded wider than the space declares, no value is in the space.
+        # If values were recorded in wider dtypes than the space declares, no value is in the space.
         self._in_space = leaf.name not in layout.inner_dtypes
         self._first: bytes | None = None
         self._changes = False
@@ -152,7 +153,7 @@ class _VariableValues(LeafValues):
 
 
 def _floats(value: Any) -> Iterator[Array]:
-    """The arrays of floats inside a value."""
+    """The arrays of floats in a nested value."""
     if isinstance(value, dict | tuple | list):  # a GraphInstance is a tuple, too
         for part in value.values() if isinstance(value, dict) else value:
             yield from _floats(part)
@@ -161,14 +162,14 @@ def _floats(value: Any) -> Iterator[Array]:
 
 
 def nan(measured: Measurements) -> Iterator[Finding]:
-    """NaN in a state, a final state, an action or a reward. One is enough: it spreads through every network."""
-    advice = "drop these episodes, or find the division or sensor that made it"
+    """NaN in a state, a final state, an action or a reward. A single NaN in a batch makes all weights NaN."""
+    advice = "drop these episodes, and find the division or sensor that made NaN"
     yield from _not_finite(measured, "nan", "nan", "NaN", advice)
 
 
 def infinity(measured: Measurements) -> Iterator[Finding]:
     """An infinite state, final state, action or reward."""
-    advice = "clip the values, or drop these episodes; means and normalisation become infinite"
+    advice = "clip the values, or drop these episodes: they make means and normalisation infinite"
     yield from _not_finite(measured, "infinity", "infinite", "infinite", advice)
 
 
@@ -183,9 +184,9 @@ def _not_finite(measured: Measurements, check: str, kind: str, word: str, advice
 def outside_space(measured: Measurements) -> Iterator[Finding]:
     """Values outside of their space: bounds of a Box, choices of a Discrete, letters of a Text, ...
 
-    An error where the space names choices (an index out of range crashes an embedding), a warning for a Box: learners
-    that scale by its bounds go astray. Within 8 units in the last place of the larger bound it is a rounding error, and
-    no finding. Infinite values and NaN are left to their own checks.
+    An error for spaces of choices: an index out of range crashes an embedding. A warning for a Box: learners that scale
+    by its bounds get wrong values. Up to 8 units in the last place of the larger bound count as a rounding error.
+    Infinite values and NaN have checks of their own.
     """
     for values in measured.statistics(LeafValues):
         leaf, mask = values.leaf, values.counts["outside"] > 0
@@ -204,9 +205,9 @@ def outside_space(measured: Measurements) -> Iterator[Finding]:
             severity = Severity.ERROR
             advice = "correct the space, or what the environment returns; an index out of range crashes an embedding"
         elif values.role == "action":
-            advice = "clip actions before the environment does, or what was recorded is not what was done"
+            advice = "clip actions before env.step, so that the recorded action is the one that was taken"
         else:
-            advice = "widen the space's bounds, or clip what the environment returns"
+            advice = "widen the bounds of the space, or clip what the environment returns"
         yield _bad_values(measured, values, "outside-space", "outside", severity, what, advice)
 
 
@@ -219,7 +220,7 @@ def _bad_values(
     what: str,
     advice: str,
 ) -> Finding:
-    """The finding that the values of a kind are `what`."""
+    """A finding that so many values are `what`."""
     counts = values.counts[kind]
     count, total = int(counts.sum()), values.seen * len(counts)
     message = f"{count:,} of {total:,} values are {what}"
@@ -228,11 +229,11 @@ def _bad_values(
 
 
 def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Iterator[Finding]:
-    """Dimensions of states and of continuous actions that had one value only in at least `min_steps` steps.
+    """Dimensions of states and of continuous actions that never change, judged from `min_steps` steps on.
 
-    A warning where a whole leaf never changes, or a dimension of floats (its standard deviation is 0: normalising
-    divides by it); information where some of many integers do not. Dimensions whose Box allows one value only are left
-    out, as are single pixels, and discrete actions: those are "unused-action"'s.
+    A warning if a whole leaf never changes, or a dimension of floats: normalising would divide by a standard deviation
+    of 0. An info for some of many integers. Not judged are dimensions whose Box allows one value only, single pixels,
+    and discrete actions (see "unused-action").
     """
     if measured.steps < min_steps:
         return
@@ -244,13 +245,13 @@ def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Itera
             continue
         if whole:
             message = f"all {values.seen:,} {'frames' if leaf.apart else 'values'} are the same"
-            advice = "look whether this sensor, camera or actuator works; leave it out when training"
+            advice = "check whether this sensor, camera or actuator works; leave it out of training"
         else:
             what = (
                 "never change" if elements is None or count > 1 else f"is always {elements.least[mask][0]:g}"
             )
             message = f"{dimensions(leaf, mask)} {what} in {values.seen:,} values"
-            advice = "guard against a standard deviation of 0 when normalising, or leave it out"
+            advice = "leave it out of training, or do not divide by its standard deviation of 0"
         floats = elements is not None and elements.dtype.kind == "f"
         severity = Severity.WARNING if whole or floats else Severity.INFO
         yield measured.finding(
@@ -261,7 +262,7 @@ def constant_dimension(measured: Measurements, *, min_steps: int = 100) -> Itera
 def unused_action(measured: Measurements, *, steps_each: int = 20) -> Iterator[Finding]:
     """Choices of a Discrete, MultiDiscrete or MultiBinary action that never occur.
 
-    Judged from `steps_each` steps a choice on: a uniform policy then misses one with a probability below e^-20.
+    Judged from `steps_each` steps per choice on: a uniform policy then misses a choice with a probability below e^-20.
     """
     for values in measured.statistics(LeafValues):
         elements = values.of_elements
@@ -279,7 +280,7 @@ def unused_action(measured: Measurements, *, steps_each: int = 20) -> Iterator[F
                 f"{'occurs' if count == 1 else 'occur'} in {plural(values.seen, 'step')}: {names}"
                 f"{', ...' if count > _NAMED else ''}"
             )
-            advice = "nothing can be learnt about these: record with more exploration, or mask them"
+            advice = "a policy learns nothing about these: record with more exploration, or mask them"
             yield measured.finding(
                 "unused-action", Severity.WARNING, message, advice, count, total, (), leaf, element
             )

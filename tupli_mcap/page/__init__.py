@@ -1,6 +1,6 @@
-"""The page: recordings in a browser, of a directory, one file, or a server.
+"""Web pages that show the recordings of a directory, of one file, or of a server.
 
-shelf, directory    what is shown: the seam, and the shelves of this machine
+shelf, directory    where recordings come from: the interface, and its versions for this machine
 datasets            recordings put together by what was recorded
 routes/, answers    the addresses; pages as HTML and JSON, their headers and errors
 curves, charts      what is drawn of an episode, and how

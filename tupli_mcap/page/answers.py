@@ -1,4 +1,4 @@
-"""What a browser is sent: pages as HTML or JSON, errors too, and the headers that keep what is in files from acting."""
+"""Answers to a browser: pages and errors as HTML or JSON, with headers that keep content of files from being run."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def _shelf(request: Request) -> Shelf:
 
 
 Shown = Annotated[Shelf, Depends(_shelf)]
-"""The shelf, as who asks may see it."""
+"""The shelf, limited to what the user who asks may see."""
 
 
 class SignInNeededError(TupliError):
-    """Nobody is signed in, and who reads this has to be."""
+    """This page needs a user who is signed in, and nobody is."""
 
 
 class PageRoute(APIRoute):
@@ -82,7 +82,7 @@ def page(
     shelf: Shelf | None = None,
     **drawn: Any,
 ) -> Response:
-    """A page: its facts as JSON where `?format=json` asks for it, else a template made of them and of what is drawn."""
+    """A page: `facts` as JSON if the query has `format=json`, else the template filled with `facts` and `drawn`."""
     if request.query_params.get("format") == "json":
         return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
     made = (
@@ -97,7 +97,7 @@ def page(
             **drawn,
         )
     )
-    # A text of a file may hold what UTF-8 does not.
+    # A text of a file may hold characters that UTF-8 cannot encode (lone surrogates).
     return Response(made.encode("utf-8", "replace"), status, media_type="text/html")
 
 
@@ -134,7 +134,7 @@ def _templates() -> Environment:
 
 
 def error_page(request: Request, err: Exception) -> Response:
-    """What is said of an error; who is not signed in and has to be, goes to the page for that."""
+    """The page for an error. A reader who has to sign in is sent to the page for it."""
     as_json = request.query_params.get("format") == "json"
     if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
         here = request.url.path + (f"?{request.url.query}" if request.url.query else "")
@@ -156,7 +156,7 @@ def _shelf_or_none(request: Request) -> Shelf | None:
 
 
 def _told(request: Request, err: Exception) -> tuple[int, str]:
-    """The status of an error, and what is said of it. An application may have words of its own for errors of ours."""
+    """The status and the message of an error. An application may set `app.state.told` to word our errors itself."""
     if isinstance(err, HTTPException):
         return err.status_code, str(err.detail)
     if isinstance(err, RequestValidationError):

@@ -1,4 +1,4 @@
-"""The page of a directory or a file on this machine, as an application of its own."""
+"""The application behind `tupli-mcap browse`: the pages of a directory or a file on this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _FOR_VIEWERS = {
 
 
 def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
-    """A recording for a viewer of another host, which has its address from a page of ours."""
+    """Sends a recording to a viewer of another host. The secret ticket in its address comes from one of our pages."""
     shelf: DirectoryShelf | FileShelf = request.app.state.shelf
     if not secrets.compare_digest(ticket.encode(), shelf.ticket.encode()):
         raise HTTPException(404, "there is no such file")
@@ -40,15 +40,15 @@ def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
 
 
 def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
-    """The application that shows a shelf, to programs of this machine only."""
+    """The application that shows a shelf to programs of this machine only."""
     app = FastAPI(title="tupli-mcap", docs_url=None, redoc_url=None, openapi_url=None)
     app.state.shelf = shelf
     app.state.shelf_of = lambda request: shelf
     for router in PAGES:
         app.include_router(router)
     app.get("/file/{ticket}/{name:path}")(read_recording)
-    app.add_exception_handler(HTTPException, error_page)  # an address that there is not
-    # A page of somebody else, whose name is made to mean this machine, must not read what is shown.
+    app.add_exception_handler(HTTPException, error_page)  # for addresses of no route
+    # Against DNS rebinding: a foreign page whose host name resolves to this machine must not read our pages.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
     return app
 
@@ -57,7 +57,7 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
     """Shows a directory or a recording at an address of this machine, until Ctrl-C.
 
     Args:
-        port: 0 takes one that is free.
+        port: 0 takes a free one.
         tell: called with the address.
         show: whether to open it in a browser.
 
@@ -66,15 +66,15 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
         StorageError: the port is taken.
     """
     shelf = shelf_of(path)
-    shelf.ask(lambda connection: None)  # new recordings are catalogued before anybody waits for a page
+    shelf.ask(lambda connection: None)  # catalogs new recordings before a reader waits for a page
     app = create_app(shelf)
     listening = _listen(port)
     address = f"http://{_HOST}:{listening.getsockname()[1]}"
     tell(address)
-    if show and has_display():  # else a browser may take over the terminal
+    if show and has_display():  # without a display, a text browser may take over the terminal
         webbrowser.open(address)
     config = uvicorn.Config(app, log_level="warning", server_header=False, timeout_graceful_shutdown=2)
-    with contextlib.suppress(KeyboardInterrupt):  # which uvicorn raises when it has ended
+    with contextlib.suppress(KeyboardInterrupt):  # uvicorn raises it again after its shutdown
         uvicorn.Server(config).run([listening])
 
 
@@ -85,7 +85,7 @@ def _listen(port: int) -> socket.socket:
         listening.bind((_HOST, port))
     except OSError as err:
         raise StorageError(
-            f"port {port} cannot be used: {err.strerror or err}; choose another one (--port), or none"
+            f"port {port} cannot be used: {err.strerror or err}; choose another with --port, or leave it out"
         ) from err
     listening.listen(100)
     return listening

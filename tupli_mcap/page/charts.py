@@ -1,7 +1,7 @@
-"""Pictures of numbers as SVG: tracks of an episode, histograms, values over time.
+"""Draws numbers as SVG: tracks of an episode, histograms, values over time.
 
-They are as wide as their place on the page; their texts are not stretched. Colours are classes of the style sheet, so
-that they follow a dark page. Only numbers and escaped texts go into them.
+Drawings are stretched to the width of their place on the page; their texts are not. Colours are classes of the style
+sheet, so that dark pages have their own. Only numbers and escaped texts go into a drawing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tupli_mcap.page.texts import number
 
 __all__ = ["Line", "histogram", "line_path", "lines", "over_time", "share", "track"]
 
-_WIDE, _HIGH = 1000, 100  # of a drawing, before it is stretched
+_WIDE, _HIGH = 1000, 100  # size of a drawing before it is stretched
 _TICKS = 4
 _PATH = Markup('<path class="{}" d="{}"/>')
 _BAR = Markup(
@@ -39,7 +39,7 @@ _COVER = Markup(
 )
 
 Line = tuple[Array, Array]
-"""Where the points of a line are, and their values; a NaN is a gap. float64 of one length."""
+"""The positions and the values of the points of a line: two float64 arrays of the same length. NaN makes a gap."""
 
 
 def line_path(at: Array, values: Array, across: tuple[float, float], up: tuple[float, float]) -> str:
@@ -54,7 +54,7 @@ def line_path(at: Array, values: Array, across: tuple[float, float], up: tuple[f
         else:
             pen = "M"
     if pen == "L" and len(parts) == 1:
-        parts.append("h1")  # else one point is nothing
+        parts.append("h1")  # a path of one point would be invisible
     return "".join(parts)
 
 
@@ -79,7 +79,7 @@ def share(part: float) -> Markup:
 def histogram(
     counts: Array, edges: Array, ends: tuple[str, str], names: Sequence[str] = (), label: str = ""
 ) -> Markup:
-    """Bars, and what is at either end. names: of the bars, where they have any."""
+    """Bars, with the texts `ends` below the first and the last. names: names of the bars, if they have any."""
     most = max(1.0, float(np.max(counts, initial=0)))
     width = _WIDE / max(1, len(counts))
     bars = []
@@ -92,7 +92,7 @@ def histogram(
 
 
 def cover(given: Sequence[Line]) -> str:
-    """Some lines, each in a band of its own, as a picture with its own colours; points and values are from 0 to 1."""
+    """A picture of lines, each in its own band and colour. Positions and values are from 0 to 1."""
     bands = len(given) or 1
     paths = []
     for i, (at, values) in enumerate(given):
@@ -111,12 +111,13 @@ def over_time(
     points: Line | None = None,
     band: tuple[Array, Array] | None = None,
 ) -> Markup:
-    """Lines over the same stretch of time, with a scale.
+    """Lines over the same time, with a scale.
 
     Args:
-        ends: what is at either end of the time.
-        names: of the lines, where they are several.
-        points: single values behind the first line. band: where most of them lie, at the points of the first line.
+        ends: texts for the begin and the end of the time.
+        names: names of the lines, if there are several.
+        points: single values, drawn behind the first line.
+        band: the lower and the upper edge of the range of most values, at the points of the first line.
     """
     drawn = [*(line[1] for line in given), *([points[1]] if points else []), *(band or ())]
     finite = np.concatenate([values[np.isfinite(values)] for values in drawn])
@@ -138,7 +139,7 @@ def over_time(
 
 
 def _drawing(inside: Markup, kind: str, label: str = "") -> Markup:
-    """label: what it shows, for who cannot see it; without one, the text beside it says so."""
+    """label: describes the drawing to screen readers; without one, they skip it, and the text beside it says enough."""
     told = Markup('role="img" aria-label="{}"').format(label) if label else Markup('aria-hidden="true"')
     return Markup('<svg class="{}" {} viewBox="0 0 {} {}" preserveAspectRatio="none">{}</svg>').format(
         kind, told, _WIDE, _HIGH, inside

@@ -28,10 +28,10 @@ _MEDIA = "application/octet-stream"
 
 
 def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingResponse:
-    """An answer that is a recording of exactly these episodes, made while it is sent.
+    """An answer with one recording of these episodes, written while it is sent.
 
     Raises:
-        SpaceError, RecordingError: they cannot be one recording.
+        SpaceError, RecordingError: the episodes cannot be merged into one recording.
     """
     excerpts = []
     for name, group in itertools.groupby(headers, key=lambda header: header.recording):
@@ -44,10 +44,10 @@ def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingRes
 def streamed(
     opening: AbstractContextManager[Sequence[Excerpt]], without: Collection[str] = (), **headers: str
 ) -> StreamingResponse:
-    """An answer that is a recording of these episodes, made while it is sent; see `stream_excerpts`.
+    """An answer with one recording of these episodes, written while it is sent; see `stream_excerpts`.
 
     Raises:
-        SpaceError, RecordingError: they cannot be merged. What goes wrong later ends the connection.
+        SpaceError, RecordingError: the episodes cannot be merged. A later error ends the connection.
     """
     pieces = stream_excerpts(opening, without)
     first = next(pieces)
@@ -60,7 +60,7 @@ def _after(first: bytes, pieces: Generator[bytes]) -> Generator[bytes]:
 
 
 class _Streamed(StreamingResponse):
-    """An answer whose pieces are closed when it ends, also where its client goes away."""
+    """An answer that closes its generator when it ends, also if the client disconnects."""
 
     def __init__(self, pieces: Generator[bytes], **more: Any) -> None:
         super().__init__(pieces, **more)
@@ -74,11 +74,11 @@ class _Streamed(StreamingResponse):
 
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
-    """An episode with its blueprint for the Rerun viewer, or several in the same plots; likewise.
+    """Writes a temporary file for the Rerun viewer: one episode with its blueprint, or several in the same plots.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
-        RecordingError: they cannot be compared.
+        RecordingError: the episodes cannot be compared.
     """
     from tupli_mcap.dataset.which import Chosen
     from tupli_mcap.viewer.plan import plans_of
@@ -99,11 +99,11 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
 
 
 def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
-    """The pictures of an episode as MP4; likewise.
+    """Writes the pictures of an episode as a temporary MP4.
 
     Raises:
         MissingExtraError: PyAV is not installed.
-        RecordingError: there are no pictures.
+        RecordingError: the episode has no pictures.
     """
     from tupli_mcap.replay import film
 
@@ -115,14 +115,14 @@ def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
 
 
 def sent(path: Path, name: str, media: str = _MEDIA) -> FileResponse:
-    """A file in a temporary directory of its own, which is removed when it was sent."""
+    """An answer with a file whose directory is temporary, and removed after sending."""
     gone = BackgroundTask(shutil.rmtree, path.parent, ignore_errors=True)
     return FileResponse(path, media_type=media, filename=name, background=gone)
 
 
 @contextlib.contextmanager
 def _folder() -> Iterator[Path]:
-    """A temporary directory, which stays if nothing fails."""
+    """A temporary directory, removed only if the block fails."""
     folder = Path(tempfile.mkdtemp(prefix="tupli-mcap-"))
     try:
         yield folder

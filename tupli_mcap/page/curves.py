@@ -1,4 +1,4 @@
-"""What is drawn of an episode: a track for each number of its states, actions, rewards and infos, step by step."""
+"""The tracks of an episode: one for each number of its states, actions, rewards and infos, over its steps."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tupli_mcap.spaces.leaves import Leaf
 __all__ = ["Curves", "Track", "curves_of", "values_at"]
 
 SO_FAR: Final = "return so far"
-_POINTS: Final = 800  # of a track
-_READ_BYTES: Final = 64 << 20  # of the steps of an episode that are read at most
-_MOST_TRACKS: Final = 48  # of a leaf
-_MOST_INFOS: Final = 50_000  # of a recording, all of which have to be read for those of one episode
+_POINTS: Final = 800  # most points of a track
+_READ_BYTES: Final = 64 << 20  # most bytes of steps that are read of an episode
+_MOST_TRACKS: Final = 48  # most tracks of a leaf
+_MOST_INFOS: Final = 50_000  # most infos of a recording: those of one episode take reading all of them
 _MOST_KEYS: Final = 24
 
 
@@ -32,8 +32,8 @@ _MOST_KEYS: Final = 24
 class Track:
     """One number over the steps of an episode.
 
-    field: "state", "action", "reward" or "info". at, values: the steps and what is drawn there (float64; NaN: nothing).
-    names: of the values of a choice, from `start` on.
+    field: "state", "action", "reward" or "info". at, values: steps and values to draw (float64; NaN is a gap).
+    names: the names of discrete values, of which the first is `start`.
     """
 
     field: str
@@ -45,14 +45,14 @@ class Track:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The smallest and the largest value, NaN where there is none."""
+        """The smallest and the largest value; NaN if there is none."""
         known = self.values[np.isfinite(self.values)]
         return (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
 
 
 @dataclass(frozen=True)
 class Curves:
-    """The tracks of an episode. read: how many of its steps they show. notes: what is left out; sentences."""
+    """The tracks of an episode. read: how many of its steps they show. notes: sentences about what is left out."""
 
     tracks: Sequence[Track]
     read: int
@@ -95,7 +95,7 @@ def curves_of(episode: Episode) -> Curves:
 
 
 def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
-    """What there was at a step, as text by field and name: what has a track by the track's name, and all else.
+    """The values at a step as texts, by field and name. A value that has a track has the track's name.
 
     Raises:
         FormatError: the recording is damaged.
@@ -170,7 +170,7 @@ def _few_infos(recording: Recording) -> bool:
 
 def _info_tracks(recording: Recording, episode: Episode, read: int, notes: list[str]) -> Iterator[Track]:
     if not _few_infos(recording):
-        notes.append(f"Infos of a recording that has more than {_MOST_INFOS:,} are not drawn.")
+        notes.append(f"Infos are not drawn: the recording has more than {_MOST_INFOS:,}.")
         return
     found: dict[str, Array] = {}
     for step, info in enumerate((episode.infos or [])[:read]):

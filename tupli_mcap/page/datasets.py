@@ -1,4 +1,4 @@
-"""Datasets: the recordings of a benchmark, or those without one that name the same environment."""
+"""Datasets: the recordings of one benchmark, or of one environment if they have no benchmark."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ _UNNAMED: Final = "Recordings without an environment"
 
 @dataclass(frozen=True)
 class Dataset:
-    """What is known of a dataset without a look at its episodes.
+    """What the catalog knows of a dataset without reading its episodes.
 
-    key: what it is called in addresses. benchmark: None for recordings without one, or where it may not be read.
-    recordings: at least one, but for a benchmark that nothing was recorded of.
+    key: its name in addresses. benchmark: None for recordings without one, or if the reader may not see it.
+    recordings: empty only for a benchmark without recordings.
     """
 
     key: str
@@ -52,7 +52,7 @@ class Dataset:
 
     @property
     def name(self) -> str:
-        """The benchmark's name, else the environment's, else that of the only run."""
+        """The name of the benchmark, else of the environment, else of the run if there is only one."""
         named = self.benchmark.metadata.name if self.benchmark else ""
         runs = {str(run.get("name", "")) for run in self.runs}
         only = next(iter(runs)) if len(runs) == 1 else ""
@@ -73,12 +73,12 @@ class Dataset:
 
     @property
     def size(self) -> int:
-        """Bytes of the files."""
+        """The size of the files (bytes)."""
         return sum(item.size for item in self.recordings)
 
     @property
     def return_mean(self) -> float | None:
-        """Of the episodes whose return is a number."""
+        """The mean over the episodes whose return is a number."""
         known = sum(item.returns for item in self.recordings)
         return sum(item.return_sum or 0.0 for item in self.recordings) / known if known else None
 
@@ -96,12 +96,12 @@ class Dataset:
 
     @property
     def success(self) -> tuple[int, int]:
-        """How many episodes succeeded, of how many that say it."""
+        """How many episodes succeeded, and how many say whether they did."""
         return sum(item.succeeded for item in self.recordings), sum(item.told for item in self.recordings)
 
     @property
     def first(self) -> int:
-        """When its first episode ended (ns); of a benchmark without any, when it was stored."""
+        """When its first episode ended (ns); for a benchmark without episodes, when it was stored."""
         return min((item.first for item in self.recordings), default=self._stored)
 
     @property
@@ -114,7 +114,7 @@ class Dataset:
 
     @property
     def live(self) -> bool:
-        """Whether somebody is recording."""
+        """Whether a process is writing to one of its recordings."""
         return any(item.mixed == LIVE for item in self.recordings)
 
     @cached_property
@@ -123,7 +123,7 @@ class Dataset:
         return [run for item in self.recordings for run in item.runs]
 
     def holds(self, words: Sequence[str]) -> bool:
-        """Whether each of some words (in lower case) is somewhere in what is said of it."""
+        """Whether each of the words (lower case) is in its names, description, owner or tags."""
         said = [self.name, self.description, self.environment, self.benchmark_id]
         said += [self.benchmark.created_by] if self.benchmark else []
         for run in self.runs:
@@ -132,7 +132,7 @@ class Dataset:
         return all(word in text for word in words)
 
     def facts(self) -> dict[str, Any]:
-        """The same as JSON has it."""
+        """The facts of it that go into JSON."""
         succeeded, told = self.success
         return {
             "key": self.key,
@@ -155,7 +155,7 @@ class Dataset:
 
 
 def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
-    """All of a shelf, the last recorded first."""
+    """All datasets of a shelf, the most recently recorded first."""
     found = _grouped(
         _tallies(shelf, connection), {header.id: header for header in shelf.benchmarks(connection)}
     )
@@ -166,7 +166,7 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
     """A dataset by its key.
 
     Raises:
-        NotFoundError: there is none that may be read.
+        NotFoundError: there is no such dataset, or the reader may not see it.
     """
     benchmarks = {h.id: h for h in shelf.benchmarks(connection, FilterEQ(key="id", value=key))}
     found = _grouped(_tallies(shelf, connection, of_dataset(key)), benchmarks)
@@ -176,7 +176,7 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
 
 
 def dataset_filter(key: str) -> str:
-    """The text of a filter that is true of the episodes of a dataset; empty for none, or an odd name."""
+    """The text of a filter for the episodes of a dataset; empty for no key, or one that encodes an unusual name."""
     if not key or key.startswith(("~", _NAMELESS)):
         return ""
     name = "benchmark_id" if is_hash(key) else "run.environment"
@@ -184,19 +184,19 @@ def dataset_filter(key: str) -> str:
 
 
 def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:
-    """The dataset that an episode is of."""
+    """The dataset of an episode."""
     found = select(RECORDING.c.benchmark_id, RECORDING.c.environment).where(of_recording(header.recording))
     benchmark_id, environment = connection.execute(found).one()
     return find_dataset(shelf, connection, _key(unescape_text(benchmark_id), unescape_text(environment)))
 
 
 def of_recording(name: str) -> ColumnElement[bool]:
-    """A condition on RECORDING: the one of this name."""
+    """A condition on RECORDING: the recording of this name."""
     return RECORDING.c.path == escape_text(name)
 
 
 def of_dataset(key: str) -> ColumnElement[bool]:
-    """A condition on RECORDING: those of the dataset with a key."""
+    """A condition on RECORDING: the recordings of the dataset with this key."""
     benchmark_id, environment = _meant(key)
     if benchmark_id:
         return RECORDING.c.benchmark_id == escape_text(benchmark_id)
@@ -228,7 +228,7 @@ def _grouped(found: Iterable[Tally], benchmarks: Mapping[str, BenchmarkHeader]) 
 
 
 def _key(benchmark_id: str, environment: str) -> str:
-    """What an address calls a dataset: a benchmark's id, an environment's name, or what stands for an odd one."""
+    """The key of a dataset: a benchmark's id, an environment's name, or a code (`~b…`, `~e…`) for an unusual one."""
     if is_hash(benchmark_id):
         return benchmark_id
     if not benchmark_id and not environment:
@@ -240,7 +240,7 @@ def _key(benchmark_id: str, environment: str) -> str:
 
 
 def _meant(key: str) -> tuple[str, str]:
-    """The benchmark's id, or else the environment's name, that a key stands for."""
+    """The benchmark id and the environment's name of a key; one of them is empty."""
     if is_hash(key):
         return key, ""
     if not key.startswith("~"):

@@ -1,4 +1,4 @@
-"""Shelves of this machine: a directory, a storage, one file. Looking writes nothing into them."""
+"""Shelves for this machine: a directory, a storage, one file. They write nothing into them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ __all__ = ["CACHE_BYTES", "DirectoryShelf", "FileShelf", "OpenedRecordings", "sh
 T = TypeVar("T")
 _MOST_OPEN = 16
 CACHE_BYTES = 64 << 20
-"""What each recording that is open keeps of its steps."""
+"""The cache of each open recording (bytes)."""
 
 
 def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
-    """A directory, or one recording.
+    """The shelf of a directory, or of one recording.
 
     Raises:
-        RecordingError: there is no such file.
+        RecordingError: the path does not exist.
     """
     if path.is_dir():
         return DirectoryShelf(path)
@@ -42,16 +42,16 @@ def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
 
 
 class OpenedRecordings:
-    """Keeps a few recordings open, from any thread: a picture of an episode takes a moment, opening its file longer."""
+    """Keeps the recordings used last open, because opening takes longer than reading a picture. Thread-safe."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[Hashable, Recording] = OrderedDict()
         self._turn = threading.Lock()
 
     def get(self, key: Hashable, opening: Callable[[], Recording]) -> Recording:
-        """The recording of a key, which stands for one version of it; None: it changes all the time.
+        """The open recording of a key, which names one version of a file; None for a file that is being written.
 
-        It is closed when nobody holds it any more.
+        A recording that was dropped here is closed once no caller holds it.
         """
         with self._turn:
             if key is not None and key in self._kept:
@@ -67,9 +67,9 @@ class OpenedRecordings:
 
 
 class _OpenToAll:
-    """What lies on this machine is read as a whole, by who runs the program.
+    """A shelf whose only reader is the user who runs the program, and may read everything.
 
-    A page of another host may read a recording only where it was given its address, which nobody can guess.
+    A viewer on another host can read a recording only by an address with a secret ticket.
     """
 
     user = ""
@@ -134,10 +134,10 @@ class FileShelf(_OpenToAll):
         return self._catalog.ask(question)
 
     def _follow(self) -> None:
-        """Brings the file as it is now into the catalog.
+        """Updates the catalog if the file has changed.
 
         Raises:
-            RecordingError, FormatError: it is gone, or damaged.
+            RecordingError, FormatError: the file is gone, or damaged.
         """
         name = self._path.name
         if self._known is not None and self._known == _stamp(self._path.parent, name):

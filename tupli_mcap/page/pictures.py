@@ -23,9 +23,9 @@ _COARSE = 200  # pixels
 
 
 class Camera(NamedTuple):
-    """What there are pictures of: a camera, or an image of the states (`leaf`).
+    """A source of pictures: a camera, or an image of the states (`leaf`).
 
-    steps: int64, what each picture shows: the state after so many steps.
+    steps: int64; picture i shows the state after `steps[i]` steps.
     """
 
     name: str
@@ -34,15 +34,15 @@ class Camera(NamedTuple):
 
     @property
     def coarse(self) -> bool:
-        """Whether its pixels are to be seen as such: it has few."""
+        """Whether it has so few pixels that a browser has to enlarge them without smoothing."""
         return self.leaf is not None and max(self.leaf.shape) < _COARSE
 
     def place(self, step: int) -> int:
-        """Which picture shows a step: the last one up to it."""
+        """The index of the picture that shows a step: the last one up to it."""
         return max(0, int(self.steps.searchsorted(step, side="right")) - 1)
 
     def shows(self) -> str:
-        """For scripts, as JSON: the steps, or how many there are where each step has a picture."""
+        """JSON for the page's script: the steps, or their count if each step has a picture."""
         count = len(self.steps)
         return json.dumps(count if np.array_equal(self.steps, np.arange(count)) else self.steps.tolist())
 
@@ -60,7 +60,7 @@ def picture_at(episode: Episode, cameras: Sequence[Camera], camera: int, place: 
 
     Raises:
         NotFoundError: there is no such picture.
-        MissingExtraError: an image needs Pillow.
+        MissingExtraError: Pillow, which images need, is not installed.
     """
     if not (0 <= camera < len(cameras) and 0 <= place < len(cameras[camera].steps)):
         raise NotFoundError("there is no such picture")
@@ -69,7 +69,7 @@ def picture_at(episode: Episode, cameras: Sequence[Camera], camera: int, place: 
         data = bytes(episode.recording.frames(episode.position, chosen.name).encoded(place).data)
         form = format_of(data)
         if form is None:
-            raise NotFoundError("the bytes of the frame are no picture")
+            raise NotFoundError("this frame cannot be shown: expected PNG or JPEG, found other bytes")
         return data, f"image/{form}"
     value = chosen.leaf.get(episode[place : place + 1].states)[0]
     return encode_pixels(as_picture(value, chosen.leaf)), "image/png"

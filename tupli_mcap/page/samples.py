@@ -1,4 +1,4 @@
-"""Samples of a dataset that are quick to take, however many episodes it has: of its episodes, and of their steps."""
+"""Samples episodes and steps of a dataset, in a time that does not grow with the number of its episodes."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 __all__ = ["SampledEpisodes", "SampledValues", "sample_episodes", "sample_numbers", "sample_values"]
 
 _EPISODES: Final = 2_000
-_RECORDINGS: Final = 250  # that episodes are taken from
+_RECORDINGS: Final = 250  # most recordings that episodes are taken from
 _IDS_AT_ONCE: Final = 500
-_OPENED: Final = 5  # recordings whose steps are read
-_STEP_BYTES: Final = 2 << 20  # of each of them
+_OPENED: Final = 5  # most recordings whose steps are read
+_STEP_BYTES: Final = 2 << 20  # most bytes read of each of them
 
 
 @dataclass(frozen=True)
 class SampledEpisodes:
-    """Facts of some episodes in the order of their ends.
+    """Facts of sampled episodes, in the order in which they ended.
 
-    recordings: their names. ended: ns since 1970 (int64). returns, steps, success, seeds: float64, NaN where there is
-    none. of: how many episodes there are.
+    recordings: the name of the recording of each. ended: ns since 1970 (int64). returns, steps, success, seeds:
+    float64, NaN if unknown. of: the number of episodes that the sample was taken from.
     """
 
     recordings: Sequence[str]
@@ -47,13 +47,13 @@ class SampledEpisodes:
 
     @property
     def is_all(self) -> bool:
-        """Whether they are all that there are."""
+        """Whether the sample holds every episode."""
         return len(self.ended) >= self.of
 
 
 @dataclass(frozen=True)
 class SampledValues:
-    """Values of some steps, leaf by leaf. steps, episodes: how many. notes: what is left out; sentences."""
+    """Values of sampled steps by leaf. steps, episodes: how many were read. notes: sentences about what is left out."""
 
     states: Sequence[LeafValues]
     actions: Sequence[LeafValues]
@@ -64,7 +64,7 @@ class SampledValues:
 
 
 def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> SampledEpisodes:
-    """All episodes of a dataset, or of many those at even distances in its recordings."""
+    """All episodes of a dataset; of a large one, episodes at even distances in its recordings."""
     facts = (EPISODE.c[name] for name in ("created_at", "episode_return", "n_tuples", "success", "seed"))
     query = select(RECORDING.c.path, *facts).select_from(EPISODE.join(RECORDING, of_one_recording()))
     if dataset.episodes <= _EPISODES:
@@ -143,7 +143,7 @@ def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array
 def sample_numbers(
     shelf: Shelf, connection: Connection, dataset: Dataset, each: int = 12
 ) -> list[tuple[str, list[int]]]:
-    """A few episodes of a few recordings of a dataset, by number."""
+    """The numbers of about `each` episodes of a few recordings of a dataset, by recording."""
     found = []
     for item in _evenly(dataset.recordings, _OPENED):
         ids = _ids(shelf, connection, [item], min(1.0, each / max(1, item.episodes)))
@@ -155,14 +155,14 @@ def sample_numbers(
 
 
 def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
-    """Some recordings at even distances, the first and the last among them."""
+    """At most `most` recordings at even distances in time, among them the first and the last."""
     ordered = sorted(recordings, key=lambda item: (item.last, item.recording))
     chosen = np.unique(np.linspace(0, len(ordered) - 1, min(most, len(ordered))).round().astype(int))
     return [ordered[i] for i in chosen.tolist()]
 
 
 def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
-    """Row ids of about that share of the episodes of some recordings, at even distances in each."""
+    """The row ids of about a `share` of the episodes of some recordings, at even distances in each."""
     counts = {escape_text(item.recording): item.episodes for item in recordings}
     for paths in _batches(counts):
         found = connection.execute(
@@ -176,7 +176,9 @@ def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], shar
             if low is None:
                 continue
             there: Any = range(low, high + 1)
-            if len(there) != counts[path]:  # some are deleted, or may not be read
+            if (
+                len(there) != counts[path]
+            ):  # ids have gaps: episodes that are deleted, or that the reader may not see
                 there = (
                     connection.execute(select(EPISODE.c.id).where(own).order_by(EPISODE.c.id)).scalars().all()
                 )

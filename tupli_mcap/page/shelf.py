@@ -1,4 +1,4 @@
-"""What the page shows: the one seam between it and a directory, a file, or what a server keeps."""
+"""The interface between the pages and where recordings come from: a directory, a file, or a server's data."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ T = TypeVar("T")
 
 
 class Shelf(Protocol):
-    """Recordings as one reader sees them; from any thread.
+    """The recordings that one reader may see. Thread-safe.
 
     Attributes:
-        title: what to call all of it.
-        opened_by: what `tupli_mcap.open` is given to open it.
-        user: who reads; empty where nobody is signed in.
-        places: other pages that the reader may go to: address and title.
-        skipped: files that cannot be shown, and why, as of the last question.
+        title: a name for the whole.
+        opened_by: the argument with which `tupli_mcap.open` opens it.
+        user: the reader; empty if nobody is signed in.
+        places: further pages for the reader: address and title.
+        skipped: files that cannot be shown, and why, as of the last call of `ask`.
     """
 
     title: str
@@ -40,43 +40,43 @@ class Shelf(Protocol):
     def skipped(self) -> Mapping[str, str]: ...
 
     def ask(self, question: Callable[[Connection], T]) -> T:
-        """What a question finds in the tables of a catalog that is up to date, in one transaction."""
+        """Brings the catalog up to date, and returns the result of a function that reads it, in one transaction."""
         ...
 
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
-        """What may be read, as a condition on these columns of the table that is asked."""
+        """What the reader may see, as a condition on these two columns of the queried table."""
         ...
 
     def open(self, recording: str) -> Recording:
-        """A recording of the catalog, which others use at the same time: do not close it.
+        """An open recording of the catalog. Others use it at the same time: do not close it.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: there is no such recording.
         """
         ...
 
     def address_of(self, recording: str) -> str | None:
-        """Where a viewer of another host may read a recording for a while: a path of this server; None for nowhere."""
+        """The path on this server where a viewer of another host may read a recording for a while; None if nowhere."""
         ...
 
     def benchmarks(
         self, connection: Connection, filter: BaseFilter | None = None
     ) -> Sequence[BenchmarkHeader]:
-        """The benchmarks that may be read and that a filter is true of; within a question."""
+        """The benchmarks that the reader may see and that match a filter; for use within `ask`."""
         ...
 
 
 def seen_episodes(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
-    """The episodes that may be read, and that all conditions are true of."""
+    """A condition for the episodes that the reader may see and that meet all conditions."""
     return and_(shelf.seen(EPISODE.c.created_by, EPISODE.c.published_in), *conditions)
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:
-    """Episodes by their ids, each once, in the order of their recordings; of those that several people have stored,
-    the reader's own.
+    """Episodes by their ids, each once, in the order of their recordings. If several users have stored an episode, the
+    reader's own copy is taken.
 
     Raises:
-        NotFoundError: one of them is not there, or may not be read.
+        NotFoundError: an episode does not exist, or the reader may not see it.
     """
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
     found = each_once(find_episodes(connection, wanted, only=seen_episodes(shelf)), shelf.user)
@@ -88,12 +88,12 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
 
 
 def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
-    """An episode by its id. Raises NotFoundError, as `find_some` does."""
+    """One episode by its id; see `find_some`."""
     return find_some(shelf, connection, [uri])[0]
 
 
 def python_line(shelf: Shelf, filter: str, sort: str = "") -> str:
-    """The Python that opens the episodes that match a filter; all of them where it is empty."""
+    """Python code that opens the episodes that match a filter; all episodes if it is empty."""
     line = f"tupli_mcap.open({shelf.opened_by!r})"
     line += f".filter({filter!r})" if filter else ""
     falling = ", descending=True" if sort.startswith("-") else ""

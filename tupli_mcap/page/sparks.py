@@ -1,4 +1,4 @@
-"""Small lines beside the episodes of a table: what each of them did over its steps."""
+"""Small lines beside the episodes of a table, each of one value over the steps of the episode."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from tupli_mcap.spaces.labels import element_names
 
 __all__ = ["Sparks", "sparks_of"]
 
-_MOST_STEPS: Final = 400_000  # of all of them together
+_MOST_STEPS: Final = 400_000  # most steps that are read for one table
 _POINTS: Final = 120
 
 
 class Sparks(NamedTuple):
-    """What is drawn, and by episode id the `d` of its line in a drawing of 1000 x 100."""
+    """The name of the drawn value, and by episode id the SVG path (`d`) of its line in a drawing of 1000 x 100."""
 
     name: str
     lines: Mapping[str, str]
 
 
 def sparks_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Sparks:
-    """The rewards of some episodes, or where these are always the same, the first number of their states."""
+    """Draws the rewards of some episodes; if they are all the same, the first number of the states instead."""
     found: dict[str, Array] = {}
     name = "reward"
     for column in (_rewards, _first_state):
@@ -69,7 +69,7 @@ def _read(shelf: Shelf, headers: Sequence[EpisodeHeader], column: Column) -> tup
             if (
                 numbers[np.minimum(positions, len(numbers) - 1)] != [header.episode for header in some]
             ).any():
-                continue  # it has changed since
+                continue  # the file has changed since the query
             values, name = column(recording, positions)
         except TupliError:
             continue

@@ -1,4 +1,4 @@
-"""Numbers, times and sizes as people read them."""
+"""Numbers, times and sizes as texts for people."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["day", "duration", "iso", "minute", "number", "percent", "said", "siz
 
 
 def number(value: float | None) -> str:
-    """`1,234`, `0.0123`, `-4.5e+20`; a dash for what is none."""
+    """`1,234`, `0.0123`, `-4.5e+20`; a dash for None and NaN."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -25,7 +25,7 @@ def number(value: float | None) -> str:
 
 
 def percent(part: int, whole: int) -> str:
-    """A share; `–` of nothing."""
+    """A share such as `40%`; a dash if the whole is 0."""
     return f"{100 * part / whole:.0f}%" if whole else "–"
 
 
@@ -47,7 +47,7 @@ def iso(ns: int) -> str:
     """ISO 8601 in UTC, to the second."""
     try:
         moment = datetime.datetime.fromtimestamp(ns // 10**9, datetime.UTC)
-    except (OverflowError, ValueError, OSError):  # a file may say anything
+    except (OverflowError, ValueError, OSError):  # a file may hold a time that no clock has
         return ""
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 

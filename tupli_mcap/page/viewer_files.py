@@ -1,7 +1,7 @@
-"""The Rerun web viewer that comes with rerun-sdk, as files that the page serves itself: it asks no other host.
+"""The Rerun web viewer of rerun-sdk, as files that our pages serve, so that they load nothing from other hosts.
 
-The program `rerun` holds them and serves them; they are taken from it once, and kept compressed in this user's cache
-directory, where nobody else can write. Their version is that of the data, as viewers read no other one.
+The program `rerun` contains the files and serves them. We fetch them from it once, and keep them compressed in the
+user's cache directory, where nobody else can write. Viewer and data have the same version: a viewer reads no other.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ def viewer_file(name: str) -> Path:
     Raises:
         MissingExtraError: rerun-sdk is not installed.
         ViewerError: its program cannot be run.
-        StorageError: there is no place for the files.
+        StorageError: the files cannot be kept, or others may write to their directory.
     """
     folder = cache_dir() / "viewer" / viewer_version()
     with _turn:
         if not (folder / f"{name}.gz").is_file():
             _take(folder)
         if not is_private(folder) or not is_private(folder / f"{name}.gz"):
-            raise StorageError(f"others may write to {folder}; remove it, or set TUPLI_MCAP_CACHE_DIR")
+            raise StorageError(f"other users may write to {folder}; remove it, or set TUPLI_MCAP_CACHE_DIR")
     return folder / f"{name}.gz"
 
 

@@ -5,7 +5,7 @@ dataset    `/dataset/KEY`: one of them
 episode    `/episode/ID`: one episode
 chosen     `/compare`, `/download`
 replay     `/viewer`: episodes in Rerun
-files      pictures, and the style and the script of the pages
+files      pictures, style sheet and scripts
 """
 
 from tupli_mcap.page.routes import chosen, dataset, episode, files, lists, replay

@@ -1,4 +1,4 @@
-"""Chosen episodes: compared, drawn small beside each other, taken home."""
+"""Chosen episodes: compares them, draws small lines of them, downloads them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_leng
 
 
 class Compared(NamedTuple):
-    """The same number in several episodes. lines: as SVG. ends: the smallest and the largest value of all."""
+    """One number in several episodes. lines: SVG. ends: the smallest and the largest value of all."""
 
     name: str
     lines: Markup
@@ -43,7 +43,7 @@ class Compared(NamedTuple):
 
 @router.get("/compare")
 def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
-    """Up to eight episodes, in the same plots."""
+    """A page with up to eight episodes in the same plots."""
     if not 2 <= len(set(uris)) <= MOST_COMPARED:
         raise HTTPException(400, f"expected 2 to {MOST_COMPARED} episodes to compare, found {len(set(uris))}")
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
@@ -62,7 +62,7 @@ _FIELDS: Final = {"reward": "Reward", "action": "Actions", "state": "States", "i
 
 
 def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
-    """The tracks that all episodes have."""
+    """Overlays the tracks that all episodes have."""
     each = [{track.name: track for track in one.curves.of(field)} for one in seen]
     names = [name for name in each[0] if all(name in tracks for tracks in each)]
     return [_overlaid(name, [tracks[name] for tracks in each], steps) for name in names]
@@ -80,14 +80,14 @@ def _overlaid(name: str, tracks: Sequence[Track], steps: int) -> Compared:
 
 @router.get("/sparks")
 def sparks(shelf: Shown, uris: Ids) -> Response:
-    """Lines beside the rows of a table, as JSON: what they are of, and by id the path of each."""
+    """The small lines beside the rows of a table, as JSON: the name of their value, and by id the path of each."""
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
     return Response(jsonvalue.dumps(sparks_of(shelf, headers)._asdict()), media_type="application/json")
 
 
 @router.get("/download")
 def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Response:
-    """One recording of exactly the chosen episodes, or else of all that a filter is true of."""
+    """One recording of the chosen episodes; if none are chosen, of all that match the filter."""
 
     def ask(connection: Connection) -> list[EpisodeHeader]:
         if uris:
@@ -98,7 +98,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
 
     headers = shelf.ask(ask)
     if not headers:
-        raise NotFoundError("there is no such episode; choose others")
+        raise NotFoundError("no episode matches; choose others, or another filter")
     name = str(headers[0].run.get("name", "")) or Path(headers[0].recording).stem
     what = f"episode-{headers[0].episode}" if len(headers) == 1 else f"{len(headers)}-episodes"
     answer = recording_of(shelf, headers)
@@ -110,6 +110,6 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
 
 @router.get("/episode/{uri}/film.mp4")
 def film(shelf: Shown, uri: str) -> FileResponse:
-    """The pictures of an episode."""
+    """The pictures of an episode as an MP4."""
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")

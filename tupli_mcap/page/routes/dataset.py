@@ -1,4 +1,4 @@
-"""One dataset: an episode of it first, then what all of them are like, and what they come from."""
+"""The page of a dataset: one of its episodes, then statistics of all, and their recordings."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from tupli_mcap.storage.catalog.queries import Sort, find_episodes
 __all__ = ["router", "shown_first"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
-_RECORDINGS: Final = 100  # that are listed
-_HISTOGRAMS: Final = 24  # of a field
+_RECORDINGS: Final = 100  # most recordings that are listed
+_HISTOGRAMS: Final = 24  # most histograms of a field
 _BINS: Final = 24
-_GROUPS: Final = 60  # of episodes, along the time
-_GROUPS_EACH: Final = 30
-_LINES: Final = 8  # recordings that have a line each
-_FEW: Final = 40  # episodes, each of which is a group of its own
+_GROUPS: Final = 60  # groups of episodes along the time, whose means make a line
+_GROUPS_EACH: Final = 30  # the same, for one of several lines
+_LINES: Final = 8  # most recordings that get a line each
+_FEW: Final = 40  # up to so many episodes, each is a group of its own
 
 
 class Histogram(NamedTuple):
-    """How often values occur. name: of what."""
+    """How often values occur. name: what the values are of."""
 
     name: str
     drawn: Markup
@@ -57,7 +57,7 @@ def dataset(
     key: str,
     show: Annotated[str, Query(pattern="newest|best|worst")] = "newest",
 ) -> Response:
-    """A dataset. show: which of its episodes comes first."""
+    """The page of a dataset. show: which of its episodes is shown at its top."""
 
     def ask(connection: Connection) -> tuple[Dataset, EpisodeHeader | None, SampledEpisodes, Any]:
         found = find_dataset(shelf, connection, key)
@@ -93,8 +93,8 @@ def dataset(
 
 def _look(shelf: Shelf, header: EpisodeHeader) -> Seen | None:
     try:
-        return look(shelf, header, header.n_tuples // 3)  # where something goes on, most often
-    except TupliError:  # a damaged file must not hide the others
+        return look(shelf, header, header.n_tuples // 3)  # a step at which most environments are in motion
+    except TupliError:  # the other recordings of the dataset may be sound
         return None
 
 
@@ -122,7 +122,7 @@ def _ends(values: Array) -> str:
 
 
 class Chart(NamedTuple):
-    """Numbers of episodes: one after another, and as a distribution; `alike`: the value, where all have the same."""
+    """A number of episodes over time, and its distribution; instead, `alike` is the value that all episodes have."""
 
     title: str
     over_time: Markup = Markup("")
@@ -131,7 +131,7 @@ class Chart(NamedTuple):
 
 
 def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[Chart]:
-    """names: of the runs, by recording, each of which gets a line of its own; empty for one line of all."""
+    """Charts of return, length and success. names: by recording, the name of its line; empty for one line of all."""
     for title, values in (
         ("Return", episodes.returns),
         ("Length", episodes.steps),
@@ -158,7 +158,7 @@ def _as_one(episodes: SampledEpisodes, values: Array, what: str) -> Markup:
     middle, mean, _, low, high, _ = bands(values, len(values) if len(values) <= _FEW else _GROUPS)
     ends = texts.day(int(episodes.ended[0])), texts.day(int(episodes.ended[-1]))
     ends = ends if ends[0] != ends[1] else ("first", "last")
-    if set(values[np.isfinite(values)].tolist()) <= {0.0, 1.0}:  # of flags, only the mean says something
+    if set(values[np.isfinite(values)].tolist()) <= {0.0, 1.0}:  # points and band of flags would show nothing
         return charts.over_time([(middle, mean)], ends, what)
     return charts.over_time([(middle, mean)], ends, what, points=(at, values), band=(low, high))
 
@@ -174,7 +174,7 @@ def _by_recording(episodes: SampledEpisodes, values: Array, names: Mapping[str, 
 
 
 def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
-    """The names of runs by recording, if those are few and each has enough episodes for a line."""
+    """The names of runs by recording, if there are few recordings and each has enough episodes for a line."""
     counts = Counter(episodes.recordings)
     if (
         not 1 < len(counts) <= _LINES
@@ -188,7 +188,7 @@ def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
 
 
 def _histograms(values: SampledValues) -> list[tuple[str, Sequence[Histogram], int]]:
-    """By field: its title, histograms, and how many more there would be."""
+    """For each field: its title, its histograms, and how many were left out."""
     found: list[tuple[str, Sequence[Histogram], int]] = []
     for title, leaves in (
         ("States", values.states),
@@ -207,7 +207,7 @@ def _histogram(leaf: LeafValues, i: int) -> Histogram:
     if leaf.kind == "choices":
         start, counts = int(leaf.starts[i]), leaf.counts[i]
         names = list(leaf.value_names) or [str(start + k) for k in range(len(counts))]
-        edges, label = np.arange(len(counts) + 1.0), f"How often each value of {name} was"
+        edges, label = np.arange(len(counts) + 1.0), f"How often each value of {name} occurred"
         return Histogram(name, charts.histogram(counts, edges, (names[0], names[-1]), names, label))
     column: Array = leaf.column(i)
     edges, _ = bin_edges(column, _BINS)
@@ -229,7 +229,7 @@ def _file_facts(item: Any) -> dict[str, Any]:
 
 
 def _environment(recording: Recording) -> Mapping[str, Any]:
-    """What a recording says of its environment and of what it was made with."""
+    """What a recording holds about its environment and the program that made it."""
     facts = describe(recording, np.empty(0, np.int64))
     return {
         "observation": facts.observation,

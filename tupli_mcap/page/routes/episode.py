@@ -1,4 +1,4 @@
-"""One episode: its pictures, its curves, and what is known of it."""
+"""The page of an episode: its pictures, its curves, and its facts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
 
 class Neighbours(NamedTuple):
-    """The ids of the episodes before and after one, in the list that it was found in."""
+    """The ids of the episodes before and after one, in the list that the reader came from."""
 
     before: str | None
     after: str | None
@@ -45,7 +45,7 @@ def episode(
     filter: str = "",
     sort: str = "",
 ) -> Response:
-    """An episode. dataset, filter, sort: the list that its neighbours are of, by default its recording."""
+    """The page of an episode. dataset, filter, sort: the list of its neighbours; by default, its recording."""
 
     def ask(connection: Connection) -> tuple[EpisodeHeader, Dataset, Neighbours]:
         found = find_episode(shelf, connection, uri)
@@ -79,18 +79,18 @@ def episode(
 
 @router.get("/episode/{uri}/step/{step}")
 def one_step(shelf: Shown, uri: str, step: int) -> Response:
-    """What there was at a step, as JSON: text by field and name."""
+    """The values at a step as JSON: texts by field and name."""
     shown = opened(shelf, shelf.ask(lambda connection: find_episode(shelf, connection, uri)))
     if not 0 <= step < len(shown):
-        raise NotFoundError(f"the episode has steps from 0 to {len(shown) - 1}")
+        raise NotFoundError(f"expected a step from 0 to {len(shown) - 1}, found {step}")
     return Response(jsonvalue.dumps(values_at(shown, step)), media_type="application/json")
 
 
 def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
-    """The episode of a header, open.
+    """Opens the episode of a header.
 
     Raises:
-        NotFoundError: it is gone.
+        NotFoundError: the episode is gone.
     """
     recording = shelf.open(header.recording)
     found = recording.index["episode"].searchsorted(header.episode)
@@ -110,7 +110,7 @@ def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Epis
 
 
 class Seen(NamedTuple):
-    """What is shown of an episode. values: at the step, by field and name."""
+    """What the page shows of an episode. values: the values at `step`, by field and name."""
 
     episode: Episode
     curves: Curves
@@ -120,14 +120,14 @@ class Seen(NamedTuple):
 
     @property
     def groups(self) -> list[tuple[str, Sequence[Track]]]:
-        """The tracks by field, those that there are."""
+        """The titles of the fields that have tracks, each with its tracks."""
         names = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
         found = ((title, self.curves.of(field)) for field, title in names.items())
         return [(title, tracks) for title, tracks in found if tracks]
 
     @property
     def untracked(self) -> list[tuple[str, str, str]]:
-        """What there is at the step and has no track: field, name, value."""
+        """The values at the step that have no track: field, name, value."""
         tracked = {(track.field, track.name) for track in self.curves.tracks}
         return [
             (field, name, value)
@@ -145,10 +145,10 @@ class Seen(NamedTuple):
 
 
 def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:
-    """Reads what is shown of an episode.
+    """Reads what the page shows of an episode.
 
     Raises:
-        NotFoundError: it is gone.
+        NotFoundError: the episode is gone.
         FormatError: its recording is damaged.
     """
     episode = opened(shelf, header)

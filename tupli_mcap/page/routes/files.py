@@ -1,4 +1,4 @@
-"""Pictures of episodes, and what the pages themselves are made of."""
+"""Pictures of episodes, and the static files of the pages."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def static(name: str) -> FileResponse:
 
 @router.get("/cover/{key:path}")
 def cover(shelf: Shown, key: str) -> Response:
-    """What a dataset looks like: a picture of its newest episode, else some of its curves."""
+    """The picture of a dataset in lists: one of its newest episode, or else curves of it."""
 
     def ask(connection: Connection) -> EpisodeHeader | None:
         return shown_first(shelf, connection, find_dataset(shelf, connection, key), "newest")
 
     header = shelf.ask(ask)
     if header is None:
-        raise NotFoundError("nothing was recorded of this benchmark yet")
+        raise NotFoundError("this benchmark has no episodes yet")
     episode = opened(shelf, header)
     cameras = cameras_of(episode)
     if cameras:
@@ -58,7 +58,7 @@ def cover(shelf: Shown, key: str) -> Response:
 
 
 def _curves(episode: Episode) -> list[charts.Line]:
-    """Some curves of an episode, each from 0 to 1."""
+    """Some curves of an episode, each scaled to 0 … 1."""
     curves = curves_of(episode)
     moving = [
         track for field in ("state", "reward") for track in curves.of(field) if track.ends[1] > track.ends[0]
@@ -71,7 +71,7 @@ def _curves(episode: Episode) -> list[charts.Line]:
 
 @router.get("/episode/{uri}/picture/{camera}/{place}")
 def picture(shelf: Shown, uri: str, camera: int, place: int) -> Response:
-    """A picture of an episode: of which camera, and which of its pictures."""
+    """A picture of an episode. camera, place: the index of the camera, and of the picture among its pictures."""
     shown = opened(shelf, shelf.ask(lambda connection: find_episode(shelf, connection, uri)))
     data, media = picture_at(shown, cameras_of(shown), camera, place)
     return Response(data, media_type=media, headers=_KEPT)

@@ -27,16 +27,17 @@ __all__ = ["Table", "router", "table_of"]
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _DATASETS: Final = 50  # on a page
 _ROWS: Final = 50
-_COUNTED: Final = 10_000  # episodes, beyond which a page says "more than"
-_KEYS: Final = 4  # of metadata that have a column
+_COUNTED: Final = 10_000  # beyond so many episodes, a page says "More than"
+_KEYS: Final = 4  # most keys of metadata that get a column
 
 
 @dataclass(frozen=True)
 class Table:
     """A page of episodes.
 
-    error: why the filter has no meaning, and its character (from 0) where that is known. count: None where there are
-    more than `most`. keys: of the metadata that have a column. before, after: the ids that other pages begin at.
+    error: what is wrong with the filter. position: the character (from 0) at which it is wrong, if known. count: None
+    for more than `most`. keys: the metadata keys that have a column. before, after: the ids between which this page
+    lies; None for no further page.
     """
 
     rows: Sequence[EpisodeHeader]
@@ -49,7 +50,7 @@ class Table:
     after: str | None = None
 
     def bar(self, row: EpisodeHeader) -> Markup:
-        """Where a return lies among those of the page."""
+        """A bar: where the return of a row lies between the smallest and the largest of the page."""
         known = [
             r.episode_return for r in self.rows if r.episode_return is not None and isfinite(r.episode_return)
         ]
@@ -63,7 +64,7 @@ class Table:
 def datasets(
     request: Request, shelf: Shown, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1
 ) -> Response:
-    """All datasets, or those that hold some words."""
+    """The page of all datasets, or of those that contain the words of `q`."""
     found = shelf.ask(lambda connection: all_datasets(shelf, connection))
     chosen = [dataset for dataset in found if dataset.holds(q.lower().split())]
     first = (number - 1) * _DATASETS
@@ -89,7 +90,7 @@ def episodes(
     after: str = "",
     before: str = "",
 ) -> Response:
-    """Episodes that match a filter, in some order, a page at a time."""
+    """A page of the episodes that match a filter, sorted."""
 
     def ask(connection: Connection) -> tuple[Dataset | None, Table]:
         of = find_dataset(shelf, connection, dataset) if dataset else None
@@ -127,7 +128,7 @@ def table_of(
     before: str = "",
     most: int = _ROWS,
 ) -> Table:
-    """A page of a table, by default the first one. dataset: its key; all where it is empty."""
+    """A page of a table; by default, the first one. dataset: a key; empty for all datasets."""
     try:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         order = Sort.parse(sort)
@@ -160,13 +161,13 @@ def table_of(
 
 
 def _both(a: str, b: str) -> str:
-    """A filter that is true where two are."""
+    """The text of a filter for episodes that match both of two filters."""
     given = [text for text in (a, b) if text.strip()]
     return given[0] if len(given) == 1 else " and ".join(f"({text})" for text in given)
 
 
 def _common_keys(rows: Sequence[EpisodeHeader]) -> list[str]:
-    """The keys of metadata that most rows have a short value at."""
+    """The metadata keys for which most rows have a short value."""
     said: Counter[str] = Counter()
     for row in rows:
         said.update(key for key, value in row.metadata.items() if isinstance(value, bool | int | float | str))

@@ -1,4 +1,4 @@
-"""Episodes in the Rerun viewer, which the page serves itself."""
+"""Shows episodes in the Rerun viewer, which our pages serve."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Ids = Annotated[list[str], Query(alias="episode", min_length=1, max_length=8)]
-# The viewer is WebAssembly; it is shown within our own pages.
+# The viewer needs WebAssembly, and is embedded in our own pages.
 _VIEWER_POLICY: Final = POLICY.replace("frame-ancestors 'none'", "frame-ancestors 'self'") + (
     "; script-src 'self' 'wasm-unsafe-eval'; connect-src 'self' blob: data:; worker-src 'self' blob:"
 )
@@ -25,7 +25,7 @@ _VIEWER_POLICY: Final = POLICY.replace("frame-ancestors 'none'", "frame-ancestor
 
 @router.get("/viewer")
 def viewer(request: Request, shelf: Shown, uris: _Ids) -> Response:
-    """A page with nothing but the viewer; errors are shown in its place."""
+    """A page that holds only the viewer, or an error in its place."""
     try:
         response = _viewer_page(request, shelf, uris)
     except TupliError as err:
@@ -54,6 +54,6 @@ def file(number: str, name: str) -> FileResponse:
 
 @router.get("/replay.rrd")
 def replay(shelf: Shown, uris: _Ids) -> FileResponse:
-    """An episode with its blueprint, or several in the same plots."""
+    """The data for the viewer: one episode with its blueprint, or several in the same plots."""
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
     return sent(replay_file(shelf, headers), "episodes.rrd")

@@ -1,4 +1,4 @@
-// What the page does beyond links and forms: times as the reader's clock has them, copying, choosing, the player.
+// Scripts of all pages: local times, copying, embedding the viewer, the table and the player.
 
 import { player } from "./player.js";
 import { table } from "./table.js";
@@ -37,12 +37,12 @@ async function copy(button) {
     await navigator.clipboard.writeText(button.dataset.copy);
     button.textContent = "Copied";
   } catch {
-    prompt("Copy this:", button.dataset.copy); // a browser allows more only where the page is served by HTTPS or from here
+    prompt("Copy this:", button.dataset.copy); // browsers allow the clipboard only to pages from HTTPS or from this machine
   }
   setTimeout(() => (button.textContent = label), 1500);
 }
 
-// Shows a page within this one; shown already, it goes again.
+// Shows a page within this one, or removes it if it is shown.
 function embed(place, opener) {
   const gone = place.hidden;
   place.hidden = !gone;

@@ -1,4 +1,4 @@
-// An episode over its steps: one slider moves the pictures, the line through the tracks, and the values beside them.
+// An episode step by step: a slider moves the pictures, the cursor in the tracks, and the values beside them.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -24,9 +24,9 @@ export function player(section) {
   cursor(steps > 1 ? Number(slider.value) / (steps - 1) : 0);
 }
 
-// A function that shows the picture of a step; one that is asked for while another one comes waits for it.
+// Returns a function that shows the picture of a step. While one picture loads, only the last step asked for waits.
 function film(image) {
-  const shows = JSON.parse(image.dataset.shows); // the steps, or how many pictures there are, one a step
+  const shows = JSON.parse(image.dataset.shows); // the steps of the pictures, or their count if each step has one
   const base = image.getAttribute("src").replace(/\d+$/, "");
   let wanted = null;
   let busy = false;
@@ -85,7 +85,7 @@ function cursorOver(section) {
 function play(section, slider, steps, show) {
   const button = section.querySelector("[data-play]");
   const seconds = Number(section.dataset.seconds) || 1 / 30;
-  const pace = Math.max(seconds, 8 / Math.max(8, steps) / 4, 1 / 60); // a long episode takes no longer than it did
+  const pace = Math.max(seconds, 8 / Math.max(8, steps) / 4, 1 / 60); // seconds a step: not faster than recorded, than 60 steps a second, or than the episode in 2 s
   let began = null;
   const frame = (now) => {
     if (began === null) return;
@@ -123,7 +123,7 @@ function seekByTracks(section, slider, steps, show) {
   });
 }
 
-// The values of the last step that was asked for; those of steps passed by meanwhile are not fetched.
+// Fetches the values of the last step that was asked for, and skips steps that were passed meanwhile.
 const asked = new WeakMap();
 async function values(section, step) {
   if (!section.dataset.episode) return;

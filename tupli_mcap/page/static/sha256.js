@@ -1,5 +1,5 @@
-// SHA-256 (FIPS 180-4) of a file, a piece at a time, in a worker: browsers offer their own only to pages that came by
-// HTTPS or from this machine, and only for what is in memory as a whole.
+// SHA-256 (FIPS 180-4) of a file, piece by piece, in a worker. Browsers offer theirs only to pages from HTTPS or from
+// this machine, and only for data that is in memory as a whole.
 
 const FIRST = new Uint32Array([
   0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a, 0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19,

@@ -1,4 +1,4 @@
-// A table of episodes: which are chosen, what can be done with them, and a small line in each row.
+// A table of episodes: the selection, its buttons, and a small line in each row.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -14,7 +14,7 @@ export function table(form) {
     for (const button of form.querySelectorAll("[data-least]")) {
       button.disabled = number < Number(button.dataset.least) || number > Number(button.dataset.most ?? Infinity);
     }
-    count.textContent = number ? `${number} chosen` : told;
+    count.textContent = number ? `${number} selected` : told;
     all.checked = number === boxes.length;
     all.indeterminate = number > 0 && number < boxes.length;
     const ids = chosen().map((id) => `"${id}"`);

@@ -1,4 +1,4 @@
-// Sends recordings that are dropped on the page (tus): what is there already is not sent, and what was broken off goes on.
+// Uploads recordings that are dropped on the page (protocol tus). Skips what the server has; continues what was interrupted.
 
 const PIECE = 16 << 20;
 const TRIES = 5;
@@ -60,13 +60,13 @@ function rowOf(list, file) {
 }
 
 async function send(form, file, row) {
-  if (file.size > Number(form.dataset.most)) throw new Error("larger than this server takes");
-  if (!file.size) throw new Error("empty");
+  if (file.size > Number(form.dataset.most)) throw new Error("the file is larger than this server accepts");
+  if (!file.size) throw new Error("the file is empty");
   const digest = await digestOf(file, (read) => row.show("checking", read));
   const told = { "Upload-Length": String(file.size), "Upload-Metadata": `sha256 ${btoa(digest)}`, "Tus-Resumable": "1.0.0" };
   const begun = await ask(form, "POST", "/v1/uploads", told);
   let recording = begun.headers.get("Recording");
-  if (recording !== null) return row.done("is here already", linkTo(recording));
+  if (recording !== null) return row.done("the server has it already", linkTo(recording));
   const place = begun.headers.get("Location");
   let offset = Number(begun.headers.get("Upload-Offset"));
   for (let tries = 0; recording === null; ) {
@@ -95,7 +95,7 @@ function linkTo(recording) {
 function digestOf(file, tell) {
   return new Promise((resolve, reject) => {
     const worker = new Worker("/static/sha256.js", { type: "module" });
-    worker.onerror = () => reject(new Error("cannot be read"));
+    worker.onerror = () => reject(new Error("the file cannot be read"));
     worker.onmessage = ({ data }) => {
       if (data.hex === undefined) return tell(data.read);
       worker.terminate();
@@ -105,7 +105,7 @@ function digestOf(file, tell) {
   });
 }
 
-// A request to the programming interface, with an access token that this page got for it and gets anew when it is out of date.
+// A request to the HTTP API with an access token of this page; fetches a new token when the old one has expired.
 let token = null;
 async function ask(form, method, address, headers, body) {
   for (let again = false; ; again = true) {

@@ -1,4 +1,4 @@
-// Starts the Rerun viewer, whose own script defines `wasm_bindgen`, with the replay that the page names.
+// Starts the Rerun viewer (its script defines `wasm_bindgen`) with the data that the page names.
 
 (async () => {
   const canvas = document.getElementById("viewer");
@@ -17,7 +17,7 @@
     await handle.start(canvas);
     status.remove();
   } catch (error) {
-    status.textContent = `The viewer does not run in this browser: ${error}`;
+    status.textContent = `The viewer cannot run in this browser: ${error}`;
     canvas.remove();
   }
 })();
