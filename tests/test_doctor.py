@@ -712,7 +712,7 @@ def test_what_cannot_be_examined(tmp_path: Path) -> None:
         examine(tmp_path, checks=["nam"])
     with pytest.raises(RecordingError, match="'nan' has no threshold 'least'; it has none"):
         examine(tmp_path, thresholds={"nan": {"least": 3}})
-    with pytest.raises(RecordingError, match="list of the ids of checks"):
+    with pytest.raises(RecordingError, match="list of ids of checks"):
         examine(tmp_path, checks="nan")
 
 
