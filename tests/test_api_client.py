@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import http.server
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import buckets
 import gymnasium as gym
@@ -15,9 +18,11 @@ from serving import PASSWORD, serving
 from test_storage import StorageContract
 
 from tupli_mcap import RecordEpisodes
+from tupli_mcap.errors import TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
 
@@ -52,6 +57,59 @@ class TestContract(StorageContract):
     def storage(self, admin: TupliAPIClient) -> TupliAPIClient:
         admin.create_group(Group(name="lab"))
         return admin
+
+
+class _Odd(http.server.BaseHTTPRequestHandler):
+    """Answers everything with `answer`: a status and a body."""
+
+    protocol_version = "HTTP/1.1"
+    answer = (200, b"")
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        status, body = self.answer
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Upload-Offset", "!42")
+        self.end_headers()
+        self.wfile.write(body)
+
+
+@pytest.fixture(scope="module")
+def odd() -> Iterator[str]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), _Odd) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ((200, b"<html>"), "expected JSON"),
+        ((200, b"null"), "expected"),
+        ((200, b'{"items": [{"id": 5}], "access_token": 5, "next": 6}'), "expected"),
+        ((404, b"<html>"), "404 to POST /v1/"),
+        ((404, b'{"detail": "Not Found", "error": "NotFoundError"}'), "404 to POST /v1/"),
+        ((405, b'{"detail": "Method Not Allowed"}'), "405 to POST /v1/"),
+    ],
+)
+def test_what_is_no_server_of_this_version_is_one_error(
+    odd: str, answer: tuple[int, bytes], said: str, tmp_path: Path
+) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=5)
+    _Odd.answer = answer
+    with TupliAPIClient(odd) as client:
+        for ask in (lambda: client.login("ann", "password"), client.list_benchmarks, client.list_episodes):
+            with pytest.raises(TupliError, match=f"{said}.*is it a tupli-mcap server"):
+                ask()
+        with pytest.raises(TupliError, match="is it a tupli-mcap server"):
+            client.push(tmp_path / "run.mcap")
 
 
 def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -250,6 +250,21 @@ def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: User
     assert users.bob.list_episodes() == []
 
 
+def test_nothing_is_published_in_a_group_that_is_not_there_or_not_known(users: Users, things: Things) -> None:
+    """Whoever makes a group of that name later would see it."""
+    users.eve.create_group(Group(name="secret"))
+    for group in ("robbots", "secret"):
+        for publish in (
+            lambda group=group: users.ann.publish_benchmark(things.benchmark, group),
+            lambda group=group: users.ann.publish_artifact(things.artifact, group),
+            lambda group=group: users.ann.publish_episode(things.episodes[0].id, group),
+        ):
+            with pytest.raises(StorageError, match=f"{group}. Either it is not there, or you are not in it"):
+                publish()
+    users.ann.publish_benchmark(things.benchmark, "bob")  # a user's own group
+    assert [header.id for header in users.bob.list_benchmarks()] == [things.benchmark]
+
+
 def test_a_recording_is_cut_to_what_may_be_read(users: Users, things: Things) -> None:
     users.ann.publish_episode(things.episodes[1].id)
     (header,) = users.eve.list_episodes()

@@ -12,7 +12,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.server.database import audience, audit, pend
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, left_alone, readable
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, demand_audience, left_alone, readable
 from tupli_mcap.server.tables import FILE, USER
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.catalog import queries
@@ -120,7 +120,7 @@ def publish(
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
     if found:
         published_in([], group)
-        caller.demand(Right.EPISODE_CREATE, group)
+        demand_audience(connection, caller, Right.EPISODE_CREATE, group)
     _set_audiences(connection, found, lambda groups: published_in(groups, group))
     _note(connection, caller, "publish_episodes", found, f" in {group}")
     return len(found)

@@ -27,7 +27,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people import quotas
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, left_alone, readable
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, demand_audience, left_alone, readable
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import published_in
@@ -169,7 +169,7 @@ class Items:
         """Lets a group see the caller's own item; done twice, nothing changes."""
         row = self._owned(connection, caller, kind, uri)
         groups = published_in(json.loads(row.published_in), group)
-        caller.demand(_CREATE[kind], group)
+        demand_audience(connection, caller, _CREATE[kind], group)
         self._set_audience(connection, row, groups)
         audit(connection, caller.name, f"publish_{kind}", f"{uri} in {group}")
 

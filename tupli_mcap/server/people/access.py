@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import and_, or_, select
+from sqlalchemy import Connection, and_, or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
@@ -18,7 +18,17 @@ from tupli_mcap.schema import Right
 from tupli_mcap.server.tables import AUDIENCE, GROUP, USER
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["DEFAULT_ROLES", "GLOBAL", "GUEST", "Caller", "DeniedError", "Right", "left_alone", "readable"]
+__all__ = [
+    "DEFAULT_ROLES",
+    "GLOBAL",
+    "GUEST",
+    "Caller",
+    "DeniedError",
+    "Right",
+    "demand_audience",
+    "left_alone",
+    "readable",
+]
 
 GLOBAL: Final = "global"
 """The group of everybody who is signed in."""
@@ -91,6 +101,23 @@ def readable(
     groups = [escape_text(group) for group in caller.groups_with(right)]
     seen = select(AUDIENCE.c.published_in).where(AUDIENCE.c.team.in_(groups))
     return or_(created_by == escape_text(caller.name), published_in.in_(seen))
+
+
+def demand_audience(connection: Connection, caller: Caller, right: Right, group: str) -> None:
+    """Raises DeniedError without the right to publish in a group, or in a user's own one.
+
+    A group that is not there is refused, since whoever makes one of that name later would see what was published; one
+    that the caller may not know of is refused in the same words.
+    """
+    if group not in (GLOBAL, *caller.rights):
+        known = {Right.GROUP_READ: GROUP.c.name, Right.USER_READ: USER.c.name}
+        names = [select(name).where(name == group) for right, name in known.items() if caller.may(right)]
+        if not any(connection.execute(query).first() for query in names):
+            raise DeniedError(
+                f"Insufficient permissions in group: {group:.100}. Either it is not there, or you are not in it; "
+                "`tupli-mcap list-groups` names those that you may know of"
+            )
+    caller.demand(right, group)
 
 
 def left_alone(created_by: ColumnElement[Any], published_in: ColumnElement[Any]) -> ColumnElement[bool]:

@@ -14,11 +14,22 @@ from tupli_mcap.storage.texts import first_defect
 if TYPE_CHECKING:
     import httpx
 
-__all__ = ["LATER", "ConflictError", "Page", "SignInError", "UnreachableError", "as_told", "error_of"]
+__all__ = [
+    "LATER",
+    "ConflictError",
+    "Page",
+    "SignInError",
+    "TokenPair",
+    "UnreachableError",
+    "as_told",
+    "error_of",
+]
 
 LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
 _ANEW: Final = (410, 460)  # an upload that is gone, or has come with wrong bytes: it is begun anew
+_NO_ROUTE: Final = ("Not Found", "Method Not Allowed")  # as Starlette says it
+_WHICH: Final = "is it a tupli-mcap server, of a version like this one?"
 _T = TypeVar("_T")
 
 
@@ -41,28 +52,42 @@ class Page(BaseModel):
     next: str | None
 
 
+class TokenPair(BaseModel):
+    """What a server gives who signs in."""
+
+    access_token: str
+    refresh_token: str
+
+
 def as_told(kind: type[_T], value: Any) -> _T:
     """What a server tells, as a model, or a list of them. StorageError if it is something else."""
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as err:
         raise StorageError(
-            f"expected {getattr(kind, '__name__', kind)} from the server, found something else: {first_defect(err)}"
+            f"expected {getattr(kind, '__name__', kind)} from the server, found something else ({first_defect(err)}); "
+            f"{_WHICH}"
         ) from err
 
 
-def error_of(response: httpx.Response, url: str, *, signed_in: bool) -> TupliError:
-    """The error that a refusal of the server at `url` stands for."""
+def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
+    """The error that a refusal of the server at `url` stands for.
+
+    sign_in: what to do if somebody else should ask; empty where nobody has to be signed in.
+    """
     status = response.status_code
     try:
         told = json.loads(response.content)
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         detail, name = f"it answers {status}", ""
+    if status in (404, 405) and (not name or detail in _NO_ROUTE):
+        asked = response.request
+        detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
     detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
     message = f"{detail} (says {url})"
-    if status == 401 and signed_in:
-        return SignInError(f"{message}; sign in: tupli-mcap login USER --url {url}")
+    if status == 401 and sign_in:
+        return SignInError(f"{message}; {sign_in}")
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
         return UnreachableError(f"{message}; try again later")
     if status == 409:

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from tupli_mcap import jsonvalue, trust
 from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
 from tupli_mcap.remote import shown
-from tupli_mcap.storage.api.answers import LATER, Page, UnreachableError, as_told, error_of
+from tupli_mcap.storage.api.answers import LATER, Page, TokenPair, UnreachableError, as_told, error_of
 from tupli_mcap.storage.api.tokens import TokenStore
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Session:
     def sign_in(self, username: str, password: str) -> None:
         """Gets tokens for a user, and keeps them."""
         pair = self.ask("POST", "/v1/tokens", {"username": username, "password": password}, anonymous=True)
-        self.tokens.put(self.url, username, as_told(dict[str, Any], pair))
+        self.tokens.put(self.url, username, as_told(TokenPair, pair).model_dump())
 
     def sign_out(self) -> None:
         """Ends the sign-in, here and on the server."""
@@ -133,7 +133,7 @@ class Session:
             except TupliError:
                 self.tokens.forget(self.url)
                 return False
-            self.tokens.put(self.url, self.tokens.username(self.url), as_told(dict[str, Any], pair))
+            self.tokens.put(self.url, self.tokens.username(self.url), as_told(TokenPair, pair).model_dump())
             return True
 
     # --- asking ---
@@ -191,8 +191,14 @@ class Session:
         if response.status_code >= 400 and not (stream and response.status_code == _NOTHING_LEFT):
             with contextlib.closing(response):
                 response.read()
-                raise error_of(response, shown(self.url), signed_in=not anonymous)
+                raise error_of(response, shown(self.url), sign_in="" if anonymous else self._sign_in())
         return response
+
+    def _sign_in(self) -> str:
+        """What to do if the server wants to know who asks."""
+        if os.environ.get(_TOKEN_VARIABLE):
+            return f"put another token into {_TOKEN_VARIABLE}, or take it out of the environment and sign in"
+        return f"sign in: tupli-mcap login USER --url {shown(self.url)}"
 
     def _sent(
         self,

@@ -6,12 +6,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
 
-from tupli_mcap.storage.api.answers import UnreachableError
+from tupli_mcap.errors import StorageError
+from tupli_mcap.storage.api.answers import UnreachableError, as_told
 from tupli_mcap.storage.api.session import TIMEOUT, Session
 from tupli_mcap.storage.atomic import os_errors
 
@@ -54,11 +55,11 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
 
     while True:
         begun = session.send("POST", "/v1/uploads", headers=headers, repeat=True).headers
-        offset = int(begun.get("Upload-Offset", size))
+        offset = as_told(int, begun.get("Upload-Offset", size))
         tell(offset - shown)
         shown = offset
         if "Recording" in begun:
-            return unquote(str(begun["Recording"]))
+            return _recording(begun)
         fruitless, reached = (fruitless, reached) if offset <= reached else (0, offset)
         try:
             done = session.send(
@@ -73,7 +74,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
                 },
                 timeout=TIMEOUT + size / _CHECKED,
             )
-            return unquote(str(done.headers["Recording"]))
+            return _recording(done.headers)
         except UnreachableError:
             fruitless += 1
             if fruitless == _FRUITLESS:
@@ -81,6 +82,16 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
         time.sleep(0.2 * 2**fruitless)
 
 
+def _recording(headers: Mapping[str, str]) -> str:
+    """What the server calls a recording that has come."""
+    return unquote(as_told(str, headers.get("Recording")))
+
+
 def _path(location: str) -> str:
     """The path of an upload on the same server, whatever that calls itself."""
-    return urlsplit(location).path or "/"
+    try:
+        return urlsplit(location).path or "/"
+    except ValueError as err:
+        raise StorageError(
+            f"expected the address of an upload from the server, found {location!r:.80}"
+        ) from err
