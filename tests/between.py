@@ -36,6 +36,7 @@ class _Passed:
 
 _ON_ITS_WAY = 1 << 16  # bytes to a client, which a reset throws away although they are counted
 _FILES = (b"PATCH ", b"GET /v1/files/", b"GET /v1/artifacts/")
+_ANSWER, _END_OF_HEAD = b"HTTP/1.", b"\r\n\r\n"
 _REQUESTS = (b"GET ", b"POST ", b"PUT ", b"PATCH ", b"DELETE ", b"HEAD ")
 
 
@@ -144,12 +145,13 @@ class Between:
                     _reset(source)
                     _reset(goal)
                     return
-                is_head = up and data.startswith(_REQUESTS)
-                if is_head:
+                is_head = data.startswith(_REQUESTS if up else _ANSWER)
+                if up and is_head:
                     passed.is_file = data.startswith(_FILES)
-                if flips and passed.is_file and not is_head:
-                    data, flips = self._flipped(data, fault.after - passed.of_files)
-                    passed.of_files += len(data)
+                if flips and passed.is_file:
+                    body = len(data) - len(data.partition(_END_OF_HEAD)[2]) if is_head else 0
+                    data, flips = self._flipped(data, body, fault.after - passed.of_files)
+                    passed.of_files += len(data) - body
                 passed.total += len(data)
                 goal.sendall(data)
                 if up:
@@ -160,9 +162,10 @@ class Between:
             goal.shutdown(socket.SHUT_WR)
 
     @staticmethod
-    def _flipped(data: bytes, at: int) -> tuple[bytes, bool]:
-        """The bytes with one bit turned over, if it is among them; and whether it is still to come."""
-        if not 0 <= at < len(data):
+    def _flipped(data: bytes, body: int, after: int) -> tuple[bytes, bool]:
+        """The bytes with one bit of the body turned over, if it is among them; and whether it is still to come."""
+        at = body + after
+        if not body <= at < len(data):
             return data, True
         return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :], False
 
