@@ -19,6 +19,7 @@ from pathlib import Path
 import buckets
 import numpy as np
 import pytest
+from between import Fault, between
 from gymnasium import spaces
 from hypothesis import given, strategies as st
 from typer.testing import CliRunner
@@ -27,7 +28,7 @@ from web_server import WebServer, serving
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, RecordingError, TupliDataset, write_recording
 from tupli_mcap.cli import app
-from tupli_mcap.remote import matching, shown, source
+from tupli_mcap.remote import copied, matching, objects, shown, source
 from tupli_mcap.remote.patterns import _expression
 from tupli_mcap.remote.plan import pieces_of
 
@@ -182,6 +183,37 @@ def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
     assert len(recording.read(fields=["rewards"]).rewards) == EPISODES * STEPS
 
 
+@pytest.mark.parametrize(
+    ("kind", "said"), [("stall", "TUPLI_MCAP_REMOTE_SECONDS"), ("reset", "try again later")]
+)
+def test_what_fails_for_ever_ends_with_one_error(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch, kind: str, said: str
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "2")
+    with between(server.url("")) as proxy:
+        recording = Recording(f"{proxy.url}/r.mcap")
+        proxy.faults.extend([Fault(kind, 50_000)] * 1000)
+        proxy.drop()
+        with pytest.raises(RecordingError, match=f"r.mcap cannot be read: .*{said}"):
+            recording.read(fields=["rewards"])
+        assert len(proxy.faults) > 900
+        proxy.faults.clear()
+        assert len(recording.read(fields=["rewards"]).rewards) == EPISODES * STEPS
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "soon")
+    with pytest.raises(RecordingError, match="expected TUPLI_MCAP_REMOTE_SECONDS to be a number of seconds"):
+        Recording(server.url())
+
+
+def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:
+    with between(server.url("")) as proxy:
+        proxy.faults.extend(
+            [Fault(), *[Fault("reset", 400_000)] * 7]
+        )  # more often than one request is tried again
+        with copied(f"{proxy.url}/r.mcap") as path:
+            assert path.read_bytes() == large.read_bytes()
+        assert not proxy.faults
+
+
 def test_what_is_no_recording(server: WebServer) -> None:
     server.files |= {"/empty.mcap": b"", "/text.mcap": b"hello, I am a text and nothing else" * 9}
     with pytest.raises(tupli_mcap.FormatError, match="is empty"):
@@ -301,6 +333,24 @@ def test_other_addresses_go_through_fsspec(large: Path) -> None:
         Recording("memory://runs/y.mcap")
     with pytest.raises(RecordingError, match="cannot be opened"):
         Recording("nosuch://runs/y.mcap")
+
+
+def test_fsspec_gives_a_whole_file_in_pieces(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import fsspec
+
+    monkeypatch.setattr(objects, "_RANGE", 1 << 20)
+    data = large.read_bytes()
+    system = fsspec.filesystem("memory")
+    system.pipe("/runs/z.mcap", data)
+    url = "memory://runs/z.mcap"
+    pieces = [bytes(piece) for piece in objects.find(url).pieces(7)]
+    assert b"".join(pieces) == data[7:]
+    assert max(map(len, pieces)) == 1 << 20
+    coming = objects.find(url).pieces()
+    next(coming)
+    system.pipe("/runs/z.mcap", data + b"more")
+    with pytest.raises(RecordingError, match="has been changed"):
+        list(coming)
 
 
 # ---- plans

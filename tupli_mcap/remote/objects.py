@@ -20,9 +20,16 @@ __all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store
 _T = TypeVar("_T")
 Tell = Callable[[int], None]  # how many bytes more have come
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
-_RETRIES = {"max_retries": 5, "retry_timeout": timedelta(seconds=60)}
 _PIECE = 256 << 10  # bytes that are handed on at least
-_CLIENT = {"connect_timeout": "10s", "timeout": "120s", "allow_http": True}
+_RANGE = 8 << 20  # bytes of a file that fsspec reads are asked for at a time, where all of it is wanted
+_SECONDS_VARIABLE = "TUPLI_MCAP_REMOTE_SECONDS"
+_SECONDS = 120.0
+_CLIENT = {"connect_timeout": "10s", "allow_http": True}
+# A body may take as long as it likes, while something comes; what breaks off is asked for again for a minute.
+_UNLIMITED = {
+    "client_options": {**_CLIENT, "read_timeout": "120s", "timeout": "365d"},
+    "retry_config": {"max_retries": 5, "retry_timeout": timedelta(seconds=60)},
+}
 
 
 def _nobody(_: int) -> None:
@@ -103,7 +110,9 @@ def changed(url: str) -> RecordingError:
 
 
 def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
-    """The store of a URL, as obstore has it, and the path in it; what is asked of it is given up after `within`.
+    """The store of a URL, as obstore has it, and the path in it.
+
+    within: when what is asked of it is given up, all attempts together; without it, when nothing more comes.
 
     Raises:
         MissingExtraError: obstore is not installed.
@@ -113,10 +122,7 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
         from obstore.store import HTTPStore, from_url
     except ImportError as err:
         raise missing_extra(f"reading {shown(url)} needs obstore", "remote") from err
-    options: Any = {"client_options": _CLIENT, "retry_config": _RETRIES}
-    if within is not None:
-        options["client_options"] = {**_CLIENT, "timeout": f"{within.total_seconds():.0f}s"}
-        options["retry_config"] = {**_RETRIES, "retry_timeout": within}
+    options: Any = _UNLIMITED if within is None else _limited(within)
     parts = urlsplit(url)
     if is_web(url):
         return _asked(url, lambda: HTTPStore.from_url(url, **options)), ""
@@ -126,6 +132,29 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
     return _asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), parts.path.lstrip(
         "/"
     )
+
+
+def _limited(within: timedelta) -> dict[str, Any]:
+    """Options with which an attempt takes a quarter of a time at most, and none begins in its last quarter."""
+    attempt = within / 4
+    return {
+        "client_options": {**_CLIENT, "timeout": attempt},
+        "retry_config": {"max_retries": 5, "retry_timeout": within - attempt},
+    }
+
+
+def _patience() -> timedelta:
+    """How long one range may take, all attempts together."""
+    text = os.environ.get(_SECONDS_VARIABLE, str(_SECONDS))
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 1 <= seconds <= 1e6:
+        raise RecordingError(
+            f"expected {_SECONDS_VARIABLE} to be a number of seconds from 1 on, found {text!r:.80}"
+        )
+    return timedelta(seconds=seconds)
 
 
 def check_process(url: str) -> None:
@@ -142,7 +171,8 @@ class _StoredObject:
 
     def __init__(self, url: str) -> None:
         self._url = url
-        self._store, self._path = open_store(url)
+        self._patience = _patience()
+        self._store, self._path = open_store(url, self._patience)
 
     def tail(self, length: int) -> End:
         from obstore.exceptions import NotSupportedError
@@ -161,7 +191,7 @@ class _StoredObject:
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data, at = bytearray(stop - start), 0
-        for piece in self._streamed({"range": (start, stop)}, version):
+        for piece in self._streamed(self._begun(self._store, {"range": (start, stop)}, version)):
             if at + len(piece) > len(data):
                 raise changed(self._url)
             data[at : at + len(piece)] = piece
@@ -172,20 +202,44 @@ class _StoredObject:
         return memoryview(data).toreadonly()
 
     def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
-        yield from self._streamed({"range": {"offset": start}} if start else {}, version)
+        store, _ = open_store(self._url)
+        while True:
+            found = self._begun(store, {"range": {"offset": start}} if start else {}, version)
+            version, before = _version(found.meta), start
+            try:
+                for piece in self._streamed(found):
+                    start += len(piece)
+                    yield piece
+                return
+            except _BrokenOffError:
+                if start == before:
+                    raise
 
-    def _streamed(self, options: dict[str, Any], version: str | None) -> Iterator[memoryview]:
+    def _begun(self, store: Any, options: dict[str, Any], version: str | None) -> Any:
+        """An answer whose body has not been read; RecordingError if it is not of the version given."""
+        from obstore.exceptions import NotSupportedError
+
         if version and version.startswith('"'):  # a weak tag matches nothing
             options["if_match"] = version
         try:
-            found = self._ask(options)
+            found = _asked(self._url, lambda: store.get(self._path, options=options))
         except _RefusedError as err:
             raise changed(self._url) from err
+        except NotSupportedError:
+            raise _BrokenOffError(
+                f"{shown(self._url)}: the server sends whole files only; try again"
+            ) from None
         if version is not None and _version(found.meta) != version:
             raise changed(self._url)
+        return found
+
+    def _streamed(self, found: Any) -> Iterator[memoryview]:
         stream = iter(found.stream(_PIECE))
-        while (piece := _asked(self._url, lambda: next(stream, None))) is not None:
-            yield memoryview(piece)
+        try:
+            while (piece := _asked(self._url, lambda: next(stream, None))) is not None:
+                yield memoryview(piece)
+        except _RefusedError as err:
+            raise changed(self._url) from err
 
     def _ask(self, options: Any) -> Any:
         return _asked(self._url, lambda: self._store.get(self._path, options=options))
@@ -193,6 +247,10 @@ class _StoredObject:
 
 def _version(meta: Any) -> str:
     return meta["e_tag"] or f"{meta['last_modified']} {meta['size']}"
+
+
+class _BrokenOffError(RecordingError):
+    """The server does not answer, or stops in the middle of it."""
 
 
 class _RefusedError(Exception):
@@ -219,7 +277,10 @@ def _asked(url: str, ask: Callable[[], _T]) -> _T:
         said = str(err).partition("\n")[0]
         if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
             raise _RefusedError from None
-        raise RecordingError(f"{shown(url)} cannot be read: {shown(said):.300}; try again later") from None
+        slow = f", or give it more time with {_SECONDS_VARIABLE}" if "kind: Timeout" in str(err) else ""
+        raise _BrokenOffError(
+            f"{shown(url)} cannot be read: {shown(said):.300}; try again later{slow}"
+        ) from None
 
 
 # ---- fsspec
@@ -245,12 +306,17 @@ class _FsspecObject:
         self._system, self._path = _fsspec(url)
 
     def tail(self, length: int) -> End:
-        info = self._asked(lambda: self._system.info(self._path))
-        size = int(info["size"])
+        size, version = self._now()
         if not size:
             return End(memoryview(b""), 0, "")
         data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
-        return End(memoryview(data), size, f"{info.get('ETag') or info.get('mtime') or ''} {size}")
+        return End(memoryview(data), size, version)
+
+    def _now(self) -> tuple[int, str]:
+        """Its size and version at this moment."""
+        info = self._asked(lambda: self._system.info(self._path))
+        size = int(info["size"])
+        return size, f"{info.get('ETag') or info.get('mtime') or ''} {size}"
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data = memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))
@@ -260,7 +326,13 @@ class _FsspecObject:
         return data
 
     def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
-        yield memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start)))
+        size, found = self._now()
+        if version not in (None, found):
+            raise changed(self._url)
+        for at in range(start, size, _RANGE):
+            yield self.get(at, min(at + _RANGE, size), found)
+        if self._now()[1] != found:
+            raise changed(self._url)
 
     def _asked(self, ask: Callable[[], _T]) -> _T:
         try:
