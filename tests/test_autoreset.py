@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 from tupli_mcap import Recording, StepError, verify_recording
-from tupli_mcap.recording.write.autoreset import Autoreset
+from tupli_mcap.recording.write.recorders.autoreset import Autoreset
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes
 

@@ -21,8 +21,8 @@ from killing.moments import MOMENTS, die
 from tupli_mcap import RecordEpisodes, Recording, files, journal_path, recover_recording
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.mcap.lock import FileLock
+from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.rows.vector import VectorRows
-from tupli_mcap.recording.write.vector import VectorRecorder
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

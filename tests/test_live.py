@@ -187,7 +187,7 @@ class Looker:
 
     def __init__(self, env: Any) -> None:
         writer = env._writer
-        self._place = writer.path, writer.uuid, writer.container.position
+        self._place = writer.path, writer.place.uuid, writer.container.position
         self.follower: Follower | None = None
 
     def look(self) -> tuple[list[NewSteps], list[Any]]:
@@ -400,7 +400,7 @@ def test_the_overview_counts_all_episodes(tmp_path: Path) -> None:
     space = spaces.Box(-1, 1, (3,))
     with RecordEpisodes(Sampler(space, space, 1), tmp_path / "r.mcap") as env:
         roll(env, 10_000)
-        follower = follow(env.path, env._writer.uuid, 0)
+        follower = follow(env.path, env._writer.place.uuid, 0)
         assert follower is not None
         panels = LivePanels("many")
         assert panels.decide(follower)

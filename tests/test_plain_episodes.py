@@ -22,8 +22,8 @@ from gymnasium.vector import SyncVectorEnv
 from tupli_mcap import RecordEpisodes, Recording, verify_recording
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.journal.derive import EpisodeDeriver
+from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.rows.single import SingleRows
-from tupli_mcap.recording.write.single import SingleRecorder
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 EXACT = ("first_row", "length", "return", "seed", "final_row", "episode", "env", "end", "has_seed")

@@ -1169,7 +1169,7 @@ def test_signalling_nans_are_not_quieted(tmp_path: Path) -> None:
 
 
 def test_a_thread_compresses_large_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tupli_mcap.recording.write.compressing.WORTH_A_THREAD", 0.0)
+    monkeypatch.setattr("tupli_mcap.recording.write.chunks.WORTH_A_THREAD", 0.0)
     space = spaces.Box(0, 255, (90, 80, 3), np.uint8)
     with RecordEpisodes(Sampler(space, spaces.Discrete(3)), tmp_path / "r.mcap", chunk_size=1000) as env:
         taken = roll(env, 100)

@@ -420,7 +420,7 @@ def test_a_recording_that_names_any_file_as_its_journal_is_refused(
 ) -> None:
     path, precious = tmp_path / "r.mcap", tmp_path / "precious.txt"
     with monkeypatch.context() as forged:
-        forged.setattr("tupli_mcap.recording.write.journals.journal_in", lambda *_: precious)
+        forged.setattr("tupli_mcap.recording.write.place.journal_in", lambda *_: precious)
         with cart_pole(path, journal_dir=tmp_path) as env:
             roll(env, 5)
         abandon(tmp_path / "killed.mcap", lambda p: cart_pole(p, journal_dir=tmp_path), 100)

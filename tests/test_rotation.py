@@ -24,7 +24,7 @@ from tupli_mcap import (
     TupliEnvWrapper,
     verify_recording,
 )
-from tupli_mcap.recording.write import rotation, writer
+from tupli_mcap.recording.write import chunks, rotation
 from tupli_mcap.recording.write.rotation import series
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -223,7 +223,7 @@ class TestSingle:
     def test_an_episode_of_more_rows_than_a_file_takes_is_refused(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(writer, "_MOST_ROWS", 300)
+        monkeypatch.setattr(chunks, "_MOST_ROWS", 300)
         env, steps = RecordEpisodes(Endless(), tmp_path / "run.mcap", chunk_size=1000), 0
         env.reset(seed=1)
         with pytest.raises(RecordingError, match="at most 300 messages in a channel.* new recording"):

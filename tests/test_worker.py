@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from tupli_mcap.recording.write.compressing import LARGE, WORTH_A_THREAD, ChunkWorker
+from tupli_mcap.recording.write.chunks import LARGE, WORTH_A_THREAD, ChunkWorker
 
 
 @pytest.fixture

@@ -510,7 +510,7 @@ def frames(path: Path) -> list[Log]:
     """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
     env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
     options: dict[str, Any] = {"compression": "none", "attachments": {}, "capture": "none", "chunk_size": 300}
-    with mock.patch("tupli_mcap.recording.write.frames.encode_picture", stored_png):
+    with mock.patch("tupli_mcap.recording.write.recorders.frames.encode_picture", stored_png):
         for mode, lengths in (("x", [3, 4, 3]), ("a", [2])):
             with RecordEpisodes(env, path, frames=2, mode=mode, **options) as recorder:  # type: ignore[arg-type]
                 roll(recorder, env, lengths, action)
@@ -518,7 +518,7 @@ def frames(path: Path) -> list[Log]:
 
 
 def unfinished_frames(path: Path) -> list[Log]:
-    with mock.patch("tupli_mcap.recording.write.frames.encode_picture", stored_png):
+    with mock.patch("tupli_mcap.recording.write.recorders.frames.encode_picture", stored_png):
         return unfinished(path, Painted(POLE, pole, ENDS), frames=True)
 
 

@@ -16,9 +16,9 @@ from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.write.frames import FrameRecorder, VectorFrames
-from tupli_mcap.recording.write.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.recorders.frames import FrameRecorder, VectorFrames
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
 from tupli_mcap.recording.write.writer import RecordingWriter

@@ -23,8 +23,8 @@ from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.infos import entries_of
 from tupli_mcap.recording.write.options import Capture, Mode, RecordOptions
+from tupli_mcap.recording.write.recorders.infos import entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter

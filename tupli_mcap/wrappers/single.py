@@ -21,7 +21,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import success_of, with_success
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.frames import FrameRecorder
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
@@ -30,7 +29,8 @@ from tupli_mcap.recording.write.options import (
     RecordOptions,
     StepCallback,
 )
-from tupli_mcap.recording.write.single import SingleRecorder
+from tupli_mcap.recording.write.recorders.frames import FrameRecorder
+from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback

@@ -16,11 +16,11 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, ResetFacts
-from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder
+from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import StepStore
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.rows.variable import final_encoder
-from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_array, leaf_value
 

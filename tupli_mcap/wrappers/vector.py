@@ -20,10 +20,7 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success, with_success
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.frames import VectorFrames
-from tupli_mcap.recording.write.infos import final_info_of, info_of
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
@@ -32,7 +29,10 @@ from tupli_mcap.recording.write.options import (
     RecordOptions,
     StepCallback,
 )
-from tupli_mcap.recording.write.vector import VectorRecorder
+from tupli_mcap.recording.write.recorders.autoreset import Autoreset
+from tupli_mcap.recording.write.recorders.frames import VectorFrames
+from tupli_mcap.recording.write.recorders.infos import final_info_of, info_of
+from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback

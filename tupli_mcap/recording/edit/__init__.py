@@ -1,8 +1,7 @@
 """New recordings out of others.
 
-assemble                          the new file: writes chunks, index and summary
+assemble                          the new file: writes chunks, or copies them as they are, index and summary
 copy_episodes                     episodes of a recording into it
-copy_chunks                       chunks that can be copied as they are
 merge, split                      several recordings into one, with new numbers; one into several
 stream                            a recording of some episodes, handed on while it is made
 rewrite                           a recording with fewer episodes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -12,11 +12,13 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.journal.logs import group_records
-from tupli_mcap.mcap.container import Container, Rows, library
+from tupli_mcap.mcap.compression import decompress
+from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows, library
+from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
+from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.edit.copy_chunks import first_chunks
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
 
@@ -79,7 +81,7 @@ class Assembler:
             return 0
         if channel in self.container.codecs:  # only in memory they are of constant size
             dtype = None
-        for chunk, packed in first_chunks(source, self.container, channel, count, dtype):
+        for chunk, packed in _first_chunks(source, self.container, channel, count, dtype):
             self.container.place(chunk, packed)
             self._latest[channel] = int(chunk.rows.times[-1])
             self.copied += 1
@@ -188,3 +190,51 @@ def _in_time(messages: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     """Times that never decrease."""
     times = itertools.accumulate((time_ns for time_ns, _ in messages), max)
     return [(time_ns, body) for time_ns, (_, body) in zip(times, messages, strict=True)]
+
+
+def _first_chunks(
+    file: OpenFile,
+    container: Container,
+    channel: int,
+    count: int,
+    dtype: np.dtype[Any] | None,
+) -> Iterator[tuple[Prepared, bytes]]:
+    """The chunks that hold only rows of the first `count` of a channel, and their compressed bytes.
+
+    A row says which one it is (`sequence`), of which channel and of which episode; so only the first rows of a
+    recording are those of another one, up to the first that is left out. Each chunk is unpacked, and its CRC checked:
+    no damage is handed on.
+
+    Args:
+        container: the target, in which the channel has the same id.
+        dtype: of rows of constant size, where they lie so in the chunk; None where they vary.
+
+    Raises:
+        FormatError: a chunk is damaged.
+    """
+    store, end = file.store, 0
+    for chunk in store.chunks(channel):
+        row = store.table[chunk]
+        end += int(row["rows"])
+        offset, length, skip = int(row["offset"]), int(row["length"]), int(row["skip"])
+        name = COMPRESSIONS[int(row["compression"])]
+        if end > count or offset >= IN_MEMORY or name != container.compression:
+            return
+        data = store.load(chunk, keep=False)
+        method = name.replace("none", "")
+        packed = file.source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
+        definitions = container.definitions(channel) if int(row["first"]) == 0 else b""
+        size = int(row["uncompressed"])
+        whole = decompress(method, memoryview(packed), size, store.name) if skip else data
+        if skip != len(definitions) or bytes(whole[:skip]) != definitions:
+            return
+        yield Prepared(_rows(store, chunk, channel, data, dtype), skip, whole, int(row["crc"])), packed
+
+
+def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtype[Any] | None) -> Rows:
+    first = int(store.table[chunk]["first"])
+    if dtype is not None:
+        return even_rows(channel, first, data, store.rows(chunk, dtype, keep=False))
+    starts = store.records(chunk)[1][:, 0].tolist()
+    times = [int.from_bytes(memoryview(data)[start + 15 : start + 23], "little") for start in starts]
+    return Rows(channel, first, data, np.array(starts, np.uint64), np.array(times, np.uint64))

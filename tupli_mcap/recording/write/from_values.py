@@ -16,10 +16,10 @@ from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEO
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.frames import put_frame
-from tupli_mcap.recording.write.infos import InfoRecorder
 from tupli_mcap.recording.write.options import Mode, RecordOptions
-from tupli_mcap.recording.write.single import SingleRecorder
+from tupli_mcap.recording.write.recorders.frames import put_frame
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder
+from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_flag, shorten

@@ -177,13 +177,13 @@ def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
             f"{given}; leave journal_dir out when appending"
         )
     if recorded is not None:
-        writer.journal_place = recorded_journal(writer.path, contents.metadata)
+        writer.place.journal = recorded_journal(writer.path, contents.metadata)
 
 
 def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
-    writer.uuid = contents.metadata["uuid"]
-    writer.rewritten = contents.metadata.get("rewritten", "")
-    writer.replaced = contents.metadata.get("replaced", "")
+    writer.place.uuid = contents.metadata["uuid"]
+    writer.place.rewritten = contents.metadata.get("rewritten", "")
+    writer.place.replaced = contents.metadata.get("replaced", "")
     _keep_journal_place(writer, contents)
     restore_container(writer.container, contents, source)
     index_rows = contents.index.episodes

@@ -135,7 +135,7 @@ class Rotation:
                 if self._folder is None or not os.path.lexists(path):
                     raise
             else:
-                writer.own_folders = made
+                writer.place.own_folders = made
                 return writer
             self._paths = [self._new_in(self._folder)]  # another process has made a file of this name
 

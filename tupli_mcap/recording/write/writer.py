@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-import uuid
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -18,36 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, RecordingError, SpaceError, StepError, TupliError, os_reason
-from tupli_mcap.journal.derive import LAST_ROW, EpisodeBatch, StartedEpisode
+from tupli_mcap.errors import RecordingError, SpaceError, StepError, TupliError, os_reason
+from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Area, Journal
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
-from tupli_mcap.mcap.container import Container, Rows, library
+from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
-from tupli_mcap.recording.recover.prefix import metadata_at
-from tupli_mcap.recording.write.compressing import ChunkWorker
+from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts
-from tupli_mcap.recording.write.journals import (
-    is_left,
-    journal_place,
-    remove_left,
-    remove_of_killed,
-    remove_unnamed,
-    remove_unstarted,
-)
 from tupli_mcap.recording.write.options import RecordOptions, check_place
+from tupli_mcap.recording.write.place import Place
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
-
-_MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the journal must not come to LAST_ROW
-
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
 
@@ -68,14 +56,10 @@ class RecordingWriter:
     ) -> None:
         check_place(path)
         self.path = Path(path)
-        # the process may change its directory before the journal is made
-        self._place = Path(os.path.realpath(path))
+        self.place = Place(path, options.journal_dir)
         self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
         self.closed = False
         self.failed = ""  # why nothing more can be recorded, where that is known
-        self.own_folders: Sequence[Path] = ()  # made for this file, the innermost one first
-        self._told_deleted = False
-        self._old_journal: Path | None = None  # on append: where a writer that was killed has left its own
         self.layout: StepLayout | None = None
         self.index = IndexBuilder()
         self.next_episode = 0
@@ -87,7 +71,6 @@ class RecordingWriter:
         self._durable = options.durability != "os"
         self.syncs_steps = self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
-        self.worker = ChunkWorker()
         self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
@@ -101,12 +84,6 @@ class RecordingWriter:
         self.is_vector = False
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
         self.recorded_vector = False
-        self.uuid = uuid.uuid4().hex
-        self.rewritten = ""
-        # the recording whose journal a writer that was killed has left in this one's place
-        self.replaced = ""
-        self._replaces = ""  # the recording that this one takes the place of with its first step
-        self.journal_place = journal_place(self._place, options.journal_dir, self.uuid)
         self._is_cut = True  # False on append, while the file still is as it was found
         self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
@@ -128,21 +105,15 @@ class RecordingWriter:
 
     def _open(self) -> None:
         self.container = Container(self.lock.fd, str(self.path), self.options.compression)
+        self._chunks = ChunkWriter(self.path, self.container, self.lock, self._settle_chunks)
         if self.options.mode == "a" and self.path.stat().st_size:
             from tupli_mcap.recording.write.resume import resume
 
             self._is_cut = False
             resume(self)
-            self._old_journal = self.journal_place
-            remove_left(self._place, self.replaced)
-            remove_unstarted(self._place, self.uuid)
+            self.place.go_on()
             return
-        there = _metadata_of(self._place) if self.options.mode == "w" else {}
-        self._replaces = there.get("uuid", "")
-        remove_left(self._place, there.get("replaced", ""))  # whose file is gone
-        remove_unstarted(self._place, self._replaces)
-        if is_left(self._place, self._replaces):
-            self.replaced = self._replaces
+        self.place.begin(replaces=self.options.mode == "w")
         try:
             os.ftruncate(self.lock.fd, 0)
         except OSError as err:
@@ -151,17 +122,17 @@ class RecordingWriter:
             ) from err
         now = time.time_ns()
         values = {
-            "uuid": self.uuid,
+            "uuid": self.place.uuid,
             "format_version": self.format_version,
             "library": library(),
             "created_ns": str(now),
             "benchmark_id": self.options.benchmark_id,
         }
         if self.options.journal_dir is not None:
-            values["journal"] = str(self.journal_place)
-        if self.replaced:
+            values["journal"] = str(self.place.journal)
+        if self.place.replaced:
             # whoever comes next shall know, if this process dies before it removes that journal
-            values["replaced"] = self.replaced
+            values["replaced"] = self.place.replaced
         self.container.start(values["library"])
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
@@ -205,15 +176,15 @@ class RecordingWriter:
         self.container.define_channels()
         if self._durable:
             self._settle()
-            sync_directory(self._place.parent)
+            sync_directory(self.place.file.parent)
 
     def take_place(self) -> None:
         """The file that this one replaces goes when this one has a step."""
         if self.lock.replaces:
             self.lock.publish()
-            remove_left(self._place, self.replaced)
+            self.place.remove_replaced()
             if self._durable:
-                sync_directory(self._place.parent)
+                sync_directory(self.place.file.parent)
 
     def _png(self, layout: StepLayout) -> frozenset[str]:
         """The image leaves stored as PNG: as the options say, on append as they are in the file."""
@@ -255,8 +226,8 @@ class RecordingWriter:
     def _make_stores(self, areas: Sequence[Area]) -> None:
         layout, channels = self.laid(), self.channels
         self.journal = self._new_journal(areas)
-        self.journal.publish(durable=self._durable, replaced=self.replaced)
-        file = ToFile(self.add_chunk, self._start_chunks, self._grow, self._durable, self._sealed)
+        self.journal.publish(durable=self._durable, replaced=self.place.replaced)
+        file = ToFile(self._chunks.add, self._chunks.start, self._grow, self._durable, self._sealed)
         self._stores = stores = Stores(
             layout, channels, self.container, self.journal, self.index, file, vector=self.is_vector,
             apart=self._apart,
@@ -333,56 +304,9 @@ class RecordingWriter:
 
     # ---- chunks
 
-    def add_chunk(self, rows: Rows) -> None:
-        """Writes a chunk, to the disk where durability is asked for."""
-        self._write_chunk(rows)
+    def _settle_chunks(self) -> None:
         if self._durable:
             self._settle()
-
-    def _write_chunk(self, rows: Rows) -> None:
-        self._check_room(rows)
-        self.container.add_chunk(rows)
-        self._warn_if_deleted()
-
-    def _start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], None]:
-        """Begins to compress chunks, on the worker's thread; the result waits for it and writes them.
-
-        Until then their memory must stay, and no other chunk of their channels be written.
-        """
-        for rows in chunks:
-            self._check_room(rows)
-        container = self.container
-        pack = container.start_chunks(chunks)
-        # a thread that needs the interpreter lock for every chunk would wait for it again and again
-        in_thread = len(chunks) == 1 or container.packs_together
-        size = sum(len(rows.data) for rows in chunks)
-        packed = self.worker.submit(pack, size) if in_thread else pack
-
-        def finish() -> None:
-            container.finish_chunks(packed())
-            if self._durable:
-                self._settle()
-            self._warn_if_deleted()
-
-        return finish
-
-    def _check_room(self, rows: Rows) -> None:
-        if rows.first + len(rows.offsets) > _MOST_ROWS:
-            raise RecordingError(
-                f"{self.path}: expected at most {_MOST_ROWS} messages in a channel, found more; close it (every step "
-                "is safe), and go on in a new recording"
-            )
-
-    def _warn_if_deleted(self) -> None:
-        """Once: what is written to a file without a name is lost when it is closed."""
-        if self.lock.is_deleted and not self._told_deleted:
-            self._told_deleted = True
-            warnings.warn(
-                f"{self.path} was deleted while it is recorded, and nothing of it will be left; "
-                "record to another file",
-                RuntimeWarning,
-                stacklevel=2,
-            )
 
     def _settle(self) -> None:
         """Waits until what was written is on the disk: the journal first, for it holds the ends of the episodes."""
@@ -456,17 +380,14 @@ class RecordingWriter:
     def _new_journal(self, areas: Sequence[Area]) -> Journal:
         channels = self.channels
         description = {
-            "uuid": self.uuid,
-            **({"rewritten": self.rewritten} if self.rewritten else {}),
-            **({"replaces": self._replaces} if self._replaces else {}),
-            **({} if self.journal_place.parent == self._place.parent else {"recording": str(self._place)}),
+            **self.place.identity(),
             "boot": boot_id(),
             "seals": "rows" if self._sealed else "records",
             "vector": self.is_vector,
             "channels": [channels.steps, channels.images, *channels[2:6]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
         }
-        return Journal(self.journal_place, list(areas), description)
+        return Journal(self.place.journal, list(areas), description)
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal.
@@ -483,14 +404,14 @@ class RecordingWriter:
         self.container.add_attachment(INDEX_NAME, INDEX_MEDIA_TYPE, data, time.time_ns())
         self.container.finish()
         self.take_place()
-        self._warn_if_deleted()
+        self._chunks.warn_if_deleted()
         if self._durable:  # before the journal goes
             sync_file(self.lock.fd, str(self.path))
-            sync_directory(self._place.parent)
+            sync_directory(self.place.file.parent)
         if self.journal is not None:
             self.journal.remove()
-        elif self._old_journal is not None:
-            remove_of_killed(self._old_journal, self.uuid)
+        else:
+            self.place.remove_of_killed()
         self.closed = True
         self.let_go()
 
@@ -504,7 +425,7 @@ class RecordingWriter:
         self.on_close()
         self.container.close()
         try:
-            self.worker.close()
+            self._chunks.close()
             if self._stores is not None:
                 self._stores.let_go()
                 self._stores = self.rows = self.vector = self.events = self.infos = None
@@ -531,13 +452,13 @@ class RecordingWriter:
             compression=self.options.compression, mode="a", durability=self.options.durability
         )
         # errors name the file as its user does, unless the process has changed its directory since
-        is_there = os.path.realpath(self.path) == str(self._place)
+        is_there = os.path.realpath(self.path) == str(self.place.file)
         try:
             self.let_go()
-            remove_unnamed(self.journal_place)
+            self.place.remove_unnamed()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # no journal: it was not needed yet
-                finish_in_place(self.path if is_there else self._place, options)
+                finish_in_place(self.path if is_there else self.place.file, options)
         except TupliError:
             self.leave_unfinished()
             raise
@@ -557,13 +478,12 @@ class RecordingWriter:
         if self.journal is not None:
             self.journal.remove()
         with contextlib.suppress(OSError):
-            remove_unnamed(self.journal_place)
+            self.place.remove_unnamed()
             if self._is_cut:
                 self.lock.unlink()
-            for folder in self.own_folders:
+            for folder in self.place.own_folders:
                 folder.rmdir()  # unless somebody else has put something into it
-            if self._old_journal is not None:
-                remove_of_killed(self._old_journal, self.uuid)
+            self.place.remove_of_killed()
         self.closed = True
         self.let_go()
 
@@ -591,14 +511,6 @@ def finish_in_place(path: Path, options: RecordOptions) -> None:
     except BaseException:
         writer.leave_unfinished()
         raise
-
-
-def _metadata_of(path: Path) -> dict[str, str]:
-    """The metadata of a recording that is there; empty if there is none."""
-    if path.is_file():
-        with contextlib.suppress(RecordingError, FormatError):
-            return metadata_at(path)
-    return {}
 
 
 def _abandon_all() -> None:

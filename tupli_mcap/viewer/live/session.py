@@ -30,7 +30,7 @@ class LiveSession:
 
     def go_on(self, writer: RecordingWriter) -> None:
         """Shows what `writer` records, once the files before it are shown to their ends."""
-        file = os.path.realpath(writer.path), writer.uuid, writer.container.position
+        file = os.path.realpath(writer.path), writer.place.uuid, writer.container.position
         with contextlib.suppress(OSError):  # the process has ended
             if self.process.stdin is not None:
                 self.process.stdin.write(json.dumps(file).encode() + b"\n")

@@ -17,13 +17,19 @@ from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success
-from tupli_mcap.recording.write.autoreset import Autoreset
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.infos import InfoRecorder, check_infos, final_states, info_of, reset_info_of
+from tupli_mcap.recording.write.recorders.autoreset import Autoreset
+from tupli_mcap.recording.write.recorders.infos import (
+    InfoRecorder,
+    check_infos,
+    final_states,
+    info_of,
+    reset_info_of,
+)
+from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
-from tupli_mcap.recording.write.single import decide_layout
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
 

@@ -14,7 +14,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.images.pictures import check_picture, encode_picture
 from tupli_mcap.recording.write.options import CAMERA, RecordOptions
-from tupli_mcap.recording.write.vector import VectorRecorder
+from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.writer import RecordingWriter
 
 Ask = Callable[..., Any]

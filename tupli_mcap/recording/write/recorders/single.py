@@ -15,7 +15,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.infos import InfoRecorder
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.writer import RecordingWriter
