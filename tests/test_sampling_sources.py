@@ -24,8 +24,8 @@ from test_sampling import naive
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, Recording, TupliDataset
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
-from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.sources import FilesSource
 from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording

@@ -24,8 +24,9 @@ from hypothesis import given, strategies as st
 from test_sampling_properties import FEW, Library, dataset_of, libraries
 
 from tupli_mcap import F, FileStorage, RecordEpisodes, TupliDataset, files
-from tupli_mcap.dataset import DatasetError, SavedColumns, open_columns, saved
+from tupli_mcap.dataset import DatasetError, SavedColumns, open_columns
 from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.columns import saved
 from tupli_mcap.dataset.items import FIELDS, MemorySteps, SamplingError
 from tupli_mcap.errors import FormatError, StorageError, TupliError
 from tupli_mcap.recording import EpisodeData, write_recording

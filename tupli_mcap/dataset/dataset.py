@@ -1,123 +1,52 @@
-"""`Dataset`: episodes, wherever they lie, narrowed, put in order, read and handed on; and `open`, which gives one."""
+"""`Dataset`: episodes, wherever they lie, narrowed, put in order, read and handed on."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
-from urllib.parse import urlsplit
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset import curate, display, tables
+from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
+from tupli_mcap.dataset.columns import tables
+from tupli_mcap.dataset.columns.load import read_columns
+from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.steps import pick
-from tupli_mcap.dataset.load import read_columns
+from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
     FilesSource,
     JoinedSource,
     OpenRecordings,
     Source,
-    StorageSource,
     numbers_by_recording,
+    place_of,
 )
-from tupli_mcap.dataset.statistics import STATISTICAL, FieldStatistics, statistics_of
-from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.frames import Frames
-from tupli_mcap.remote import is_url, is_web
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
-from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
-from tupli_mcap.schema.predicate import MISSING, look_up
-from tupli_mcap.storage import FileStorage, TupliStorage, storage_at
-from tupli_mcap.storage.listing import find_recordings, is_storage
+from tupli_mcap.remote import is_url
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from tupli_mcap.dataset.tables import Level
+    from tupli_mcap.dataset.columns.tables import Level
 
-__all__ = ["Dataset", "open"]
+__all__ = ["Dataset"]
 
 Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
-Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
-
-
-def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
-    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
-    a server: "http://lab:8080"), or a list of them.
-
-    An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
-    far as it has come, and ends as interrupted.
-
-        ds = tupli_mcap.open("runs/")
-        best = ds.filter("return > 100").sort("return", descending=True).head(10)
-
-    Files are opened when their episodes are needed; their errors are raised then.
-
-    Raises:
-        RecordingError: there is no such file.
-        DatasetError: it is none of these.
-        StorageError: the directory may not be looked at.
-    """
-    if isinstance(source, Dataset):
-        return source
-    if isinstance(source, TupliStorage):
-        return Dataset(StorageSource(source))
-    if isinstance(source, Recording):
-        return Dataset(FilesSource([_place_of(source)]))
-    if isinstance(source, str | os.PathLike):
-        name = os.fspath(source)
-        folder = Path(name).expanduser()
-        if _is_server(name):
-            return Dataset(StorageSource(storage_at(name)))
-        if is_url(name) or not folder.is_dir():
-            return Dataset(FilesSource(source))
-        files = _files_in(folder)
-        if is_storage(folder) or not files:
-            return Dataset(StorageSource(FileStorage(folder)))
-        return Dataset(FilesSource(files, of_directory=True))
-    if not isinstance(source, Iterable):
-        raise DatasetError(
-            f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
-        )
-    return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
-
-
-def _is_server(name: str) -> bool:
-    """Whether it is the address of a web server, and not of a file on it."""
-    return is_web(name) and not urlsplit(name).path.strip("/")
-
-
-def _place_of(recording: Recording) -> str:
-    if recording.address is None:
-        raise DatasetError(f"{recording.name} was opened as a file object; open it by its path or URL")
-    return recording.address
-
-
-def _files_in(source: Openable) -> Sequence[str]:
-    """The recordings of one source."""
-    if isinstance(source, Recording):
-        return [_place_of(source)]
-    if isinstance(source, str | os.PathLike):
-        name = os.fspath(source)
-        if not is_url(name) and Path(name).expanduser().is_dir():
-            return [str(path) for path in find_recordings(Path(name).expanduser())]
-        return FilesSource(source).names
-    raise DatasetError(
-        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"
-    )
 
 
 class Dataset(RandomAccess):
@@ -153,7 +82,7 @@ class Dataset(RandomAccess):
         if self._listed is None:
             self._listed = self._source.episodes(None, self._filter)
             if not self._listed and self._filter is not None:
-                self._check_metadata(self._filter, self._source.episodes(None, None))
+                check_metadata(self._filter, self._source.episodes(None, None))
         return self._listed
 
     @property
@@ -250,7 +179,8 @@ class Dataset(RandomAccess):
         """
         if not isinstance(other, Dataset | Recording):
             return NotImplemented
-        other = open(other)
+        if isinstance(other, Recording):
+            other = Dataset(FilesSource([place_of(other)]))
         ids = {header.id for header in self.headers}
         more = [header for header in other.headers if header.id not in ids]
         if self._source is other._source:
@@ -283,25 +213,8 @@ class Dataset(RandomAccess):
         matches = compile_predicate(wanted, EpisodeHeader)
         found = [header for header in self._listed if matches(header)]
         if not found:
-            self._check_metadata(wanted, self._listed)
+            check_metadata(wanted, self._listed)
         return self._of(found)
-
-    def _check_metadata(self, wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
-        """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none of them
-        has."""
-        known = {
-            ("metadata",): {key for header in among for key in header.metadata},
-            ("run",): {key for header in among for key in header.run},
-            ("run", "metadata"): {key for header in among for key in header.run.get("metadata", {})},
-        }
-        for comparison in comparisons(wanted) if among else ():
-            path = path_in(comparison.key or "", EpisodeHeader)
-            for there, keys in known.items():
-                if path[:-1][: len(there)] == there and path[len(there)] not in keys:
-                    raise FilterError(
-                        f"no episode has {comparison.key}{did_you_mean(path[len(there)], keys)}; "
-                        f"{'.'.join(there)} has {', '.join(sorted(keys)) or 'no keys'}"
-                    )
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
@@ -315,7 +228,7 @@ class Dataset(RandomAccess):
         if callable(key):
             values = [key(self._episode(header)) for header in self.headers]
         elif isinstance(key, str):
-            values = self._values(key)
+            values = values_at(key, self.headers)
         else:
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
@@ -352,7 +265,7 @@ class Dataset(RandomAccess):
         """
         if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
-        values = None if by is None else self._values(by)
+        values = None if by is None else values_at(by, self.headers)
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
         for i, header in enumerate(self.headers):
             name = header.id if values is None else repr(values[i])
@@ -363,24 +276,7 @@ class Dataset(RandomAccess):
     @property
     def keys(self) -> list[str]:
         """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
-        own = {"metadata." + key for header in self.headers for key in header.metadata}
-        runs = {id(header.run): header.run for header in self.headers}.values()
-        own |= {"run." + key for run in runs for key in run if key != "metadata"}
-        own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
-        return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
-
-    def _values(self, key: str) -> list[Any]:
-        """The value that each episode has at a key, None where it has none; FilterError if no episode knows the key."""
-        values = [self._value(header, key) for header in self.headers]
-        if values and all(value is None for value in values):
-            self._check_metadata(F(key) == True, self.headers)  # noqa: E712 - an expression
-        return values
-
-    def _value(self, header: EpisodeHeader, key: str) -> Any:
-        if key == "run":  # of files without a run, each is one
-            return header.run.get("id") or header.id.partition("-")[0]
-        value = look_up(header, path_in(key, EpisodeHeader))
-        return None if value is MISSING else value
+        return keys_of(self.headers)
 
     # ---- reading
 

@@ -8,10 +8,10 @@ from contextlib import nullcontext
 from typing import Any, Self
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.columns.load import Selected, TupleFilter, read_columns, selector_of
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
-from tupli_mcap.dataset.load import Selected, TupleFilter, read_columns, selector_of
 from tupli_mcap.dataset.sources import Source, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording

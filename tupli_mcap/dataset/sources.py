@@ -42,6 +42,7 @@ __all__ = [
     "StorageSource",
     "episode_headers",
     "numbers_by_recording",
+    "place_of",
 ]
 
 _MOST_OPEN = 64
@@ -354,6 +355,13 @@ class OpenRecordings:
                 self._kept.popitem(last=False)  # closed when nobody holds an episode of it
         self._kept.move_to_end(name)
         return self._kept[name][0]
+
+
+def place_of(recording: Recording) -> str:
+    """The path or URL of a recording, by which it can be opened again; DatasetError if it has none."""
+    if recording.address is None:
+        raise DatasetError(f"{recording.name} was opened as a file object; open it by its path or URL")
+    return recording.address
 
 
 def numbers_by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[int]]:

@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from tupli_mcap.dataset import convert, display
+from tupli_mcap.dataset import display
 from tupli_mcap.dataset.access import RandomAccess
-from tupli_mcap.dataset.convert import BaseTupleParser, NumpyTupleParser
+from tupli_mcap.dataset.columns import convert
+from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
+from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
+from tupli_mcap.dataset.columns.saved import save_columns
+from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples, items_of
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.items.windows import FIVE
-from tupli_mcap.dataset.load import TupleFilter, read_columns
 from tupli_mcap.dataset.query import Query
-from tupli_mcap.dataset.saved import save_columns
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
-from tupli_mcap.dataset.tuples import EpisodeItems, Tuples, items_of
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
     from tupli_mcap.arrays import Array
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.dataset.columns.statistics import FieldStatistics
+    from tupli_mcap.dataset.columns.tables import Level
     from tupli_mcap.dataset.dataset import Test
     from tupli_mcap.dataset.items import Transitions, Windows
-    from tupli_mcap.dataset.statistics import FieldStatistics
-    from tupli_mcap.dataset.tables import Level
     from tupli_mcap.recording.episode import Episode
     from tupli_mcap.recording.recording import Recording
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tupli_mcap.dataset.columns.load import Selected
+from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items.steps import map_arrays, pick
-from tupli_mcap.dataset.load import Selected
-from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
 

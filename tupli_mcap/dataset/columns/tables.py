@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from tupli_mcap.dataset.convert import import_pandas
+from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE

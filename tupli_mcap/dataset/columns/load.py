@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.dataset.tuples import Tuples
 from tupli_mcap.errors import FilterError, SpaceError, memory_for
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout

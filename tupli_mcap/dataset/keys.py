@@ -1,0 +1,55 @@
+"""The values that episodes have at a key, such as "return" or "metadata.score", and the keys that they have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from tupli_mcap.errors import FilterError, did_you_mean
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
+from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
+from tupli_mcap.schema.predicate import MISSING, look_up
+
+__all__ = ["check_metadata", "keys_of", "values_at"]
+
+
+def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
+    """The facts about episodes, and the metadata that some of these have."""
+    own = {"metadata." + key for header in headers for key in header.metadata}
+    runs = {id(header.run): header.run for header in headers}.values()
+    own |= {"run." + key for run in runs for key in run if key != "metadata"}
+    own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
+    return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+
+
+def values_at(key: str, headers: Sequence[EpisodeHeader]) -> list[Any]:
+    """The value that each episode has at a key, None where it has none; FilterError if no episode knows the key."""
+    values = [_value(header, key) for header in headers]
+    if values and all(value is None for value in values):
+        check_metadata(F(key) == True, headers)  # noqa: E712 - an expression
+    return values
+
+
+def _value(header: EpisodeHeader, key: str) -> Any:
+    if key == "run":  # of files without a run, each is one
+        return header.run.get("id") or header.id.partition("-")[0]
+    value = look_up(header, path_in(key, EpisodeHeader))
+    return None if value is MISSING else value
+
+
+def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
+    """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none of them
+    has."""
+    known = {
+        ("metadata",): {key for header in among for key in header.metadata},
+        ("run",): {key for header in among for key in header.run},
+        ("run", "metadata"): {key for header in among for key in header.run.get("metadata", {})},
+    }
+    for comparison in comparisons(wanted) if among else ():
+        path = path_in(comparison.key or "", EpisodeHeader)
+        for there, keys in known.items():
+            if path[:-1][: len(there)] == there and path[len(there)] not in keys:
+                raise FilterError(
+                    f"no episode has {comparison.key}{did_you_mean(path[len(there)], keys)}; "
+                    f"{'.'.join(there)} has {', '.join(sorted(keys)) or 'no keys'}"
+                )

@@ -1,0 +1,85 @@
+"""`open`: the dataset of a path, a pattern, a URL, a storage, a recording, or a list of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+from urllib.parse import urlsplit
+
+from tupli_mcap.dataset.dataset import Dataset
+from tupli_mcap.dataset.sources import (
+    DatasetError,
+    FilesSource,
+    StorageSource,
+    place_of,
+)
+from tupli_mcap.recording import Recording
+from tupli_mcap.remote import is_url, is_web
+from tupli_mcap.storage import FileStorage, TupliStorage, storage_at
+from tupli_mcap.storage.listing import find_recordings, is_storage
+
+__all__ = ["open"]
+
+Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
+
+
+def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
+    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
+    a server: "http://lab:8080"), or a list of them.
+
+    An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
+    far as it has come, and ends as interrupted.
+
+        ds = tupli_mcap.open("runs/")
+        best = ds.filter("return > 100").sort("return", descending=True).head(10)
+
+    Files are opened when their episodes are needed; their errors are raised then.
+
+    Raises:
+        RecordingError: there is no such file.
+        DatasetError: it is none of these.
+        StorageError: the directory may not be looked at.
+    """
+    if isinstance(source, Dataset):
+        return source
+    if isinstance(source, TupliStorage):
+        return Dataset(StorageSource(source))
+    if isinstance(source, Recording):
+        return Dataset(FilesSource([place_of(source)]))
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        folder = Path(name).expanduser()
+        if _is_server(name):
+            return Dataset(StorageSource(storage_at(name)))
+        if is_url(name) or not folder.is_dir():
+            return Dataset(FilesSource(source))
+        files = _files_in(folder)
+        if is_storage(folder) or not files:
+            return Dataset(StorageSource(FileStorage(folder)))
+        return Dataset(FilesSource(files, of_directory=True))
+    if not isinstance(source, Iterable):
+        raise DatasetError(
+            f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
+        )
+    return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
+
+
+def _is_server(name: str) -> bool:
+    """Whether it is the address of a web server, and not of a file on it."""
+    return is_web(name) and not urlsplit(name).path.strip("/")
+
+
+def _files_in(source: Openable) -> Sequence[str]:
+    """The recordings of one source."""
+    if isinstance(source, Recording):
+        return [place_of(source)]
+    if isinstance(source, str | os.PathLike):
+        name = os.fspath(source)
+        if not is_url(name) and Path(name).expanduser().is_dir():
+            return [str(path) for path in find_recordings(Path(name).expanduser())]
+        return FilesSource(source).names
+    raise DatasetError(
+        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"
+    )
