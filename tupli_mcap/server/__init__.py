@@ -7,9 +7,7 @@ traffic/              requests and connections: limited, counted, logged
 wire                  JSON of requests, answers and errors
 library, backup       all that is kept, and changes that touch database and files at once; copies of it
 people/               users, groups, roles, tokens, and what each may do and read
-items                 benchmarks and artifacts
-episodes, arrivals    recordings and their episodes: those that are there, and those that come
-selection             which episodes a query means
+stored/               benchmarks, artifacts, recordings and their episodes
 uploads, blobs        bytes on their way in, and where they lie
 database, tables      the database, and what is in it
 migrations/           tables of earlier versions

@@ -25,8 +25,8 @@ from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, DirectoryBlobs, LostError
 from tupli_mcap.server.database import Database
-from tupli_mcap.server.items import artifact_key
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, METADATA, PENDING, UPLOAD, USER
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG

@@ -29,7 +29,6 @@ from tupli_mcap.schema import (
     EpisodeItem,
     FilterEQ,
 )
-from tupli_mcap.server import arrivals, episodes
 from tupli_mcap.server.blobs import Blobs, BucketBlobs, DirectoryBlobs
 from tupli_mcap.server.database import (
     Database,
@@ -40,12 +39,13 @@ from tupli_mcap.server.database import (
     pending,
     settle,
 )
-from tupli_mcap.server.items import Items, artifact_key
 from tupli_mcap.server.people import accounts, quotas, throttle
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.stored import arrivals, episodes
+from tupli_mcap.server.stored.items import Items, artifact_key
 from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage

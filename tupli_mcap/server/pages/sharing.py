@@ -13,11 +13,11 @@ from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, parse_bound
-from tupli_mcap.server import episodes
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import DeniedError, Right, readable
+from tupli_mcap.server.stored import episodes
 from tupli_mcap.storage.benchmark_json import unpack
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
 from tupli_mcap.storage.texts import unescape_text

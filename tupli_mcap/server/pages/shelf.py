@@ -18,7 +18,7 @@ from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, Right, readable
-from tupli_mcap.server.selection import Selected, opened
+from tupli_mcap.server.stored.selection import Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.texts import escape_text, unescape_text

@@ -11,8 +11,8 @@ from pydantic import BaseModel, Field
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ
-from tupli_mcap.server import episodes
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.queries import After

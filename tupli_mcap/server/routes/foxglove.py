@@ -18,13 +18,13 @@ from pydantic import BaseModel
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import parse_filter
 from tupli_mcap.schema.times import iso_utc
-from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder
 from tupli_mcap.server.routes.query import streamed
-from tupli_mcap.server.selection import EpisodeQuery, Selected, opened, select_episodes
+from tupli_mcap.server.stored import episodes
+from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
 
 __all__ = ["router"]
 

@@ -12,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
-from tupli_mcap.server.items import artifact_key
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.wire import Found, Listing, answer, paged
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect

@@ -27,14 +27,14 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     FilterEQ,
 )
-from tupli_mcap.server import episodes
-from tupli_mcap.server.items import Kind, artifact_key
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
+from tupli_mcap.server.stored import episodes
+from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer
 from tupli_mcap.storage.texts import first_defect
 

@@ -12,7 +12,7 @@ from tupli_mcap.page import copies
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served
-from tupli_mcap.server.selection import EpisodeQuery, Selected, opened, select_episodes
+from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
 
 __all__ = ["router", "streamed"]
 

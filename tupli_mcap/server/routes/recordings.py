@@ -15,13 +15,13 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.server import episodes
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, Right
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
-from tupli_mcap.server.selection import EpisodeQuery, select_episodes
+from tupli_mcap.server.stored import episodes
+from tupli_mcap.server.stored.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
 from tupli_mcap.storage.texts import is_hash
 

@@ -15,9 +15,9 @@ from sqlalchemy import Connection, insert, select
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.server.database import audience, audit, settle
-from tupli_mcap.server.episodes import forget, whole_name
 from tupli_mcap.server.people.access import Caller, Right, readable
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.stored.episodes import forget, whole_name
 from tupli_mcap.server.tables import FILE, ITEM
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of

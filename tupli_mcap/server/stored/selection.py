@@ -17,10 +17,10 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.schema import BaseFilter, FilterIN
-from tupli_mcap.server import episodes
 from tupli_mcap.server.blobs import Blobs
-from tupli_mcap.server.items import Items
 from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.stored import episodes
+from tupli_mcap.server.stored.items import Items
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.server.wire import AskedFilter
 from tupli_mcap.storage.texts import escape_text, unescape_text
