@@ -24,9 +24,9 @@ from tupli_mcap.dataset import (
     TensorflowTupleParser,
     TorchTupleParser,
     TupliDataset,
-    load,
     sources,
 )
+from tupli_mcap.dataset.columns import load
 from tupli_mcap.errors import (
     FilterError,
     FormatError,

@@ -20,7 +20,7 @@ import numpy as np
 from killing import breakages
 from killing.kinds import KINDS, open_recorder
 from killing.moments import MOMENTS, lay_trap
-from tupli_mcap.recording.write import compressing as worker
+from tupli_mcap.recording.write import chunks as worker
 
 __all__ = ["Job", "Told", "record_and_die"]
 

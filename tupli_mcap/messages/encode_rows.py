@@ -16,19 +16,25 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from struct import Struct
 from types import CodeType
 from typing import Any, Protocol
 
 import numpy as np
-from gymnasium import spaces
 
-from tupli_mcap.arrays import DType
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.records import BODY
+from tupli_mcap.messages.encode_values import (
+    Packed,
+    Source,
+    access_to,
+    add_fields,
+    add_structure_checks,
+    flag_check,
+)
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
+from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
 SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
@@ -38,11 +44,6 @@ _TIME = Struct("<Q")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _MAX_LEAVES = 4096  # compiling takes time and memory for each
-_BOOLS = b"\0\1"
-_LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
-_INT_FORMATS = {
-    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
-}  # fmt: skip
 
 
 class ImageSink(Protocol):
@@ -93,40 +94,6 @@ class RowEncoder:
     begin: Callable[[bytes], None]
     state_end: int  # bytes of a row up to the end of its state
     source: str
-
-
-@dataclass
-class _Source:
-    """The generated body and the objects it names."""
-
-    names: dict[str, Any] = field(default_factory=dict)
-    lines: list[str] = field(default_factory=list)
-
-    def bind(self, prefix: str, value: Any) -> str:
-        name = f"{prefix}{len(self.names)}"
-        self.names[name] = value
-        return name
-
-
-@dataclass
-class _Packed:
-    """Format pieces and argument expressions of one `struct` call, at growing offsets.
-
-    `stores` are the lines that write the leaves which are too large for it.
-    """
-
-    start: int
-    offset: int
-    format: str = ""
-    args: list[str] = field(default_factory=list)
-    stores: list[str] = field(default_factory=list)
-
-    def add(self, offset: int, code: str, size: int, arg: str) -> None:
-        if offset > self.offset:
-            self.format += f"{offset - self.offset}x"
-        self.format += code
-        self.args.append(arg)
-        self.offset = offset + size
 
 
 @dataclass
@@ -200,18 +167,18 @@ def _compiled(text: str) -> CodeType:
 
 
 def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
-    size, source = layout.step_message.record_size, _Source()
+    size, source = layout.step_message.record_size, Source()
     tail = _tail(source, layout)
-    state = _Source(source.names)
+    state = Source(source.names)
     head = _head(state, layout)
     puts, firsts, advance = [], [], []
     for i, leaf in enumerate(layout.images):
         check = source.bind("check", images[i].check)
-        state.lines.append(f"image{i} = {check}({_access(source, 'state', leaf.keys)})")
+        state.lines.append(f"image{i} = {check}({access_to(source, 'state', leaf.keys)})")
         puts.append(f"{source.bind('put_image', images[i].put)}(image{i})")
         firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
         advance.append(f"{source.bind('advance', images[i].advance)}()")
-    flags = [_flag(source, "terminal"), _flag(source, "timeout")]
+    flags = [flag_check(source, "terminal"), flag_check(source, "timeout")]
     next_stores = [line.replace("offset +", f"offset + {size} +") for line in head.stores]
     args = ", ".join([*tail.args, *head.args])
     put = [
@@ -243,26 +210,26 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
     return _Code(put, put_state, put_next, put_whole, advance, amount, names)
 
 
-def _tail(source: _Source, layout: StepLayout) -> _Packed:
+def _tail(source: Source, layout: StepLayout) -> Packed:
     """The end of a row, behind its state, and the beginning of the next one up to its state."""
     message = layout.step_message
     after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
     begin = BODY + message.offset(after_state[0])
-    packed = _Packed(begin, begin)
-    _structure_checks(source, layout.action_space, "action")
-    _fields(source, layout, layout.action, "action", packed)
-    _fields(source, layout, layout.reward, "reward", packed)
+    packed = Packed(begin, begin)
+    add_structure_checks(source, layout.action_space, "action")
+    add_fields(source, layout, layout.action, "action", packed)
+    add_fields(source, layout, layout.reward, "reward", packed)
     packed.add(BODY + message.offset("terminal"), "?", 1, "terminal")
     packed.add(BODY + message.offset("timeout"), "?", 1, "timeout")
     packed.add(message.record_size, f"{PREFIX}s", PREFIX, "prefix")
     return packed
 
 
-def _head(source: _Source, layout: StepLayout) -> _Packed:
+def _head(source: Source, layout: StepLayout) -> Packed:
     """The state of a row."""
-    packed = _Packed(PREFIX, PREFIX)
-    _structure_checks(source, layout.observation_space, "state")
-    _fields(source, layout, layout.state, "state", packed)
+    packed = Packed(PREFIX, PREFIX)
+    add_structure_checks(source, layout.observation_space, "state")
+    add_fields(source, layout, layout.state, "state", packed)
     return packed
 
 
@@ -368,124 +335,6 @@ def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
         log_time=SEQUENCE_OFFSET + 4,
         hole=HOLE,
     )
-
-
-def _structure_checks(source: _Source, space: Any, expression: str) -> None:
-    if type(space) not in (spaces.Dict, spaces.Tuple):
-        return
-    n = len(space.spaces)
-    if type(space) is spaces.Tuple:
-        source.lines.append(
-            f"if not isinstance({expression}, tuple) or len({expression}) != {n}: raise TypeError"
-        )
-        children = list(enumerate(space.spaces))
-    else:
-        source.lines.append(f"if len({expression}) != {n}: raise TypeError")
-        children = list(space.spaces.items())
-    for key, sub in children:
-        if type(sub) in (spaces.Dict, spaces.Tuple):
-            _structure_checks(source, sub, _access(source, expression, (key,)))
-
-
-def _access(source: _Source, root: str, keys: Sequence[Any]) -> str:
-    parts = [repr(key) if type(key) in (str, int) else source.bind("key", key) for key in keys]
-    return root + "".join(f"[{part}]" for part in parts)
-
-
-def _fields(source: _Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: _Packed) -> None:
-    for i, leaf in enumerate(leaves):
-        if leaf.apart:
-            continue
-        dtype = layout.dtypes[leaf.name]
-        access = _access(source, root, leaf.keys)
-        if leaf.size == 0:
-            check = source.bind("check", _exact_bytes(leaf, dtype))
-            source.lines.append(f"{check}({access})")
-            continue
-        offset = BODY + layout.step_message.offset(leaf.name)
-        value = f"{root[0]}{i}" if leaf.keys else root
-        if leaf.keys:
-            source.lines.append(f"{value} = {access}")
-        _leaf(source, leaf, dtype, value, offset, packed)
-
-
-def _leaf(source: _Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: _Packed) -> None:
-    nbytes = leaf.size * dtype.itemsize
-    if leaf.kind == "scalar" and dtype.kind in "iu":
-        exact = source.bind("exact", _exact_int(leaf, dtype))
-        kind = source.bind("kind", dtype.type)
-        source.lines.append(
-            f"if {value}.__class__ is not {kind} and {value}.__class__ is not int: {value} = {exact}({value})"
-        )
-        packed.add(offset, _INT_FORMATS[dtype.name], nbytes, value)
-    elif value == "reward" and leaf.shape == () and dtype == np.float64:
-        exact = source.bind("exact", _exact_float(leaf))
-        double = source.bind("double", np.float64)
-        source.lines.append(
-            f"if reward.__class__ is not float and reward.__class__ is not {double}: reward = {exact}(reward)"
-        )
-        packed.add(offset, "d", nbytes, value)
-    else:
-        kind, shape = source.bind("dtype", dtype), source.bind("shape", leaf.shape)
-        raw = f"{value}b"
-        large, is_bool = nbytes >= _LARGE, dtype.kind == "b"
-        exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
-        fast = value if large else f"{value}.tobytes()"
-        # of exactly this class: a subclass may mean something else by its bytes, as a masked array does
-        plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
-        if leaf.shape == ():
-            plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
-        # a vector's length is told by its bytes, which spares it making a tuple
-        vector = len(leaf.shape) == 1 and not large
-        shaped = f"{value}.ndim == 1" if vector else f"{value}.shape == {shape}"
-        source.lines.append(
-            f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {shaped} else {exact}({value})"
-            if not (large and is_bool)
-            else f"{raw} = {exact}({value})"
-        )
-        if vector:
-            source.lines.append(f"if len({raw}) != {nbytes}: {raw} = {exact}({value})")
-        if is_bool and not large:  # made by a view, perhaps
-            source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
-        if large:
-            packed.stores.append(
-                f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"
-            )
-        else:
-            packed.add(offset, f"{nbytes}s", nbytes, raw)
-
-
-def _flag(source: _Source, name: str) -> str:
-    exact, kind = source.bind("exact", exact_flag), source.bind("kind", np.bool_)
-    return (
-        f"if {name} is not False and {name} is not True and {name}.__class__ is not {kind}: "
-        f"{name} = {exact}({name}, {name!r})"
-    )
-
-
-def _exact_int(leaf: Leaf, dtype: DType) -> Callable[[Any], int]:
-    return lambda value: int(exact_array(value, dtype, leaf.shape, leaf.path))
-
-
-def _exact_float(leaf: Leaf) -> Callable[[Any], float]:
-    dtype = np.dtype(np.float64)
-
-    def exact(value: Any) -> float:
-        if value.__class__ is int and -(2**53) <= value <= 2**53:
-            return float(value)
-        if value.__class__ is np.float32 and value == value:  # widening may quiet a NaN
-            return float(value)
-        return float(exact_array(value, dtype, (), leaf.path))
-
-    return exact
-
-
-def _exact_bytes(leaf: Leaf, dtype: DType) -> Callable[[Any], bytes]:
-    return lambda value: exact_array(value, dtype, leaf.shape, leaf.path).tobytes()
-
-
-def _exact_plain(leaf: Leaf, dtype: DType) -> Callable[[Any], np.ndarray[Any, Any]]:
-    return lambda value: exact_array(value, dtype, leaf.shape, leaf.path)
 
 
 def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exception) -> StepError:
