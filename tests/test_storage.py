@@ -53,11 +53,10 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.bundles import bundle_recording
-from tupli_mcap.storage.catalog import database
+from tupli_mcap.storage.catalog import database, entries
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.exchange import copy_episodes
-from tupli_mcap.storage.files import recordings
 from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.verify import verify_storage
@@ -779,7 +778,7 @@ class TestFileStorage(StorageContract):
         (item,) = storage.list_episodes(include_tuples=True)
         assert (item.n_tuples, item.end) == (5, "interrupted")
         with monkeypatch.context() as patch:
-            patch.setattr(recordings, "Recording", None)  # a dead recording is read once
+            patch.setattr(entries, "Recording", None)  # a dead recording is read once
             assert storage.count_episodes() == 1
         storage.delete_episode(item.id)
         assert list(storage.root.rglob("*.mcap*")) == []
