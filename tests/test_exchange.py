@@ -25,6 +25,7 @@ from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, F
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.exchange import copy_episodes
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 
 def fill(lab: Path, episodes: int = 12) -> str:
@@ -99,6 +100,14 @@ def test_pulling_a_filter_and_an_episode(admin: TupliAPIClient, tmp_path: Path) 
         assert storage.load_benchmark(uri).metadata.name == "cart"
     gone = CliRunner().invoke(app, ["pull", "0" * 32 + "-0", "--storage", str(target)])
     assert (gone.exit_code, "there is no episode with id" in gone.stderr) == (1, True)
+
+
+def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
+    with web_server.serving() as web:
+        web.files["/r.mcap"] = (tmp_path / "run.mcap").read_bytes()
+        assert run("push", web.url() + "?sig=SECRET") == f"sent {web.url()} to {admin.url}\n"
+    assert sum(header.n_tuples for header in admin.list_episodes()) == 30
 
 
 def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -263,7 +263,7 @@ def test_a_loader_with_workers_reads_from_a_server(server: WebServer, large: Pat
     assert bool((first["states"] == expected["states"]).all())
 
 
-@pytest.mark.parametrize("command", ["info", "verify", "doctor"])
+@pytest.mark.parametrize("command", ["info", "verify", "doctor", "episodes"])
 def test_commands_take_addresses(server: WebServer, large: Path, command: str) -> None:
     far = CliRunner().invoke(app, [command, server.url(), "--json"])
     near = CliRunner().invoke(app, [command, str(large), "--json"])
@@ -308,7 +308,7 @@ def bucket(large: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_buckets_and_patterns(bucket: str, large: Path) -> None:
+def test_buckets_and_patterns(bucket: str, large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.array_equal(Recording(f"{bucket}/runs/a.mcap").read().states, Recording(large).read().states)
     assert matching(f"{bucket}/runs/*.mcap") == [f"{bucket}/runs/a.mcap"]
     assert matching(f"{bucket}/**/*.mcap") == [
@@ -318,6 +318,12 @@ def test_buckets_and_patterns(bucket: str, large: Path) -> None:
         tupli_mcap.open(f"{bucket}/runs/*.bag")
     with pytest.raises(RecordingError, match=r"gone\.mcap does not exist"):
         Recording(f"{bucket}/gone.mcap")
+    with pytest.raises(RecordingError, match=f"{bucket} is a bucket; give the URL of a recording"):
+        Recording(bucket)
+    with monkeypatch.context() as patch:
+        patch.setenv("AWS_SKIP_SIGNATURE", "perhaps")
+        with pytest.raises(RecordingError, match="boolean; check the address, and the environment"):
+            Recording(f"{bucket}/runs/a.mcap")
     dataset = TupliDataset.from_files(f"{bucket}/runs/*.mcap")
     dataset.load()
     assert len(dataset.episodes) == EPISODES

@@ -229,7 +229,7 @@ def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> 
 
 def episodes(
     paths: Annotated[
-        list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
+        list[str], typer.Argument(metavar="PATH|URL", help="Files, directories, storages, URLs of files.")
     ],
     filter_text: FilterText = None,
     sort: Sort = None,
@@ -247,8 +247,8 @@ def episodes(
     """
     from tupli_mcap import open as open_dataset
 
-    if len(paths) == 1 and paths[0].is_dir():
-        with open_storage(paths[0]) as storage:
+    if len(paths) == 1 and Path(paths[0]).is_dir():
+        with open_storage(Path(paths[0])) as storage:
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
     found = open_dataset(paths[0] if len(paths) == 1 else paths)

@@ -24,6 +24,8 @@ _PIECE = 256 << 10  # bytes that are handed on at least
 _RANGE = 8 << 20  # bytes of a file that fsspec reads are asked for at a time, where all of it is wanted
 _SECONDS_VARIABLE = "TUPLI_MCAP_REMOTE_SECONDS"
 _SECONDS = 120.0
+# Who finds no credentials in the environment asks the cloud's machine for them.
+_WHERE_MACHINES_ASK = ("//169.254.", "//metadata.google.internal")
 _CLIENT = {"connect_timeout": "10s", "allow_http": True}
 # A body may take as long as it likes, while something comes; what breaks off is asked for again for a minute.
 _UNLIMITED = {
@@ -171,8 +173,12 @@ class _StoredObject:
 
     def __init__(self, url: str) -> None:
         self._url = url
-        self._patience = _patience()
-        self._store, self._path = open_store(url, self._patience)
+        self._store, self._path = open_store(url, _patience())
+        if not self._path and not is_web(url):
+            folder = shown(url).rstrip("/")
+            raise RecordingError(
+                f"{folder} is a bucket; give the URL of a recording, such as {folder}/x.mcap"
+            )
 
     def tail(self, length: int) -> End:
         from obstore.exceptions import NotSupportedError
@@ -277,6 +283,15 @@ def _asked(url: str, ask: Callable[[], _T]) -> _T:
         said = str(err).partition("\n")[0]
         if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
             raise _RefusedError from None
+        if any(where in said for where in _WHERE_MACHINES_ASK):
+            raise RecordingError(
+                f"{shown(url)} cannot be read: no credentials are in the environment; set those of its provider, such "
+                "as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or for a public bucket AWS_SKIP_SIGNATURE=true"
+            ) from None
+        if said.startswith(("Generic Config error", "Generic URL error")):
+            raise RecordingError(
+                f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
+            ) from None
         slow = f", or give it more time with {_SECONDS_VARIABLE}" if "kind: Timeout" in str(err) else ""
         raise _BrokenOffError(
             f"{shown(url)} cannot be read: {shown(said):.300}; try again later{slow}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from tupli_mcap.cli.options import DEFAULT_STORAGE, FilterText, Json, filter_of,
 from tupli_mcap.cli.output import bytes_of, counted, print_json
 from tupli_mcap.cli.share.account import Url
 from tupli_mcap.cli.terminal import say
+from tupli_mcap.remote import copied, is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
@@ -30,10 +32,7 @@ _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 def push(
     source: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[DIR|FILE]", parser=local_path, help="A storage or a recording.", readable=False
-        ),
+        str | None, typer.Argument(metavar="[DIR|FILE|URL]", help="A storage, or a recording.")
     ] = None,
     benchmark: Annotated[
         str | None,
@@ -53,23 +52,26 @@ def push(
     from tupli_mcap.storage import FileStorage, TupliAPIClient
     from tupli_mcap.storage.exchange import copy_episodes, push_recording
 
-    if (source is None or source.is_file()) and (filter_text is not None or benchmark is not None):
+    is_one = source is not None and (is_url(source) or Path(source).is_file())
+    if (source is None or is_one) and (filter_text is not None or benchmark is not None):
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
     verb = "would send" if dry_run else "sent"
     with TupliAPIClient(url) as client:
         to = client.url
         if source is None:
             _push_waiting(client, verb, dry_run=dry_run, as_json=as_json)
-        elif source.is_file():
-            name = push_recording(client, source, dry_run=dry_run)
-            _tell_sent(to, f"{verb} {source}", dry_run, recordings=[name or str(source)], as_json=as_json)
+        elif is_one:
+            with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
+                name = push_recording(client, path, dry_run=dry_run)
+            what = shown(source)
+            _tell_sent(to, f"{verb} {what}", dry_run, recordings=[name or what], as_json=as_json)
         else:
             with FileStorage(source) as storage:
                 uri = None if benchmark is None else full_id(storage, benchmark)
-                copied = copy_episodes(
+                brought = copy_episodes(
                     storage, client, filter_of(filter_text), benchmark_id=uri, dry_run=dry_run
                 )
-            ids, episodes = list(filter(None, copied)), sum(each.episodes for each in copied.values())
+            ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
             line = f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
             _tell_sent(to, line, dry_run, benchmarks=ids, episodes=episodes, as_json=as_json)
 

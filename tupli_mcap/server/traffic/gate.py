@@ -8,6 +8,7 @@ import secrets
 import time
 from typing import Any, Final
 
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bind_contextvars, clear_contextvars
 
@@ -43,6 +44,8 @@ class Gate:
                     await passing.answer(413, refusal)
                 else:
                     await self._app(scope, passing.receive, passing.send)
+            except ClientDisconnect:
+                pass  # in the middle of its body; noted as 499
             except Exception:
                 LOG.exception("failed", extra={"route": _route(scope)})
                 if not passing.status:
