@@ -21,6 +21,8 @@ from killing.moments import MOMENTS, die
 from tupli_mcap import RecordEpisodes, Recording, files, journal_path, recover_recording
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.mcap.lock import FileLock
+from tupli_mcap.messages.topics import parse
+from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -170,14 +172,14 @@ def test_images_stay_with_their_steps_when_a_killed_recording_goes_on(tmp_path: 
         return RecordEpisodes(env, path, mode=mode, chunk_size=1000, compression="none")
 
     def record() -> None:
-        add = RecordingWriter.add_chunk
+        add = ChunkWriter.add
 
-        def add_and_die(self: RecordingWriter, rows: Any) -> None:
+        def add_and_die(self: ChunkWriter, rows: Any) -> None:
             add(self, rows)
-            if rows.channel == self.channels.images[0][0]:
+            if parse(self._container.channels[rows.channel].topic).kind == "image":
                 die()
 
-        RecordingWriter.add_chunk = add_and_die  # type: ignore[method-assign]
+        ChunkWriter.add = add_and_die  # type: ignore[method-assign]
         env = make("x")
         env.reset(seed=1)
         while True:
