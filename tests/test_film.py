@@ -122,7 +122,7 @@ def test_of_a_stack_its_newest_frame(tmp_path: Path) -> None:
 
 def test_refuses_what_has_no_meaning(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", gym.make("CartPole-v1"), 1)
-    with pytest.raises(RecordingError, match="no pictures"):
+    with pytest.raises(RecordingError, match="without pictures"):
         Recording(path).episodes[0].video(tmp_path / "x.gif")
     episode = Recording(record(tmp_path / "c.mcap", Camera())).episodes[0]
     for name in ("x.txt", "c.mcap"):

@@ -130,17 +130,15 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     before = source.read_bytes()
     target = tmp_path / "layout.json"
     target.write_bytes(b"here")
-    with pytest.raises(
-        RecordingError, match="exists already; choose another name, or replace it with --force"
-    ):
+    with pytest.raises(RecordingError, match="exists; choose another name, or replace it with --force"):
         write_layout(source, target)
     write_layout(source, target, force=True)
     assert json.loads(target.read_text(encoding="utf-8"))["layout"]["direction"] == "row"
-    with pytest.raises(RecordingError, match="is the recording, which is never written over"):
+    with pytest.raises(RecordingError, match="is the recording itself, which is never overwritten"):
         write_layout(source, source, force=True)
     with pytest.raises(RecordingError, match="there is no directory"):
         write_layout(source, tmp_path / "no" / "layout.json")
-    with pytest.raises(RecordingError, match="expected one recording to lay out, found 2"):
+    with pytest.raises(RecordingError, match="expected one recording to make a layout for, found 2"):
         write_layout([source, source], tmp_path / "two.json")
     assert source.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == [target, source]
@@ -152,7 +150,7 @@ def test_the_command_writes_a_layout(tmp_path: Path) -> None:
     runner = CliRunner()
     done = runner.invoke(app, ["replay", str(source), "--layout", str(target)])
     assert done.exit_code == 0, done.output
-    assert "import this as a layout" in done.output
+    assert "import this file as a layout" in done.output
     with Recording(source) as recording:
         assert json.loads(target.read_text(encoding="utf-8")) == foxglove_layout(recording)
     assert runner.invoke(app, ["replay", str(source), "--layout", str(target)]).exit_code == 1

@@ -381,14 +381,14 @@ class TestBadInput:
         (tmp_path / "old.gif").write_bytes(b"old")
         cases = [
             ("old.gif", "exists and is not replaced"),
-            ("r.mcap", "is the recording, which is never written over"),
+            ("r.mcap", "is the recording itself, which is never overwritten"),
             ("new.avi", r"ends in \.mcap, \.mp4 or \.gif"),
             ("none/new.gif", "there is no directory"),
         ]
         for name, message in cases:
             with pytest.raises(RecordingError, match=message):
                 render(path, tmp_path / name)
-        with pytest.raises(RecordingError, match="never written over"):
+        with pytest.raises(RecordingError, match="never overwritten"):
             render(path, path, overwrite=True)
         assert (tmp_path / "old.gif").read_bytes() == b"old"
         assert render(path, tmp_path / "old.gif", overwrite=True).ok
@@ -450,7 +450,7 @@ class TestCommandLine:
             ]
         code, out, err = run("render", tmp_path / "runs", "-o", tmp_path / "all.mcap", "--episodes", "all")
         assert (code, out) == (1, "")
-        assert "found some of 2 in" in err and "(one.mcap, two.mcap); give the path of one of them" in err
+        assert "found episodes of 2 in" in err and "(one.mcap, two.mcap); give the path of one of them" in err
         assert not (tmp_path / "all.mcap").exists()
 
     @pytest.mark.parametrize(

@@ -184,7 +184,7 @@ def test_without_a_display_it_names_the_other_ways(
 
 def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert replay(folder / "runs" / "one.mcap", "--connect", "viewer.example") == 1
-    assert "error: the viewer at viewer.example took nothing" in capfd.readouterr().err
+    assert "error: the viewer at viewer.example did not take the data" in capfd.readouterr().err
 
 
 def test_where_no_viewer_answers_it_ends_soon(
@@ -222,7 +222,7 @@ def test_a_viewer_that_does_not_start_is_told_with_its_last_words(
     broken.chmod(0o755)
     monkeypatch.setattr(targets, "viewer_program", lambda: broken)
     monkeypatch.setenv("DISPLAY", ":9")
-    with pytest.raises(ViewerError, match="did not start, its last words are 'Error: no graphics here'"):
+    with pytest.raises(ViewerError, match="did not start; its last output is 'Error: no graphics here'"):
         viewer.show(folder / "runs" / "one.mcap")
 
 

@@ -88,7 +88,7 @@ def test_a_backup_comes_back_anywhere(
             )
             said = capsys.readouterr()
             if code:
-                assert "there is a server's data already; restore into an empty place" in said.err
+                assert "the target holds a server's data already; restore into an empty place" in said.err
             else:
                 assert "restored 1 user, 2 recordings, 1 artifact" in said.out
         with signed_in(settings) as admin:
@@ -141,15 +141,15 @@ def test_a_backup_while_much_comes_and_goes(tmp_path: Path) -> None:
 
 def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
     settings = Settings(tmp_path / "served")
-    with pytest.raises(StorageError, match="holds no server's data"):
+    with pytest.raises(StorageError, match="expected the data of a server in"):
         back_up(settings, tmp_path / "backup")
     with signed_in(settings) as admin:
         fill(admin)
         (tmp_path / "thesis").mkdir()
         (tmp_path / "thesis" / "thesis.tex").touch()
-        with pytest.raises(StorageError, match="holds something else than a backup"):
+        with pytest.raises(StorageError, match="expected a backup or nothing in"):
             back_up(settings, tmp_path / "thesis")
-        with pytest.raises(StorageError, match="holds no backup of a server"):
+        with pytest.raises(StorageError, match="expected the backup of a server in"):
             restore(tmp_path / "thesis", Settings(tmp_path / "new"))
         damaged = next((tmp_path / "served" / "recordings").rglob("*.mcap"))
         data = bytearray(damaged.read_bytes())

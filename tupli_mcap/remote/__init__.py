@@ -1,10 +1,10 @@
 """Files on web servers and in buckets, read in place.
 
 objects:  one object behind a URL: its size, its version, and ranges of its bytes (obstore, or fsspec).
-plan:     which ranges are asked for together, and when to let a server cut.
-source:   what a reader reads from: it plans ahead, keeps what came, and stops if the object changes.
-patterns: the URLs that a pattern such as "s3://bucket/runs/*.mcap" matches.
-names:    URLs, and how they may be shown.
+plan:     which ranges are fetched in one request, and when a server should cut out episodes instead.
+source:   the file as a reader sees it: ranges are fetched ahead and cached; a changed object is an error.
+patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
+names:    recognises URLs, and removes secrets from them.
 """
 
 from tupli_mcap.remote.names import is_url, is_web, shown

@@ -1,4 +1,4 @@
-"""URLs, and how they may be shown."""
+"""Recognises URLs, and removes secrets from them before they are shown."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
 
 
 def is_url(name: str) -> bool:
-    """True for `scheme://…`."""
+    """Whether a name is a URL: `scheme://…`."""
     return _SCHEME.match(name) is not None
 
 
 def is_web(url: str) -> bool:
-    """True for the address of a web server."""
+    """Whether a URL is the address of a web server."""
     return url.lower().startswith(("http://", "https://"))
 
 
 def shown(text: str) -> str:
-    """A URL, or a text with URLs in it, without names, passwords and signatures."""
+    """Removes user names, passwords and signatures from the URLs in a text."""
     return _SECRET.sub(lambda found: found[1] or "", text)

@@ -18,16 +18,16 @@ from tupli_mcap.remote.names import is_web, shown
 __all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store"]
 
 _T = TypeVar("_T")
-Tell = Callable[[int], None]  # how many bytes more have come
+Tell = Callable[[int], None]  # called with the number of bytes that have just arrived
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
-_PIECE = 256 << 10  # bytes that are handed on at least
-_RANGE = 8 << 20  # bytes of a file that fsspec reads are asked for at a time, where all of it is wanted
+_PIECE = 256 << 10  # least bytes of a piece
+_RANGE = 8 << 20  # bytes of each request of fsspec for a whole file
 _SECONDS_VARIABLE = "TUPLI_MCAP_REMOTE_SECONDS"
 _SECONDS = 120.0
 # Who finds no credentials in the environment asks the cloud's machine for them.
 _WHERE_MACHINES_ASK = ("//169.254.", "//metadata.google.internal")
 _CLIENT = {"connect_timeout": "10s", "allow_http": True}
-# A body may take as long as it likes, while something comes; what breaks off is asked for again for a minute.
+# A body may take any time while bytes arrive; a broken request is retried for a minute.
 _UNLIMITED = {
     "client_options": {**_CLIENT, "read_timeout": "120s", "timeout": "365d"},
     "retry_config": {"max_retries": 5, "retry_timeout": timedelta(seconds=60)},
@@ -43,7 +43,7 @@ class NoRangesError(Exception):
 
 
 class End(NamedTuple):
-    """The last bytes of an object, its size, and its version: a text that differs when its content does."""
+    """The last bytes of an object, its size, and its version: a text that changes with its content."""
 
     data: memoryview
     size: int
@@ -51,30 +51,30 @@ class End(NamedTuple):
 
 
 class RemoteObject(Protocol):
-    """An object that can be read from several threads."""
+    """An object on a server. Thread-safe."""
 
     def tail(self, length: int) -> End:
-        """Its last `length` bytes, or all of them; NoRangesError."""
+        """The last `length` bytes, or all if there are fewer. NoRangesError if the server sends whole files only."""
         ...
 
     def get(self, start: int, stop: int, version: str, tell: Tell = ...) -> memoryview:
-        """The bytes `start:stop` of the version, telling as they come; RecordingError if it is another one by now."""
+        """The bytes `start:stop`; `tell` is called as they arrive. RecordingError if the object has another version."""
         ...
 
     def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
-        """Its bytes from an offset on, from one request; RecordingError if it is not the version given."""
+        """The bytes from an offset on, from one request; RecordingError if the object has another version."""
         ...
 
 
-_process: int | None = None  # which reads from servers
+_process: int | None = None  # the process that has read from servers
 
 
 def find(url: str) -> RemoteObject:
-    """What reads a URL; nothing is asked of the server yet.
+    """The object behind a URL; sends no request yet.
 
     Raises:
         MissingExtraError: obstore or fsspec is not installed.
-        RecordingError: the URL is none, or this process is a fork of one that has read from a server.
+        RecordingError: the URL is not valid, or this process is a fork of one that has read from a server.
     """
     global _process
     _process = _process or os.getpid()
@@ -112,13 +112,13 @@ def changed(url: str) -> RecordingError:
 
 
 def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
-    """The store of a URL, as obstore has it, and the path in it.
+    """The obstore store of a URL, and the path in it.
 
-    within: when what is asked of it is given up, all attempts together; without it, when nothing more comes.
+    within: the time limit of a request with all its retries; without it, a request ends when no more bytes arrive.
 
     Raises:
         MissingExtraError: obstore is not installed.
-        RecordingError: the URL is none.
+        RecordingError: the URL is not valid.
     """
     try:
         from obstore.store import HTTPStore, from_url
@@ -137,7 +137,7 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
 
 
 def _limited(within: timedelta) -> dict[str, Any]:
-    """Options with which an attempt takes a quarter of a time at most, and none begins in its last quarter."""
+    """Options for a time limit: each attempt may take a quarter of it, and none begins in its last quarter."""
     attempt = within / 4
     return {
         "client_options": {**_CLIENT, "timeout": attempt},
@@ -146,7 +146,7 @@ def _limited(within: timedelta) -> dict[str, Any]:
 
 
 def _patience() -> timedelta:
-    """How long one range may take, all attempts together."""
+    """The time limit of one range, with all retries."""
     text = os.environ.get(_SECONDS_VARIABLE, str(_SECONDS))
     try:
         seconds = float(text)
@@ -160,7 +160,7 @@ def _patience() -> timedelta:
 
 
 def check_process(url: str) -> None:
-    """Raises RecordingError in a fork of the process that read first: threads that fetch are not in it."""
+    """Raises RecordingError in a fork of the process that read first: a fork lacks the threads that fetch."""
     if _process is not None and _process != os.getpid():
         raise RecordingError(
             f"{shown(url)} cannot be read in a forked process, as its parent has read from a server; start the process "
@@ -225,7 +225,7 @@ class _StoredObject:
         """An answer whose body has not been read; RecordingError if it is not of the version given."""
         from obstore.exceptions import NotSupportedError
 
-        if version and version.startswith('"'):  # a weak tag matches nothing
+        if version and version.startswith('"'):  # servers match no weak tag (W/"…")
             options["if_match"] = version
         try:
             found = _asked(self._url, lambda: store.get(self._path, options=options))
@@ -264,7 +264,7 @@ class _RefusedError(Exception):
 
 
 def _asked(url: str, ask: Callable[[], _T]) -> _T:
-    """What a server answers; RecordingError, without anything secret, where it does not."""
+    """The answer to a request; RecordingError, without secrets in its message, if the request fails."""
     from obstore import exceptions as told
 
     try:
@@ -314,7 +314,7 @@ def _fsspec(url: str) -> tuple[Any, str]:
 
 
 class _FsspecObject:
-    """An object that fsspec reads. What changes without changing its size and tag is not noticed."""
+    """An object that fsspec reads. A change that leaves size and tag the same is not noticed."""
 
     def __init__(self, url: str) -> None:
         self._url = url

@@ -14,12 +14,12 @@ _MAGIC = re.compile(r"[*?\[]")
 
 
 def matching(url: str) -> list[str]:
-    """The URLs that a pattern such as "s3://bucket/runs/*.mcap" matches, by name; a URL without one by itself.
+    """The sorted URLs that match a pattern such as "s3://bucket/runs/*.mcap"; a URL without wildcards as it is.
 
-    "*" stays within a folder, "**" does not.
+    "*" matches within a folder, "**" also across folders.
 
     Raises:
-        RecordingError: nothing matches, or the server does not list what it has.
+        RecordingError: nothing matches, or the server cannot list files.
     """
     web = is_web(url)
     path = url.partition("?")[0] if web else url
@@ -45,7 +45,7 @@ def _expression(pattern: str) -> str:
 
 
 def _one(token: str) -> str:
-    """A set of characters, or a character that means itself."""
+    """The regular expression of a token: a wildcard, a set of characters, or a plain character."""
     if len(token) == 1:
         return re.escape(token)
     negated = token[1] == "!"

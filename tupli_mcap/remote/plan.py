@@ -1,4 +1,4 @@
-"""Which ranges of a remote file are asked for together."""
+"""Plans which ranges of a remote file are fetched in one request."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from collections.abc import Iterable, Sequence
 
 __all__ = ["is_cut_cheaper", "pieces_of"]
 
-Range = tuple[int, int]  # first byte, and the one behind the last
+Range = tuple[int, int]  # half-open: first byte, and the one after the last
 
 _LARGEST_GAP = 1 << 20
 _LARGEST_PIECE = 8 << 20
-# Fewer requests may cost a fifth of what is wanted, or so many bytes. Between two chunks lie the message indexes of the
-# first one, which are a seventh of a file of small steps: a whole field must not become a request for each chunk.
+# To save requests, gaps may be fetched too, up to a fifth of the wanted bytes, or so many bytes. Between two chunks are
+# the message indexes of the first, a seventh of a file of small steps: without this rule, reading a whole field would
+# take a request for each chunk.
 _WASTE = 5
 _LITTLE = 16 << 10
-_CHUNK = 128 << 10  # about what a chunk takes
-_TAIL = 128 << 10  # what opening takes
+_CHUNK = 128 << 10  # about the compressed size of a chunk
+_TAIL = 128 << 10  # about the bytes that opening a file takes
 _CUT = 4
 
 
 def pieces_of(wanted: Iterable[Range]) -> list[Range]:
-    """Ranges that cover all the wanted ones, in ascending order, each a request.
+    """Ranges that cover all the wanted ones, in ascending order; each is one request.
 
-    Neighbours become one piece, and so do those with small gaps between them: the smallest gaps first, as long as all
-    of them together stay a small part of what is wanted. A piece ends at 8 MiB, so that several travel side by side.
+    Adjacent ranges become one, and so do ranges with small gaps: the smallest gaps first, as long as all gaps together
+    are a small part of the wanted bytes. A range has at most 8 MiB, so that several are fetched at the same time.
     """
     merged = _touching(wanted)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(itertools.pairwise(merged)))
@@ -55,19 +56,18 @@ def _touching(wanted: Iterable[Range]) -> list[Range]:
 
 
 def _cut(start: int, stop: int) -> list[Range]:
-    """A range in pieces of about the same size."""
+    """Cuts a range into pieces of about the same size."""
     count = -(-(stop - start) // _LARGEST_PIECE)
     size = -(-(stop - start) // count)
     return [(at, min(stop, at + size)) for at in range(start, stop, size)]
 
 
 def is_cut_cheaper(wanted: Sequence[int] | None, episodes: int, size: int) -> bool:
-    """Whether a server should make a recording of the wanted ones (None: all) of a file's episodes, rather than be
-    asked for ranges of the file.
+    """Whether a server should cut out the wanted episodes (None: all) as a recording, instead of sending ranges.
 
-    Ranges bring the index, and whole chunks: of each wanted episode its own, and one for what lies beside it. What is
-    cut brings its rows only, but the server has to unpack and pack them, which takes as long as to send some times as
-    many bytes. The index would tell the bytes exactly; it can have more of them than the wanted episodes.
+    Ranges bring the index and whole chunks: those of each episode, and about one more for rows beside it. A cut brings
+    only the wanted rows, but the server has to decompress and compress them, which takes as long as sending several
+    times as many bytes. This is an estimate: fetching the index to compute it could cost more than the episodes.
     """
     if wanted is None or not episodes:
         return False

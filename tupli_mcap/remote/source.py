@@ -1,4 +1,4 @@
-"""A file on a server, as a reader sees it: ranges that are planned ahead, fetched side by side, and kept."""
+"""A file on a server, as a reader sees it: ranges are planned ahead, fetched at the same time, and cached."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tupli_mcap.remote.plan import Range, pieces_of
 __all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url", "watching"]
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
-# What is fetched when a file is opened: the summary and the index, unless the file is huge.
+# Fetched when a file is opened: holds the summary and the index, unless the file is huge.
 _TAIL = 128 << 10
-# What is fetched together when something of it is asked for: what a recording says of its run and its environment.
+# Fetched together when any byte of it is read: holds what a recording says about its run and its environment.
 _HEAD = 16 << 10
 _AT_ONCE = 8
 
 
 class _Block:
-    """Bytes of a file that have come, or are on their way."""
+    """Bytes of a file that have arrived, or are being fetched."""
 
     __slots__ = ("coming", "start", "stop")
 
@@ -39,7 +39,7 @@ class _Block:
 
 
 class _Blocks:
-    """The blocks that were used last, of all remote files of this process, by the version of the file."""
+    """The cache of this process: the blocks of remote files used last, by file and version."""
 
     def __init__(self, budget: int) -> None:
         self._budget = budget
@@ -88,7 +88,7 @@ _watch: Callable[[int, int], None] | None = None
 
 @contextmanager
 def watching(watch: Callable[[int, int], None]) -> Iterator[None]:
-    """Has a function told, from any thread, how many bytes more are to come from servers, and how many have come."""
+    """Within the block, calls `watch(planned, arrived)` with numbers of new bytes, from any thread."""
     global _watch
     _watch = watch
     try:
@@ -108,10 +108,10 @@ _fetchers = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="tupli-remote")
 
 
 class RemoteSource:
-    """One version of a file on a server. Safe from several threads; a copy in another process fetches for itself.
+    """One version of a file on a server. Thread-safe; a copy in another process fetches for itself.
 
-    It was opened with the tail of the file, which stays in memory. When the file on the server changes,
-    reading raises RecordingError: bytes of two versions are never mixed.
+    Opening it has fetched the tail of the file, which stays in memory. If the file on the server changes, reading
+    raises RecordingError: bytes of two versions are never mixed.
     """
 
     def __init__(self, url: str, remote: RemoteObject, tail: End) -> None:
@@ -121,8 +121,8 @@ class RemoteSource:
         self._url, self._remote, self._tail = url, remote, tail
         self._file = f"{tail.version} {url}"
         self._lock = threading.Lock()
-        self._planned: list[Range] = []  # not yet asked for, the next one last
-        self._unread: set[tuple[int, int]] = set()  # of the plan: asked for, and not yet read
+        self._planned: list[Range] = []  # not requested yet; the next one is the last
+        self._unread: set[tuple[int, int]] = set()  # of the plan: requested, and not read yet
 
     def read(self, offset: int, length: int) -> bytes:
         return bytes(self.view(offset, length))
@@ -150,7 +150,7 @@ class RemoteSource:
         return data[offset - block.start : stop - block.start]
 
     def fetch(self, ranges: Sequence[Range]) -> None:
-        """Begins to fetch what will be read next, and goes on while it is read."""
+        """Starts to fetch ranges that will be read next; fetching continues while they are read."""
         first = self.size - len(self._tail.data)
         missing = [
             (start, min(stop, self.size))
@@ -165,7 +165,7 @@ class RemoteSource:
             self._fill()
 
     def _ask_for(self, start: int, stop: int) -> _Block:
-        """Asks for a range now: for the piece of the plan that holds it, or for nothing more than the range."""
+        """Requests the planned range that holds this range, or else the range alone."""
         with self._lock:
             for i, (first, last) in enumerate(self._planned):
                 if first <= start and stop <= last:
@@ -177,7 +177,7 @@ class RemoteSource:
             return self._begin(start, stop)
 
     def _go_on(self, block: _Block) -> None:
-        """Asks for more of the plan: a block of it has been read."""
+        """Requests more of the plan, after a block of it was read."""
         with self._lock:
             self._unread.discard((block.start, block.stop))
             self._fill()
@@ -208,10 +208,10 @@ class RemoteSource:
             raise
 
     def refresh(self) -> None:
-        """Nothing: it is one version."""
+        """Does nothing, since this source is one version of the file."""
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Does nothing, since no connection is held open."""
 
     def __reduce__(self) -> tuple[Callable[..., RemoteSource], tuple[str, bytes, int, str]]:
         tail = self._tail
@@ -223,11 +223,11 @@ def _again(url: str, tail: bytes, size: int, version: str) -> RemoteSource:
 
 
 def open_url(url: str) -> RemoteSource | BinaryIO:
-    """A file on a server; where the server sends whole files only, a temporary copy of it, and a warning.
+    """Opens a file on a server. If the server sends whole files only, warns, and returns a temporary copy.
 
     Raises:
-        RecordingError: it does not exist, may not be read, or the server does not answer.
-        MissingExtraError: what reads such URLs is not installed.
+        RecordingError: the file does not exist, may not be read, or the server does not answer.
+        MissingExtraError: the package that reads such URLs is not installed.
     """
     remote = find(url)
     try:
@@ -249,17 +249,17 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
 
 @contextmanager
 def copied(url: str) -> Iterator[Path]:
-    """A temporary copy of a whole file, for those that walk through all of it.
+    """A temporary copy of a whole file, for callers that read all of it.
 
     Raises:
-        RecordingError: it cannot be read, or there is no room for it.
-        MissingExtraError: what reads such URLs is not installed.
+        RecordingError: the file cannot be read, or the disk is full.
+        MissingExtraError: the package that reads such URLs is not installed.
     """
     remote = find(url)
     try:
         size = remote.tail(1).size
     except NoRangesError:
-        size = 0  # not known
+        size = 0  # unknown
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
         path = Path(folder) / (Path(urlsplit(url).path).name or "recording.mcap")
         with path.open("xb") as file:
@@ -268,7 +268,7 @@ def copied(url: str) -> Iterator[Path]:
 
 
 def _download(url: str, remote: RemoteObject, file: IO[bytes], size: int) -> None:
-    """Copies a file, with a bar of the bytes; a connection that breaks off is an error."""
+    """Copies a file with a progress bar; RecordingError if the connection breaks."""
     done = 0
     try:
         with progress(size, f"downloading {shown(url)}", in_bytes=True) as bar:

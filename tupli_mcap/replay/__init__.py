@@ -1,8 +1,8 @@
-"""Replays recordings: rebuilds the environment, takes every episode again, and compares it bit for bit.
+"""Runs recorded episodes again in their rebuilt environment, and compares them bit for bit.
 
-`certify` does so for a whole recording and gives a `Certificate`; `render` also keeps what the environment renders.
-`starts` decides how each episode is started again, `reapply` resets and steps the environment, `compare` compares with
-`recorded_values`, `attempt` is the three together for one episode, `movie` keeps rendered frames and writes films.
+`certify` does this for a recording and returns a `Certificate`; `render` also keeps the frames that the environment
+renders. `starts` decides how each episode is started, `reapply` resets and steps the environment, `compare` compares
+with `recorded_values`, `attempt` does these three for one episode, `movie` keeps frames and writes films.
 `recorded_film` makes films of recorded pictures, and executes nothing.
 """
 

@@ -1,4 +1,4 @@
-"""Replays one episode and compares it; tells whether its environment repeats itself."""
+"""Runs one episode again and compares it; checks whether its environment is deterministic."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from tupli_mcap.replay.recorded_values import Block, RecordedValues
 from tupli_mcap.replay.starts import EpisodePlan
 
 Watch = Callable[[int], None]
-"""Called with the number of each step whose state agrees, while the environment is in it; last for the final state."""
+"""Called with the number of each step whose state agrees, while the environment is in that state; then for the final
+state."""
 
-_SAMPLE = 2000  # steps that are compared to see whether an environment repeats itself
+_SAMPLE = 2000  # most steps that are compared to see whether an environment is deterministic
 
 
 class Attempt(NamedTuple):
-    """The differences found; `error` is what the environment raised, if it did."""
+    """The differences of an episode; `error` is set if the environment raised."""
 
     tally: Tally
     error: EnvironmentFailedError | None = None
@@ -34,7 +35,7 @@ class Attempt(NamedTuple):
 
 
 class _Actions:
-    """The actions of the block that is being replayed."""
+    """The recorded actions, one after another, of the blocks that are bound one after another."""
 
     def __init__(self, recording: Recording, *, plain: bool) -> None:
         self._recording = recording
@@ -61,7 +62,7 @@ def attempt(
     checker: Checker,
     watch: Watch | None = None,
 ) -> Attempt:
-    """Takes an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
+    """Runs an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
     first difference."""
     tally = Tally()
     actions = _Actions(recording, plain=replayer.plain)
@@ -79,7 +80,7 @@ def attempt(
                     watch(step)
                 moment = next(moments)
                 if not checker.result(step, moment, tally) and step + 1 < values.length:
-                    tally.ended = step  # the environment is over: no later step can be compared
+                    tally.ended = step  # the environment ended the episode: no later step can be compared
                     return Attempt(tally)
         final = values.final_state
         if final is not None:

@@ -1,4 +1,4 @@
-"""The certificate: what was replayed and by what, what agreed, and the first place where something did not."""
+"""The certificate: which episodes were run again and with which software, what agreed, and what did not."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from tupli_mcap.recording import Recording
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
 SkipKind = Literal["unseeded", "after_divergence", "no_predecessor", "untrusted"]
 REASONS: dict[SkipKind, str] = {
-    "unseeded": "reset without a seed, from a random state that the recording does not hold",
+    "unseeded": "reset without a seed, from a random state that is not recorded",
     "after_divergence": "reset without a seed, after an episode that diverged",
-    "no_predecessor": "reset without a seed, after steps or episodes that are not in the recording any more",
+    "no_predecessor": "reset without a seed, after steps or episodes that are missing in the recording",
     "untrusted": "reset with options that need trust, such as names of files, or after such a reset; "
-    "`tupli-mcap trust FILE` or --trust (trust=True) lets the environment have them",
+    "allow them with `tupli-mcap trust FILE`, or with --trust (trust=True)",
 }
 """Why episodes could not be checked."""
 _ROW = np.dtype(
@@ -46,9 +46,10 @@ class Divergence(_Model):
     episode, env: its number and its sub-environment. step: counts from 0; the episode's length for the final state, -1
         for an error in reset.
     leaf, path: the field's name in the file, and its place with the space's own keys (`state['pos'][1]`).
-    expected, found: recorded and replayed, as text.
-    largest_difference, largest_step: of this leaf in the whole episode; None if it is no number.
-    differing_steps, length: of the episode. hint: a likely cause, empty if there is none to tell.
+    expected, found: the recorded value and the one of the new run, as text.
+    largest_difference, largest_step: the largest difference of this leaf in the episode, and its step; None if it is no
+        number.
+    differing_steps, length: how many steps of the episode differ, and how many it has. hint: a likely cause, or empty.
     """
 
     kind: Literal["value", "end", "error"]
@@ -97,13 +98,13 @@ class Counts(_Model):
 
 
 class Certificate(_Model):
-    """The result of replaying a recording.
+    """The result of running the episodes of a recording again.
 
-    recorded: what the recording holds. chosen: what was asked for; it is agreed, diverged or skipped.
-    divergences: the first one of each episode that has some, at most 100, in the order of the recording.
-    versions, platform: of this replay. recorded_versions: what the recording says of its own making.
+    recorded: all episodes of the recording. chosen: the chosen ones; each is agreed, diverged or skipped.
+    divergences: the first one of each diverged episode, at most 100, in the order of the recording.
+    versions, platform: the software and the machine of this run. recorded_versions: those of the recording.
     environment, environment_digest: its name, and the digest of what was rebuilt; "" for one that was passed in.
-    content_sha256: over the episodes' facts; tells whether the recording is still the one that was replayed.
+    content_sha256: over the facts of the episodes; it changes if episodes are added or deleted.
     created_ns: wall clock (ns).
     """
 
@@ -127,12 +128,12 @@ class Certificate(_Model):
 
     @property
     def agrees(self) -> bool:
-        """True if something was replayed and nothing of it differs; see `complete`."""
+        """Whether at least one episode was compared, and none differs; see `complete`."""
         return self.agreed.episodes > 0 and self.diverged.episodes == 0
 
     @property
     def complete(self) -> bool:
-        """True if every episode of the recording was replayed and agrees."""
+        """Whether every episode of the recording was compared and agrees."""
         return self.agreed == self.recorded and self.recorded.episodes > 0
 
     @property
@@ -157,7 +158,7 @@ class Certificate(_Model):
 
 def content_digest(recording: Recording) -> str:
     """SHA-256 (hex) over a recording's UUID and the facts of its episodes: number, sub-environment, length, return,
-    times, seed, end. Appending and deleting change it, writing the file anew does not. No step is read."""
+    times, seed, end. Appending and deleting change it, rewriting the file does not. Reads no steps."""
     index = recording.index
     rows = np.zeros(len(index), _ROW)
     for name in _ROW.names or ():
@@ -166,7 +167,7 @@ def content_digest(recording: Recording) -> str:
 
 
 def versions_of(env: gym.Env[Any, Any] | None) -> dict[str, str]:
-    """Versions of Python, of what replaying rests on, and of the packages that an environment's classes come from."""
+    """Versions of Python, Gymnasium, NumPy and tupli-mcap, and of the packages of an environment's classes."""
     names = {"gymnasium", "numpy", "tupli-mcap"}
     while env is not None:
         names |= _distributions(type(env).__module__.partition(".")[0])
@@ -190,7 +191,7 @@ def _packages() -> dict[str, list[str]]:
 
 
 def platform_facts() -> dict[str, str]:
-    """System, machine, processor, C library and Python implementation: what floating-point results may depend on."""
+    """System, machine, processor, C library and Python implementation, on which floating-point results may depend."""
     facts = {
         "system": platform.system(),
         "machine": platform.machine(),

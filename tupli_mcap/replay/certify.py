@@ -1,4 +1,4 @@
-"""`certify`: replays a whole recording and compares it."""
+"""`certify`: runs the episodes of a recording again and compares them."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ def certify(
     env: gym.Env[Any, Any] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Certificate:
-    """Replays a recording and compares it bit for bit with what it holds.
+    """Run the episodes of a recording again, and compare them bit for bit.
 
-    Every episode is reset with its seed and options and stepped with its actions; states, rewards, flags and the final
-    state are compared. Episodes that were reset without a seed go on with the random stream of the one before, as
-    they did when they were recorded.
+    Each episode is reset with its seed and options and stepped with its actions; states, rewards, flags and the final
+    state are compared. An episode that was reset without a seed continues the random stream of the one before, as it
+    did when it was recorded.
 
     Args:
         recording: an open recording, or what `Recording` opens.
         trust: rebuild the environment even if that runs code from the file, and reset it with any options.
-        episodes: numbers of those to check (all by default); what they depend on is replayed too.
-        env: used instead of the environment in the file; it is not closed.
+        episodes: numbers of those to check; by default, all. Episodes that they depend on are run too.
+        env: an environment to use instead of the one in the file; it is not closed.
         progress: called with the number of steps done.
 
     Raises:
-        UntrustedError: rebuilding the environment would run code that nobody here has trusted.
+        UntrustedError: rebuilding the environment would run code that this user does not trust.
         RecordingError: the recording carries no environment, or has no such episode.
         FormatError: the file is damaged.
     """
@@ -67,7 +67,7 @@ def certify(
 
 
 class Certifier:
-    """Replays the chosen episodes, and what they depend on; `run` does it once.
+    """Runs the chosen episodes again, and those that they depend on. For one call of `run`.
 
     A subclass that does more than compare overrides `_build`, `_watch` and `_stops`.
     """
@@ -89,17 +89,19 @@ class Certifier:
         self._versions: dict[str, str] | None = None
         self._outcomes: dict[int, Divergence | SkipKind | None] = {}  # by position
         self._done = 0
-        self._plain = False  # whether actions are given with Python's numbers
-        self._settled = False  # whether that is known
+        self._plain = False  # whether actions are passed with Python's numbers
+        self._settled = False  # whether `_plain` is known
         self._deterministic: bool | None = None
         self._stopped = False
-        self._any_options: bool | None = None  # whether resets may be given options that could run code
+        self._any_options: bool | None = (
+            None  # whether options that could run code are trusted; None: not asked yet
+        )
 
     def run(self) -> Certificate:
-        """Replays and compares; the result."""
+        """Runs and compares the episodes."""
         captured = self._record is not None and self._record.pickle is not None
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the environment warned when it was recorded
+            warnings.simplefilter("ignore")  # the environment gave its warnings when it was recorded
             if self._chosen:
                 self._checker = Checker(self._recording.layout, casts=self._recording.is_vector)
                 for plans in plan_episodes(self._recording, captured=captured):
@@ -118,19 +120,19 @@ class Certifier:
         return self._recording.benchmark.make_env(trust=self._trust)
 
     def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
-        """What watches the next attempt at an episode, which may not be the last one."""
+        """The watcher of the next attempt at an episode; further attempts may follow."""
         return None
 
     def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
-        """Whether nothing more is to be replayed after this outcome."""
+        """Whether to stop after this outcome."""
         return False
 
     def _replayer(self, *, plain: bool = False) -> Replayer:
         return Replayer(self._make, owned=self._given is None, plain=plain)
 
     def _sub_environment(self, plans: list[EpisodePlan]) -> None:
-        """Replays the chosen episodes of one sub-environment and those they go on from. If one differs, replays all
-        before them too: a wrapper may carry state beyond a seed."""
+        """Runs the chosen episodes of one sub-environment, and those that they continue. If one differs, runs them anew
+        after all episodes before them: a wrapper may carry state over a seeded reset."""
         everything = up_to_last(plans, self._chosen)
         needed = needed_for(everything, self._chosen)
         self._replay(needed)
@@ -141,7 +143,7 @@ class Certifier:
                 self._replay(everything)
 
     def _replay(self, plans: list[EpisodePlan]) -> None:
-        """Replays episodes in order, on one environment."""
+        """Runs episodes in order, in one environment."""
         replayer = self._replayer(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:
@@ -169,7 +171,7 @@ class Certifier:
             replayer.close()
 
     def _withheld(self, plan: EpisodePlan) -> bool:
-        """Whether an episode is not reset, since its options could run code and are not trusted."""
+        """Whether an episode is not run, because its reset options could run code and are not trusted."""
         if not any(foreign_options(reset.options) for reset in plan.resets):
             return False
         if self._any_options is None:
@@ -177,7 +179,7 @@ class Certifier:
         return not self._any_options
 
     def _doubt(self, plan: EpisodePlan, before: SkipKind | None) -> SkipKind | None:
-        """Why an episode may differ although nothing is wrong; None if it may not."""
+        """A reason for which an episode may differ although nothing is wrong; None if there is none."""
         if plan.starts_chain:
             return None
         if plan.gap:
@@ -187,8 +189,8 @@ class Certifier:
     def _attempt(
         self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
     ) -> tuple[Attempt, Replayer]:
-        """Tries the episode on the environment that took those before it, then on new ones: the recording may have been
-        continued in another process, and its policy may have given Python's numbers."""
+        """Runs an episode in the environment of those before it; if it differs, in new ones: another process may have
+        continued the recording, or the policy may have given Python's numbers."""
         used = replayer.used
         found = self._attempted(plan, values, replayer)
         if found.agrees:
@@ -246,18 +248,20 @@ class Certifier:
         repeats = self._repeats_itself(plan, values) if plan.starts_chain and found.error is None else None
         if repeats is False:
             hints.append(
-                "The environment is not deterministic: replayed twice with the same seed it differs from itself "
+                "The environment is not deterministic: two runs with the same seed differ "
                 "(it may draw from np.random, random or an unseeded space)."
             )
         elif repeats:
             hints.append(
-                "The environment repeats itself: its code, its libraries or the recorded values are others than then."
+                "The environment is deterministic: its code, its libraries or the recorded values have changed."
             )
         if plan.env > 0:
-            hints.append("The file carries the first sub-environment; this one may have been made otherwise.")
+            hints.append(
+                "The file holds the first sub-environment; this one may have been made in another way."
+            )
         if plan.needs_predecessor and not plan.after_end:
             hints.append(
-                "It was reset without a seed after an interrupted episode: a step that is not recorded may lie between."
+                "It was reset without a seed after an interrupted episode: a step before it may not have been recorded."
             )
         return hints
 

@@ -28,8 +28,8 @@ _FLAGS = ("terminal", "timeout")
 
 
 class Difference(NamedTuple):
-    """A leaf that differs at a step; `largest` is the largest absolute difference of its numbers, None if they
-    cannot be subtracted. `path` names the first element that differs."""
+    """A leaf that differs at a step. `path` names the first element that differs; `largest` is the largest absolute
+    difference of the elements, None if they are no numbers."""
 
     step: int
     leaf: str
@@ -41,18 +41,19 @@ class Difference(NamedTuple):
 
 @dataclass
 class Tally:
-    """The differences of one episode: the first one, how many steps have some, and the largest of the first leaf."""
+    """The differences of one episode: the first one, the number of differing steps, and the largest difference of the
+    leaf that differed first."""
 
     first: Difference | None = None
     steps: int = 0
     largest: float | None = None
     largest_step: int = 0
-    unmeasured: bool = False  # of the first leaf, a difference that is no number
+    unmeasured: bool = False  # whether that leaf has a difference that is no number
     ended: int | None = None  # the step at which the environment ended before the recording did
     _last: int = field(default=-1, repr=False)
 
     def note(self, difference: Difference) -> None:
-        """Adds a difference; they come in the order of the steps."""
+        """Adds a difference. Call it in the order of the steps."""
         if self.first is None:
             self.first = difference
         if difference.step != self._last:
@@ -69,7 +70,7 @@ class Tally:
 class Checker:
     """Compares moments with the columns of a recording.
 
-    casts: the values were stored in a vector environment's batch, in the dtype of its space, before they were recorded.
+    casts: whether values were cast to the dtype of the space before they were recorded, as vector environments do.
     """
 
     def __init__(self, layout: StepLayout, *, casts: bool) -> None:
@@ -81,7 +82,7 @@ class Checker:
         self._flags: tuple[list[bool], list[bool]] = ([], [])
 
     def bind(self, columns: Columns, start: int) -> None:
-        """Compares with these columns from now on; their first row is step `start`."""
+        """Sets the columns to compare with; their first row is step `start`."""
         self._start = start
         self._states = [self._prepared(leaf, columns.states) for leaf in self._layout.state]
         self._rewards = [self._prepared(leaf, columns.rewards) for leaf in self._layout.reward]
@@ -166,7 +167,7 @@ class Checker:
         if dtype == np.float64 and shape == ():
 
             def same_float(i: int, value: Any) -> bool:
-                # zeros have signs, and NaN has payloads
+                # equal is not the same for zero (sign) and NaN (payload): those are compared as bytes
                 if type(value) is float and value == plain[i] and value:
                     return True
                 return same(i, value)
@@ -203,7 +204,7 @@ class Checker:
 
 
 def _bits(array: Any) -> Any:
-    """An array's bits as integers; itself where equality already is that of bits."""
+    """The bits of a float array as integers; other arrays as they are."""
     array = np.asarray(array, order="C")
     return array.view(_BITS[array.itemsize]) if array.dtype.kind == "f" else array
 

@@ -1,5 +1,5 @@
-"""Rendered frames: kept in a temporary file, for an episode may have thousands, and written as MP4 (by PyAV, extra
-`video`) or GIF (by Pillow, extra `frames`)."""
+"""Keeps rendered frames in a temporary file, and writes pictures as MP4 (with PyAV, extra `video`) or GIF (with Pillow,
+extra `frames`)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tupli_mcap.messages.images.pictures import FrameFormat, Picture, decode_pic
 
 _GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
-_GIF_SAMPLE = 15_000  # pixels that the colours of a picture with more than that are chosen from
+_GIF_SAMPLE = 15_000  # about so many pixels of a larger picture are sampled to choose its colours
 _CODECS = ("libx264", "h264", "mpeg4")
 
 
@@ -32,9 +32,9 @@ class _Take(NamedTuple):
 
 
 class RenderedFrames:
-    """Frames by episode, as `NewFrames` has them, in a temporary file; a context manager that removes it.
+    """Frames by episode in a temporary file, with the methods of `NewFrames`; a context manager removes the file.
 
-    `times` of an episode says when it was in the state of each step (ns).
+    `times` of an episode are the wall clock times of its states (ns).
     """
 
     def __init__(self, camera: str, form: FrameFormat) -> None:
@@ -46,7 +46,7 @@ class RenderedFrames:
         self._end = 0
 
     def begin(self, episode: int, times: Sequence[int]) -> None:
-        """Starts an episode, over again if there are frames of it."""
+        """Starts an episode, and forgets frames that it has."""
         self._takes[episode], self._times[episode] = [], times
 
     def add(self, episode: int, step: int, picture: Picture) -> None:
@@ -59,7 +59,7 @@ class RenderedFrames:
 
     @property
     def counts(self) -> dict[int, int]:
-        """Frames by episode, those with none left out."""
+        """The number of frames of each episode that has some."""
         return {episode: len(takes) for episode, takes in self._takes.items() if takes}
 
     def of(self, episode: int) -> Iterator[tuple[int, EncodedFrame]] | None:
@@ -79,7 +79,7 @@ class RenderedFrames:
                 yield decode_picture(frame.data, f"frame of step {step}")
 
     def close(self) -> None:
-        """Throws the frames away."""
+        """Removes the frames."""
         self._file.close()
 
     def __enter__(self) -> RenderedFrames:
@@ -90,7 +90,7 @@ class RenderedFrames:
 
 
 def check_movie(suffix: str) -> None:
-    """Raises MissingExtraError unless films of that kind can be written here."""
+    """Raises MissingExtraError if the package for films of this kind is not installed."""
     if suffix == ".mp4":
         _av()
 
@@ -128,7 +128,7 @@ def _write_mp4(path: Path, first: Picture, rest: Iterator[Picture], fps: float) 
         stream = container.add_stream(codec, rate=rate)
         even = _even(first)
         stream.height, stream.width = even.shape[:2]
-        stream.pix_fmt = "yuv420p"  # what every player and browser knows
+        stream.pix_fmt = "yuv420p"  # the format that all players and browsers support
         if codec == "libx264":
             stream.options = {"crf": "18", "movflags": "+faststart"}
         for picture in _with(first, rest):
@@ -152,10 +152,10 @@ def _with(first: Picture, rest: Iterator[Picture]) -> Iterator[Picture]:
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
     stride = max(1, math.ceil(fps / _GIF_FPS))
     shown = math.ceil(count / stride)
-    # in hundredths of a second, as GIF has them
+    # GIF counts in hundredths of a second
     ends = np.round(np.arange(1, shown + 1) * stride * 100 / fps)
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
-    durations[-1] += 1000  # a moment to see the end
+    durations[-1] += 1000  # shows the end for a second before the film repeats
     indexed = Indexed()
     images = map(indexed, islice(rest, stride - 1, None, stride))
     indexed(first).save(
@@ -164,7 +164,7 @@ def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, 
 
 
 class Indexed:
-    """Makes images of at most 256 colours from pictures; those of a picture that has no more are exact."""
+    """Makes images of at most 256 colours from pictures; exact if a picture has no more colours."""
 
     def __init__(self) -> None:
         self._places: np.ndarray[Any, Any] | None = None  # of colours in the palette
@@ -185,7 +185,7 @@ class Indexed:
         return image.quantize(palette=palette, dither=Image.Dither.NONE)
 
     def _exact(self, picture: Picture, colours: Picture) -> Any:
-        """An image of at most 256 colours, each kept as it is. (Pillow would choose colours again.)"""
+        """An image of exactly these colours, at most 256. (Pillow's `quantize` may change them.)"""
         from PIL import Image
 
         if self._places is None:

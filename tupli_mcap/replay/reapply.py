@@ -1,6 +1,6 @@
-"""Takes an episode again: resets the environment with the recorded seed and options, steps it with the actions.
+"""Runs an episode again: resets the environment with the recorded seed and options, and steps it with the actions.
 
-Yields what the environment returns; comparing and rendering are done elsewhere.
+It yields what the environment returns; other modules compare and render.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tupli_mcap.replay.starts import EpisodePlan, ResetCall
 
 
 class EnvironmentFailedError(TupliError):
-    """The environment raised: at `step` (-1: in reset)."""
+    """The environment raised `cause` at `step`; -1 is the reset."""
 
     def __init__(self, step: int, cause: BaseException) -> None:
         self.step = step
@@ -33,7 +33,7 @@ class EnvironmentFailedError(TupliError):
 class Moment(NamedTuple):
     """What the environment returned; reward and flags are None for a reset.
 
-    The state is the environment's own: it may change it at its next step.
+    The state is the environment's own object, which its next step may change.
     """
 
     state: Any
@@ -44,13 +44,13 @@ class Moment(NamedTuple):
 
 
 class Replayer:
-    """Takes the episodes of one sub-environment again, in the order in which it is asked to.
+    """Runs the episodes of one sub-environment again, in the order of the calls.
 
-    make: builds the environment. owned: close it when it is not needed any more; otherwise it is the caller's.
-    plain: numbers in actions are Python's, not NumPy's; a recording does not tell which ones the policy gave.
+    make: builds the environment. owned: whether this object closes it; otherwise the caller does. plain: pass numbers
+    in actions as Python's, not NumPy's, because a recording does not say which of them the policy gave.
 
-    One environment serves all episodes, since wrappers may carry state from one to the next, until an episode says
-    that it began in a new one.
+    All episodes run in one environment, since wrappers may carry state from one to the next, until an episode began in
+    a new environment when it was recorded.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Replayer:
 
     @property
     def env(self) -> gym.Env[Any, Any]:
-        """The environment; built when first asked for."""
+        """The environment; built at the first use."""
         if self._env is None:
             self._env = self._make()
             self._resets_itself = resets_itself(self._env)
@@ -80,7 +80,7 @@ class Replayer:
         return self._env
 
     def moments(self, plan: EpisodePlan, actions: Iterable[Any]) -> Iterator[Moment]:
-        """The reset's moment, then one for each action; it goes on after an end, as the recording may have.
+        """The moment of the reset, then one for each action. It continues after an end, as a recorded episode may.
 
         Raises:
             EnvironmentFailedError: the environment raised.
@@ -124,7 +124,7 @@ class Replayer:
         return moment
 
     def close(self) -> None:
-        """Closes the environment; another one is made for the next episode."""
+        """Closes the environment; the next episode builds a new one."""
         env, self._env = self._env, None
         self._last = None
         if env is not None and self._owned:
@@ -133,8 +133,8 @@ class Replayer:
 
 
 def recorded_actions(recording: Recording, columns: Any, *, plain: bool = False) -> Callable[[int], Any]:
-    """From a step's index to its action, of the type that the action space's own samples have, or with `plain` Python's
-    numbers in place of NumPy's."""
+    """A function from a step's index to its action, of the type of the action space's samples; with `plain`, NumPy
+    numbers become Python's."""
     get: Callable[[int], Any] = item_getter(recording.action_space, columns)
     return (lambda step: _plain(get(step))) if plain else get
 

@@ -1,4 +1,4 @@
-"""Films of pictures that were recorded: of a camera's frames, or of an image in the states. Nothing is executed."""
+"""Makes films of recorded pictures: a camera's frames, or an image in the states. Executes nothing."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from tupli_mcap.spaces.leaves import Leaf
 
 _KINDS = (".mp4", ".gif")
 _FPS = 30.0
-_BLOCK = 256  # states that are in memory together
+_BLOCK = 256  # most states in memory at a time
 
 
 def has_pictures(episode: Episode) -> bool:
-    """Whether frames of the episode were recorded, or its states have an image."""
+    """Whether the episode has recorded frames, or an image in its states."""
     return bool(len(episode.frames) or episode.recording.layout.images)
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film, which a notebook shows.
+    """A film; notebooks show it.
 
-    pictures: how many it has. kind: ".mp4" or ".gif". path: of the file, None where it is in memory only. data: the
-    file's bytes.
+    pictures: the number of pictures. kind: ".mp4" or ".gif". path: the file; None if it is in memory only. data: the
+    bytes of the file.
     """
 
     pictures: int
@@ -58,16 +58,16 @@ def film(
     fps: float | None = None,
     overwrite: bool = False,
 ) -> Film:
-    """Makes a film of recorded pictures of episodes, one episode after another.
+    """Make a film of the recorded pictures of episodes, one episode after another.
 
     Args:
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
-        camera: whose frames; or the path of an image in the states, such as `state['wrist']`. By default the camera
-            "render", or else the first one, or else the first image. Of a stack, the newest frame.
-        fps: pictures a second; by default what the recording says of its steps, or 30.
+        camera: a camera, or the path of an image in the states, such as `state['wrist']`. By default, the camera
+            "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
+        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30.
 
     Raises:
-        RecordingError: there is no such picture, or the target exists (and not `overwrite`), or cannot be written.
+        RecordingError: an episode has no such pictures, the target exists (without `overwrite`), or cannot be written.
         MissingExtraError: PyAV or Pillow is not installed.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -117,7 +117,7 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
     if camera is None and images:
         return len(episode), _of_states(episode, next(iter(images.values())))
     raise RecordingError(
-        f"{recording.name}: no pictures of episode {episode.number} were recorded; `tupli-mcap render` takes it again"
+        f"{recording.name}: episode {episode.number} was recorded without pictures; make them with `tupli-mcap render`"
     )
 
 

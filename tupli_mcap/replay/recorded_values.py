@@ -1,4 +1,4 @@
-"""Reads the values of episodes for comparing: many short episodes at once, a long one in parts."""
+"""Reads the recorded values of episodes: many short episodes at once, a long one in blocks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Block(NamedTuple):
 
 
 class RecordedValues:
-    """The values of one episode; iterating gives its blocks, as often as wanted."""
+    """The values of one episode. Iterating gives its blocks; it can be repeated."""
 
     def __init__(self, recording: Recording, position: int, columns: Columns | None, steps: int) -> None:
         self._recording = recording
@@ -47,7 +47,7 @@ class RecordedValues:
 
 
 def recorded_values(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
-    """The values of the episodes at `positions`, in that order; a few MiB of them are in memory at a time."""
+    """The values of the episodes at `positions`, in that order, with a few MiB in memory at a time."""
     limit = max(1, _BLOCK // step_bytes(recording.layout))
     lengths = recording.index["length"][np.asarray(positions, np.int64)].astype(np.int64)
     for some in whole_episodes(lengths, limit):

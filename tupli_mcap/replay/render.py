@@ -1,4 +1,4 @@
-"""`render`: makes frames for a recording that has none, by replaying its environment and comparing each step."""
+"""`render`: makes frames for a recording that has none, by running its episodes again and comparing each step."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from tupli_mcap.replay.starts import EpisodePlan
 from tupli_mcap.storage.sidecar import Notes
 
 _KINDS: Final = (".mcap", ".mp4", ".gif")
-_FPS: Final = 30.0  # where neither recording nor environment says how long a step takes
+_FPS: Final = 30.0  # if neither the recording nor the environment has the duration of a step
 
 
 class RenderedEpisode(NamedTuple):
-    """`frames` of an episode of `steps` steps; `whole`: it was replayed to its end, and agreed at every step."""
+    """The number of frames of an episode of `steps` steps; `whole`: it was run to its end, and agreed at every step."""
 
     episode: int
     steps: int
@@ -38,15 +38,15 @@ class RenderedEpisode(NamedTuple):
 
 
 class RenderReport(NamedTuple):
-    """What was rendered.
+    """The result of rendering.
 
-    path: the new file; None if there is no frame, and so no file.
-    episodes: those that were asked for and begun, in their order.
-    divergence: where the replay differed from the recording; nothing was rendered from there on. None if it did not.
-    skipped: episodes that cannot be replayed, whatever the environment does.
-    fps: frames a second of environment time, as a film shows them.
-    width, height: of the frames (pixels); 0 if there is none.
-    signature_left_out: the recording was signed, and the new file is another one.
+    path: the new file; None if nothing was rendered: then no file is written.
+    episodes: the chosen episodes that were begun, in their order.
+    divergence: the first difference from the recording, at which rendering stopped; None if there is none.
+    skipped: episodes that cannot be run again.
+    fps: frames a second of environment time.
+    width, height: size of the frames (pixels); 0 without frames.
+    signature_left_out: whether the recording has a signature that the new file lacks.
     """
 
     path: Path | None
@@ -61,12 +61,12 @@ class RenderReport(NamedTuple):
 
     @property
     def frames(self) -> int:
-        """All frames."""
+        """The number of all frames."""
         return sum(episode.frames for episode in self.episodes)
 
     @property
     def ok(self) -> bool:
-        """Whether all that was asked for was rendered."""
+        """Whether all chosen episodes were rendered."""
         return self.divergence is None and not self.skipped
 
 
@@ -83,30 +83,29 @@ def render(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RenderReport:
-    """Rebuilds the environment with render_mode="rgb_array", replays episodes, and writes what it renders.
+    """Rebuild the environment with render_mode="rgb_array", run episodes again, and write the frames that it renders.
 
-    States, rewards and flags are compared with the recording at every step, bit for bit. At the first difference
-    rendering ends; the frames before it are written. The episodes of another environment than the recorded one are
-    therefore never shown as the recorded ones.
+    Every step is compared with the recording: states, rewards and flags, bit for bit. Rendering stops at the first
+    difference, and the frames before it are written. So frames never show another episode than the recorded one.
 
     Args:
         recording: an open recording, or what `Recording` opens.
         target: a new file. ".mcap": the recording with the frames as `/camera/render` (those it already has of the
             rendered episodes are replaced; a signature is left out); ".mp4" or ".gif": the frames one after another.
         episodes: numbers, or episodes of `recording`; all by default.
-        every: a frame of every so many steps, and of the last one.
-        width: of the frames (pixels); as the environment renders them by default.
-        frame_format: of the frames in a ".mcap".
+        every: render every n-th step, and the last one.
+        width: width of the frames (pixels); by default, as the environment renders them.
+        frame_format: format of the frames in a ".mcap".
         trust: rebuild the environment even if that runs code from the file, and reset it with any options.
-        env: used instead of the environment in the file, made with render_mode="rgb_array"; it is not closed.
+        env: an environment, made with render_mode="rgb_array", to use instead of the one in the file; it is not closed.
         overwrite: whether an existing target is replaced.
         progress: called with the number of steps done.
 
     Raises:
-        UntrustedError: rebuilding the environment would run code that nobody here has trusted; nothing was run.
-        RecordingError: no environment in the recording, or one that cannot render; no such episode; the target
-            exists or cannot be written. It is written in one rename.
-        MissingExtraError: Pillow (`frames`), or PyAV for ".mp4" (`video`).
+        UntrustedError: rebuilding the environment would run code that this user does not trust; nothing was run.
+        RecordingError: the recording has no environment, or one that cannot render; there is no such episode; the
+            target exists or cannot be written. A target is written as a whole, or not at all.
+        MissingExtraError: Pillow (`frames`), or PyAV for ".mp4" (`video`), is not installed.
     """
     if not isinstance(recording, Recording):
         with Recording(recording) as opened:
@@ -134,13 +133,13 @@ def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
     if kind not in _KINDS:
         raise RecordingError(f"{goal}: expected a name that ends in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
     if goal.exists() and recording.path is not None and goal.samefile(recording.path):
-        raise RecordingError(f"{goal} is the recording, which is never written over; give another name")
+        raise RecordingError(f"{goal} is the recording itself, which is never overwritten; give another name")
     if goal.exists() and not overwrite:
         raise RecordingError(
             f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
         )
     if not goal.absolute().parent.is_dir():
-        raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it")
+        raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it first")
     check_movie(kind)
     return kind
 
@@ -149,7 +148,7 @@ def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> 
     deleted = _deleted(recording)
     known = [number for number in recording.index["episode"].tolist() if number not in deleted]
     if not known:
-        raise RecordingError(f"{recording.name} has no episode to render")
+        raise RecordingError(f"{recording.name} has no episodes to render")
     if episodes is None:
         return known
     numbers = [item.number if isinstance(item, Episode) else int(item) for item in episodes]
@@ -179,7 +178,7 @@ def _write(
 
 
 class _Renderer(Certifier):
-    """Renders the chosen episodes while they are replayed, up to the first difference."""
+    """Renders the chosen episodes while they run, up to the first difference."""
 
     def __init__(
         self,
@@ -199,7 +198,9 @@ class _Renderer(Certifier):
         self._fps: float | None = None
         self.size = (0, 0)
         self.divergence: Divergence | None = None
-        self._earlier: Divergence | None = None  # of an episode that is only replayed for those after it
+        self._earlier: Divergence | None = (
+            None  # of an episode that is run only because chosen ones continue it
+        )
 
     @property
     def fps(self) -> float:
@@ -208,7 +209,7 @@ class _Renderer(Certifier):
 
     @property
     def agreed(self) -> set[int]:
-        """Numbers of the chosen episodes that were replayed to their end."""
+        """The numbers of the chosen episodes that were run to their end and agree."""
         numbers = self._recording.index["episode"]
         found = {int(numbers[p]) for p, outcome in self._outcomes.items() if outcome is None}
         return found & self._chosen

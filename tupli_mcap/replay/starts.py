@@ -1,4 +1,4 @@
-"""Decides how each episode of a recording is started again, from the recording alone.
+"""Decides how each episode of a recording has to be started to run it again.
 
 A reset with a seed starts a chain. A reset without one goes on with the random stream of the episode before it, so
 it can be repeated only by repeating all episodes from the chain's start, in their order, on one environment.
@@ -16,7 +16,7 @@ How = Literal["seeded", "drawn", "captured", "follows", "continues", "unknown"]
 
 
 class ResetCall(NamedTuple):
-    """What `reset` is called with; `options` is exact JSON, empty for none."""
+    """The arguments of a call of `reset`; `options` is exact JSON, empty for none."""
 
     seed: int | None
     options: str
@@ -25,14 +25,14 @@ class ResetCall(NamedTuple):
 class EpisodePlan(NamedTuple):
     """How an episode starts.
 
-    position, number, env: in `Recording.episodes`, its own number, its sub-environment.
+    position, number, env: its position in `Recording.episodes`, its number, its sub-environment.
     how: "seeded" (a seed was given to reset), "drawn" (a new environment drew it), "captured" (no seed, but the
         environment in the file is as it was before that reset), "follows" (no seed, the episode before it is
         recorded), "continues" (no reset at all), "unknown" (no seed, and what came before it is not recorded).
-    after_end: the episode before it in its sub-environment came to an end, so that it was not cut short by this reset.
-    gap: what came before it is not all in the recording any more.
-    resets: those to be made, the last one is the episode's; none if it continues without one.
-    auto: it may have been started by `gymnasium.wrappers.Autoreset`, which resets in `step`.
+    after_end: whether the episode before it in its sub-environment ended by itself, and not by this reset.
+    gap: whether steps or episodes before it are missing in the recording.
+    resets: the resets to make, of which the last one starts the episode; empty if it continues without a reset.
+    auto: whether `gymnasium.wrappers.Autoreset` may have started it, which resets in `step`.
     """
 
     position: int
@@ -46,7 +46,7 @@ class EpisodePlan(NamedTuple):
 
     @property
     def starts_chain(self) -> bool:
-        """True if nothing that came before it needs to be repeated."""
+        """Whether it can be run without the episodes before it."""
         return self.how in ("seeded", "drawn")
 
     @property
@@ -76,7 +76,7 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
     # Episodes are numbered across sub-environments, so a missing number may be of any of them.
     gap = number != position if before is None else number - position != _shift(recording, before)
     after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
-    # without a final state (cut out of damage, or made by hand), it is not known where it left the environment
+    # without a final state (of a repaired or hand-made file), the state of the environment after it is not known
     gap = gap or (before is not None and recording.index[before]["final_row"] < 0)
     earlier = recording.resets_before(position)
     lost = [i for i, reset in enumerate(earlier) if reset.continued]
@@ -114,7 +114,7 @@ def up_to_last(plans: list[EpisodePlan], chosen: Collection[int]) -> list[Episod
 
 
 def needed_for(plans: list[EpisodePlan], chosen: Collection[int]) -> list[EpisodePlan]:
-    """The chosen episodes and those before them that they go on from."""
+    """The chosen episodes, and the episodes before them that they continue."""
     needed = []
     wanted = False
     for plan in reversed(plans):

@@ -1,14 +1,14 @@
-"""The server: what a storage holds, shared between people over HTTP.
+"""The server: shares benchmarks, artifacts and recordings between users over HTTP.
 
-settings, run         how it is set up; the processes
-app, routes/          the routes, and what they answer
-pages/                what browsers are shown besides
+settings, run         settings; starting the processes
+app, routes/          the application and its routes
+pages/                further pages for browsers
 traffic/              requests and connections: limited, counted, logged
 wire                  JSON of requests, answers and errors
-library, backup       all that is kept, and changes that touch database and files at once; copies of it
+library, backup       changes that touch database and files at once; backups of both
 people/               users, groups, roles, tokens, and what each may do and read
 stored/               benchmarks, artifacts, recordings and their episodes
-uploads, blobs        bytes on their way in, and where they lie
-database, tables      the database, and what is in it
+uploads, blobs        unfinished uploads; where finished files are kept
+database, tables      the database, and its tables
 migrations/           tables of earlier versions
 """

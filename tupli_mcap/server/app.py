@@ -36,8 +36,8 @@ from tupli_mcap.server.wire import Error, tell_errors, told
 
 __all__ = ["create_app"]
 
-# Recordings are compressed already. A page may repeat what a stranger's link says beside what only its reader may see;
-# the size of both compressed would tell the one from the other.
+# Recordings are compressed already. A page may hold text from a stranger's link beside private content: compressed, its
+# size would reveal whether the two are alike (the BREACH attack).
 _AS_THEY_ARE = ("application/octet-stream", "text/html", "font/*", "image/*", "video/*")
 _Answers = dict[int | str, dict[str, Any]]
 _TOLD: Final[dict[str, Any]] = {"model": Error}
@@ -52,7 +52,7 @@ _REFUSALS_OF_PYTUPLI: Final[_Answers] = _FAILURES | dict.fromkeys(
 
 
 def create_app(library: Library) -> FastAPI:
-    """The application that serves a library, looks after it, and closes it when it ends."""
+    """The application that serves a library, cleans it up now and then, and closes it at its end."""
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -86,7 +86,7 @@ def create_app(library: Library) -> FastAPI:
 
 
 async def _look_after(library: Library) -> None:
-    """Now and then, deletes what nobody needs any more."""
+    """Now and then, deletes what is not needed any more."""
     while True:
         await asyncio.sleep(library.settings.upkeep_seconds)
         try:

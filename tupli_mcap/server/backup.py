@@ -1,13 +1,13 @@
-"""Copies of all that a server keeps, made while it runs.
+"""Backs up and restores all data of a server, while it runs.
 
-A backup is a directory as a server with SQLite has it: `tupli-mcap serve` serves it as it is. It is made and restored
-by the same steps, whichever database and bucket there are on either side:
+A backup is a directory like that of a server with SQLite: `tupli-mcap serve` can serve it as it is. Backing up and
+restoring take the same steps, with any database and bucket on either side:
 
-1. The tables are copied as they are at one moment. What comes and goes meanwhile does not wait.
-2. The files that they name are copied, but those that are there already: a name never changes its content. Each is
-   compared with the SHA-256 that the tables have.
-3. A file may have been deleted since the first step. Then all is done again, which takes as long as there is news.
-4. The new tables take the place of the old ones, at once.
+1. Copy the tables as they are at one moment. The server goes on meanwhile.
+2. Copy the files that the tables name, except those that were copied before: the content of a name never changes.
+   Compare each with its SHA-256 in the tables.
+3. If a file was deleted since step 1, start again; only what is new is copied.
+4. Replace the old tables by the new ones, at once.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from tupli_mcap.storage.texts import unescape_text
 
 __all__ = ["Copied", "back_up", "restore"]
 
-_PASSING: Final = (FAILURE, PENDING, UPLOAD)  # of no use elsewhere
+_PASSING: Final = (FAILURE, PENDING, UPLOAD)  # tables about the running server, which a backup leaves out
 _ATTEMPTS: Final = 20
 _UNLIMITED: Final = 7 * 24 * 3600.0
 _ROWS: Final = 5000
 
 
 class Copied(NamedTuple):
-    """What a backup holds: how many users, recordings and artifacts, the bytes of those, and how many files were copied
-    now."""
+    """The numbers of users, recordings and artifacts in a backup, the bytes of its files, and how many files this call
+    has copied."""
 
     users: int
     recordings: int
@@ -52,17 +52,21 @@ class Copied(NamedTuple):
 
 
 def back_up(settings: Settings, target: Path) -> Copied:
-    """Copies what a server keeps into a directory, which is empty or holds an earlier backup; the server may run.
+    """Backs up a server into a directory, which is empty or holds an earlier backup. The server may run.
 
     Raises:
-        StorageError: there is no server's data, the directory holds something else, or something of it cannot be read.
-        FormatError: a file is not what the database says.
+        StorageError: there is no data of a server, the directory holds something else, or a file cannot be read.
+        FormatError: a file does not have the SHA-256 in the database.
     """
     place, kept = _place_of(settings), _place_of(Settings(target))
     if not settings.database and not place.sqlite.exists():
-        raise StorageError(f"{str(settings.directory)!r} holds no server's data; serve it first")
+        raise StorageError(
+            f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
+        )
     if target.exists() and any(target.iterdir()) and not kept.sqlite.exists():
-        raise StorageError(f"{str(target)!r} holds something else than a backup; choose another directory")
+        raise StorageError(
+            f"expected a backup or nothing in {str(target)!r}, found other files; choose another directory"
+        )
     kept.sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     new = kept.sqlite.with_name("server.sqlite.new")
     with contextlib.closing(Database(place.database, _UNLIMITED)) as source:
@@ -88,25 +92,27 @@ def back_up(settings: Settings, target: Path) -> Copied:
 
 
 def restore(backup: Path, settings: Settings) -> Copied:
-    """Puts a backup where a server is to keep things, where there is nothing. Broken off, it is begun again.
+    """Restores a backup into empty places. After an interruption, call it again.
 
     Raises:
-        StorageError: there is no backup, or something is there already.
+        StorageError: there is no backup, or the target holds data already.
         FormatError: a file of the backup is damaged.
     """
     kept, place = _place_of(Settings(backup)), _place_of(settings)
     if not kept.sqlite.exists():
-        raise StorageError(f"{str(backup)!r} holds no backup of a server")
+        raise StorageError(f"expected the backup of a server in {str(backup)!r}, found none; check the path")
     settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))
-        copy = folder / "server.sqlite"  # that of an earlier version is brought up to date
+        copy = (
+            folder / "server.sqlite"
+        )  # a copy, because opening it upgrades the tables of an earlier version
         shutil.copyfile(kept.sqlite, copy)
         source = stack.enter_context(contextlib.closing(Database(f"sqlite:///{copy}", _UNLIMITED)))
         target = stack.enter_context(contextlib.closing(Database(place.database, _UNLIMITED)))
         with target.reading() as connection:
             if connection.execute(select(USER.c.name)).first():
-                raise StorageError("there is a server's data already; restore into an empty place")
+                raise StorageError("the target holds a server's data already; restore into an empty place")
         copied = _copy_files(_contents(source), kept.blobs, place.blobs, folder)
         _copy_tables(source, target)
     return copied
@@ -133,7 +139,7 @@ def _copy_tables(source: Database, target: Database) -> None:
     tables = [each for each in (*CATALOG.sorted_tables, *METADATA.sorted_tables) if each not in _PASSING]
     with source.reading() as reading, target.writing() as writing:
         for table in reversed(tables):
-            writing.execute(table.delete())  # what a new database has by itself
+            writing.execute(table.delete())  # rows that every new database has
         for table in tables:
             names = [column.name for column in table.columns]
             rows = reading.execute(select(table), execution_options={"yield_per": _ROWS})
@@ -145,7 +151,7 @@ def _copy_tables(source: Database, target: Database) -> None:
 
 
 def _go_on_counting(connection: Connection, table: str) -> None:
-    """Rows that PostgreSQL numbers get numbers that none has."""
+    """Makes PostgreSQL number new rows after the copied ones."""
     for column in inspect(connection).get_columns(table):
         if "nextval" in str(column["default"] or ""):
             name = column["name"]
@@ -184,7 +190,7 @@ def _contents(database: Database) -> _Contents:
 
 
 def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path) -> Copied:
-    """Copies the files that are not there. LostError if one is gone."""
+    """Copies the files that the target lacks. LostError if the source lacks one."""
     total = copied = 0
     with progress(contents.bytes, "copying", in_bytes=True) as bar:
         for name, digest in contents.files:

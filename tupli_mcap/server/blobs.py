@@ -1,5 +1,5 @@
-"""Where the bytes of recordings and artifacts lie: below a directory, as a `FileStorage` would lay them out, or in a
-bucket of an object store under the same names."""
+"""Keeps the bytes of recordings and artifacts: in a directory, with the layout of a `FileStorage`, or in a bucket of an
+object store under the same names."""
 
 from __future__ import annotations
 
@@ -21,49 +21,49 @@ from tupli_mcap.storage.atomic import os_errors
 __all__ = ["PIECE", "Blobs", "BucketBlobs", "DirectoryBlobs", "LostError"]
 
 PIECE: Final = 4 << 20
-"""Bytes of a body that are fetched at once."""
+"""The size of the pieces in which a body is fetched (bytes)."""
 _QUICK: Final = timedelta(seconds=10)
-_AT_ONCE: Final = 4  # parts on their way, of one file
+_AT_ONCE: Final = 4  # parts of a file that are sent at the same time
 
 
 class LostError(StorageError):
-    """What the database names is not there."""
+    """A file that the database names is missing."""
 
 
 class Blobs(Protocol):
-    """Named bytes that never change, from any thread. A name is a path with forward slashes.
+    """Named bytes that never change. Thread-safe. A name is a path with forward slashes.
 
-    Every method raises UnavailableError where the object store does not answer, and StorageError where the file
-    system refuses.
+    Every method raises UnavailableError if the object store does not answer, and StorageError if the file system
+    refuses.
     """
 
     def write(self, name: str, data: bytes) -> None:
-        """Keeps bytes; the same name has the same bytes whenever it is written."""
+        """Keeps bytes. Writing a name again requires the same bytes."""
         ...
 
     def keep(self, name: str, path: Path) -> None:
-        """Keeps what a file holds, which is not written to any more. The file stays the caller's."""
+        """Keeps the content of a file that nobody writes to. The caller keeps the file itself."""
         ...
 
     def place(self, name: str) -> str:
-        """The path or URL that a recording of this name is opened at."""
+        """The path or URL with which a recording of this name is opened."""
         ...
 
     def size(self, name: str) -> int | None:
-        """How many bytes a name has; None if it is not there."""
+        """The size of a name (bytes); None if there is no such name."""
         ...
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
-        """The bytes `start:stop` of a name that is there."""
+        """The bytes `start:stop` of an existing name."""
         ...
 
     def delete(self, name: str) -> None:
-        """Forgets a name; nothing happens if it is not there."""
+        """Deletes a name; nothing happens if there is no such name."""
         ...
 
 
 class DirectoryBlobs:
-    """Files below a directory. In another one, on the same file system, they are made."""
+    """Files in a directory. They are written in another directory on the same file system, and then moved."""
 
     def __init__(self, root: Path, making: Path) -> None:
         self._root, self._making = root, making
@@ -111,18 +111,18 @@ class DirectoryBlobs:
 class BucketBlobs:
     """Objects of S3, Google Cloud Storage or Azure, below a URL such as `s3://bucket/prefix`.
 
-    Credentials are taken from the environment, as where recordings are read in place. A large file goes there in
-    several parts; parts that a killed process has left are deleted by a rule of the bucket.
+    Credentials come from the environment, as for reading remote recordings. A large file is sent in several parts; a
+    rule of the bucket has to delete parts that a killed process has left.
 
     Raises:
-        RecordingError: the URL is none.
+        RecordingError: the URL is not valid.
         MissingExtraError: obstore is not installed.
     """
 
     def __init__(self, url: str) -> None:
         self._url = url.rstrip("/")
         self._store, self._prefix = open_store(self._url)
-        # What is done while nobody else may write must not wait for long.
+        # Some calls happen within a write transaction, which blocks all others: they must not wait for long.
         self._quick, _ = open_store(self._url, within=_QUICK)
 
     def write(self, name: str, data: bytes) -> None:
@@ -164,7 +164,7 @@ class BucketBlobs:
             obstore.delete(self._quick, self._key(name))
 
     def signed(self, name: str, seconds: int) -> str:
-        """An address at which everybody may read a name for a while."""
+        """A URL with which everybody can read a name for so many seconds."""
         import obstore
 
         with self._asked(name):

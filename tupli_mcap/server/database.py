@@ -1,6 +1,6 @@
 """The database of a server: its tables and those of the catalog, in SQLite or PostgreSQL.
 
-On both, one transaction writes at a time, and each that reads sees one state of all tables from beginning to end.
+On both, one transaction writes at a time, and each reading transaction sees one state of all tables.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ __all__ = [
 ]
 
 _BUSY_MS = 30_000
-_STEPS = 20_000  # of SQLite, between two looks at the clock
-_CANCELED = "57014"  # what PostgreSQL says of a statement that took too long
-# A writer on PostgreSQL holds this lock, and its statements may take their time.
+_STEPS = 20_000  # instructions of SQLite between two looks at the clock
+_CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
+# A writer on PostgreSQL holds this lock; no time limit is set for its statements.
 _ALONE = "SELECT set_config('statement_timeout', '0', true), pg_advisory_xact_lock(1953854572)"
-_MOST_GROUPS_BYTES = 2000  # PostgreSQL indexes no longer texts
+_MOST_GROUPS_BYTES = 2000  # PostgreSQL cannot index longer texts
 
 
 class UnavailableError(StorageError):
-    """What the server keeps things in does not answer, or is busy; asked again later, it may."""
+    """The database or the bucket does not answer, or is busy. A later attempt may succeed."""
 
 
 class TooLongError(StorageError):
-    """A question takes longer than it may."""
+    """A query takes longer than allowed."""
 
 
 class Database:
-    """Transactions on the tables of a server, from any thread.
+    """Transactions on the tables of a server. Thread-safe.
 
-    seconds: how long a question may take, also one in a transaction that writes; more is a TooLongError.
+    seconds: how long a query may take, also in a writing transaction; TooLongError if it takes longer.
 
     Raises:
         StorageError: the database cannot be opened, or is of a later version.
@@ -86,7 +86,7 @@ class Database:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[Connection]:
-        """A transaction that no other one writes beside: committed at the end, rolled back on an exception."""
+        """The only writing transaction at its time: committed at the end, rolled back on an exception."""
         with _translated(), self._engine.connect() as connection:
             connection.execution_options(tupli_write=True)
             with connection.begin():
@@ -101,7 +101,7 @@ class Database:
 
 
 def audience(connection: Connection, groups: Sequence[str]) -> str:
-    """The text that stands for a list of groups in `published_in`; from then on, SQL finds it by each of them.
+    """The text for a list of groups in `published_in`. It is also registered under each group, for SQL to find it.
 
     Raises:
         StorageError: there are too many groups.
@@ -121,34 +121,34 @@ def audience(connection: Connection, groups: Sequence[str]) -> str:
 
 
 def audit(connection: Connection, user: str, action: str, target: str) -> None:
-    """Notes that a user has changed something."""
+    """Logs a change by a user in the audit table."""
     row = {"time": int(time.time()), "user": user, "action": action, "target": escape_text(target[:500])}
     connection.execute(insert(tables.AUDIT).values(**row))
 
 
 def pend(connection: Connection, name: str) -> None:
-    """Notes that a file is on its way in or out, until `settle`."""
+    """Notes that a file is being stored or deleted, until `settle`."""
     settle(connection, name)
     row = {"path": escape_text(name), "since": int(time.time())}
     connection.execute(insert(tables.PENDING).values(**row))
 
 
 def settle(connection: Connection, name: str) -> None:
-    """Notes that a file has come, or is gone."""
+    """Notes that a file has been stored, or deleted."""
     connection.execute(delete(tables.PENDING).where(tables.PENDING.c.path == escape_text(name)))
 
 
 def pending(connection: Connection, *, seconds: float) -> list[str]:
-    """The files that have been pending for so long."""
+    """The files that have been pending for at least so many seconds."""
     old = select(tables.PENDING.c.path).where(tables.PENDING.c.since <= time.time() - seconds)
     return [unescape_text(path) for path in connection.execute(old).scalars()]
 
 
 def demand_pending(connection: Connection, name: str) -> None:
-    """Raises UnavailableError if a file is not pending any more: it took too long to come, and was deleted."""
+    """Raises UnavailableError if a file is not pending any more: storing it took too long, and it was deleted."""
     there = select(tables.PENDING.c.path).where(tables.PENDING.c.path == escape_text(name))
     if connection.execute(there).first() is None:
-        raise UnavailableError(f"{name} took too long to come; send it again")
+        raise UnavailableError(f"{name} took too long to arrive; send it again")
 
 
 def _engine(url: str, seconds: float) -> Engine:
@@ -176,11 +176,11 @@ def _prepare_sqlite(engine: Engine) -> None:
         connection.isolation_level = None  # transactions are begun below
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
-        connection.execute("PRAGMA synchronous = FULL")  # what was acknowledged outlives a power loss
+        connection.execute("PRAGMA synchronous = FULL")  # acknowledged changes survive a power loss
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        # A transaction that writes takes the lock at once: one that has read before cannot wait for it.
+        # A writing transaction takes the lock at its start: SQLite lets no transaction that has read wait for it.
         write = connection.get_execution_options().get("tupli_write")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
@@ -195,7 +195,7 @@ def _prepare_postgresql(engine: Engine, seconds: float) -> None:
 
 @contextlib.contextmanager
 def _interrupted(connection: Connection, deadline: float) -> Iterator[None]:
-    """Ends statements of SQLite at a time; PostgreSQL does so by itself."""
+    """Interrupts statements of SQLite at the deadline. PostgreSQL has a time limit of its own."""
     driver: Any = connection.connection.dbapi_connection
     if not isinstance(driver, sqlite3.Connection):
         yield
@@ -218,7 +218,7 @@ def _translated() -> Iterator[None]:
     except (OperationalError, InterfaceError) as err:
         if getattr(err.orig, "sqlstate", "") == _CANCELED or str(err.orig) == "interrupted":
             raise TooLongError(
-                "this takes too long; narrow the filter, or declare the keys in it (`declare_key`)"
+                "the query takes too long; narrow the filter, or declare its keys with `declare_key`"
             ) from err
         raise UnavailableError(f"the server's database cannot be used: {err.orig}") from err
     except DBAPIError as err:

@@ -1,4 +1,4 @@
-"""`Library`: all that a server keeps, and the changes that touch its database and its files at once."""
+"""`Library`: the data of a server, and the changes that touch its database and its files at once."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
 
 
 class Library:
-    """What a server keeps. Usable from any thread.
+    """The data of a server: database and files. Thread-safe.
 
     Raises:
         StorageError: the directory or the database cannot be used.
@@ -89,7 +89,7 @@ class Library:
         self.look_after()
 
     def first_password(self) -> str | None:
-        """Makes the user `admin` where there is none; returns the password if nobody has chosen it."""
+        """Creates the user `admin` if there is none; returns its password if that is a random one."""
         with self.database.writing() as connection:
             if connection.execute(select(USER.c.name)).first():
                 return None
@@ -100,9 +100,9 @@ class Library:
         return None if chosen else password
 
     def adopt(self) -> int:
-        """Takes in what a `FileStorage` has in the directory, for the admin; returns how many recordings were new.
+        """Catalogs a `FileStorage` in the directory as the admin's; returns the number of new recordings.
 
-        Files stay where they are. What changes there while the server runs is noticed when it starts again.
+        Files stay where they are. Changes there while the server runs are noticed at its next start.
         """
         with self.database.reading() as connection:
             coming = set(pending(connection, seconds=0))
@@ -131,7 +131,7 @@ class Library:
         return sum(self._adopt(admin, name) for name in new)
 
     def _adopt(self, admin: Caller, name: str) -> bool:
-        """Takes in a recording of the directory; says whether it could. One that is unfinished is left."""
+        """Catalogs a recording of the directory; returns whether it could. Unfinished ones are skipped."""
         path = self.settings.directory / name
         try:
             with Recording(path) as recording, path.open("rb") as file:
@@ -153,7 +153,7 @@ class Library:
             SignInError: the name or the password is wrong.
             TooManyError: it was wrong too often.
         """
-        # Failures of a user from an address: somebody elsewhere must not keep the user out.
+        # Failures are counted by user and address: failures at another address must not lock the user out.
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
         with self.database.reading() as connection:
             wait = throttle.seconds_to_wait(connection, most)
@@ -167,12 +167,12 @@ class Library:
         raise SignInError("Incorrect username or password")
 
     def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
-        """A new upload, or the one of the same bytes that the caller has begun; or the name of the recording, if they
-        have stored it already.
+        """A new upload, or the caller's unfinished upload of the same bytes; the name of the recording if the caller
+        has stored it already.
 
         Raises:
-            FullError: they may not keep so much.
-            TooManyUploadsError: they have begun too many.
+            FullError: the caller's quota is used up.
+            TooManyUploadsError: the caller has too many unfinished uploads.
         """
         with self.database.writing() as connection:
             known = arrivals.stored_already(connection, caller, digest)
@@ -180,14 +180,14 @@ class Library:
                 return known
             most = self.settings.max_uploads
             found = self.uploads.begin(connection, caller, length, digest, sent_before=sent_before, most=most)
-            quotas.demand_room(connection, self.settings, caller, 0)  # the upload is counted by now
+            quotas.demand_room(connection, self.settings, caller, 0)  # the upload is counted already
         return found
 
     def take_in(self, caller: Caller, incoming: Incoming) -> str:
-        """Stores a recording that was uploaded as a whole; returns its name. Where the server fails, the upload stays.
+        """Stores a recording whose upload is complete; returns its name. If the server fails, the upload stays.
 
         Raises:
-            ChecksumError: its bytes are not those that were announced.
+            ChecksumError: its bytes do not have the announced SHA-256.
             StorageError: it is no recording, or has no episodes.
         """
         upload = incoming.upload
@@ -240,7 +240,7 @@ class Library:
             return self._keep(caller, path, digest)
 
     def _keep(self, caller: Caller, path: Path, digest: str, sent_before: int = 0) -> str:
-        """Puts a recording where it stays, and lists its episodes; returns its name."""
+        """Moves a recording to the blobs, and catalogs its episodes; returns its name."""
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
@@ -275,8 +275,8 @@ class Library:
 
     @contextlib.contextmanager
     def deleting(self, caller: Caller, action: str, uri: str) -> Iterator[None]:
-        """Deletes for PyTupli's client: what is gone is no error for who deleted it, nor for an admin; all others are
-        denied what is not there, as they are what they may not read."""
+        """For PyTupli's client: deleting a missing item is no error for an admin, nor for the user who deleted it. All
+        others get DeniedError, both for missing items and for those that they may not read."""
         try:
             yield
         except NotFoundError:
@@ -289,14 +289,14 @@ class Library:
                 raise DeniedError("You do not have sufficient permissions for this operation.") from None
 
     def delete_episodes(self, caller: Caller, filter: BaseFilter) -> int:
-        """Deletes episodes, and files of which none is left; returns how many episodes."""
+        """Deletes episodes, and files without any episode left; returns the number of episodes."""
         with self.database.writing() as connection:
             count, empty = episodes.delete_episodes(connection, caller, filter)
         self.sweep(empty)
         return count
 
     def delete_benchmark(self, caller: Caller, uri: str, *, with_episodes: bool) -> int:
-        """Deletes a benchmark, and the caller's episodes of it too if that is asked for; returns how many."""
+        """Deletes a benchmark, and `with_episodes` also the caller's episodes of it; returns how many episodes."""
         own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=caller.name)
         with self.database.writing() as connection:
             self.items.delete_benchmark(connection, caller, uri)
@@ -320,7 +320,7 @@ class Library:
                 with self.database.writing() as connection:
                     if (
                         self.blobs.size(key) is not None
-                    ):  # else somebody has deleted the same artifact of theirs
+                    ):  # else another user's deletion of the same bytes has removed them meanwhile
                         settle(connection, key)
                         return self.items.store_artifact(connection, caller, data, metadata)
         except BaseException:
@@ -328,14 +328,14 @@ class Library:
             raise
 
     def delete_artifact(self, caller: Caller, uri: str, *, force: bool) -> None:
-        """Deletes an artifact, and its bytes if nobody else has it."""
+        """Deletes an artifact, and its bytes if no other user has the same."""
         with self.database.writing() as connection:
             self.items.delete_artifact(connection, caller, uri, force=force)
         self.sweep([artifact_key(uri)])
 
     def sweep(self, names: Iterable[str]) -> None:
-        """Deletes files that are pending and that nothing in the database names, while nobody adds any. What cannot be
-        deleted now stays pending."""
+        """Deletes pending files that the database does not name, in a write transaction, so that nobody adds them
+        meanwhile. A file that cannot be deleted stays pending."""
         for name in names:
             with contextlib.suppress(UnavailableError), self.database.writing() as connection:
                 uri = name.removeprefix("artifacts/")
@@ -346,10 +346,10 @@ class Library:
                 settle(connection, name)
 
     def delete_user(self, caller: Caller, name: str) -> None:
-        """Deletes a user, and what nobody can see then of what they made; nothing happens if there is none.
+        """Deletes a user, and what only they could see; nothing happens if there is no such user.
 
         Raises:
-            DeniedError: it is somebody else, and the caller has not the right to, or has fewer rights than they.
+            DeniedError: it is another user, and the caller lacks the right to delete users, or a right of theirs.
         """
         caller.demand(Right.USER_DELETE, name)
         with self.database.writing() as connection:
@@ -363,8 +363,8 @@ class Library:
         return [*self.items.forget_unseen(connection), *episodes.forget_unseen(connection)]
 
     def look_after(self) -> None:
-        """Deletes what nobody needs any more: files that nothing names, uploads that nobody has gone on with, what only
-        users saw who are deleted, and what a killed process was making. To be called now and then."""
+        """Cleans up: deletes files that the database does not name, abandoned uploads, what only deleted users could
+        see, and leftovers of killed processes. To be called now and then."""
         with self.database.writing() as connection:
             self.uploads.forget_old(connection)
             unseen = self._forget_unseen(connection)
@@ -373,7 +373,7 @@ class Library:
             old = pending(connection, seconds=self.settings.pending_seconds)
         self.sweep(old)
         for folder in self.settings.making.iterdir():
-            with contextlib.suppress(OSError):  # another process has done it
+            with contextlib.suppress(OSError):  # another process has deleted it
                 if folder.stat().st_mtime <= time.time() - self.settings.pending_seconds:
                     shutil.rmtree(folder)
 

@@ -1,4 +1,4 @@
-"""The processes of a server."""
+"""Starts and stops the processes of a server."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from tupli_mcap.server.traffic.patience import PatientProtocol
 __all__ = ["Listening", "configured", "run"]
 
 _KEEP_ALIVE_SECONDS = 30
-_STOP_SECONDS = 600  # for what has begun when the server is told to stop
+_STOP_SECONDS = 600  # how long running requests may take once the server has to stop
 _START_SECONDS = 60
-_MOST_CONNECTIONS = 1000  # of a process
+_MOST_CONNECTIONS = 1000  # most connections of a process
 
 
 @dataclass(frozen=True)
 class Listening:
-    """Where a server listens. workers: how many processes answer. certificate, key: files of TLS. proxies: the
-    addresses of those that are believed when they say for whom they ask."""
+    """Where a server listens. workers: the number of processes. certificate, key: files for TLS. proxies: addresses of
+    proxies whose X-Forwarded headers are believed."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -43,9 +43,9 @@ class Listening:
 
 
 def run(settings: Settings, listening: Listening, tell: Callable[[str, str | None], None]) -> None:
-    """Serves until the process is told to stop; requests that have begun are finished.
+    """Serves until the process is told to stop; running requests are finished.
 
-    tell: called with the address and the admin's new password (None if there is no new one), once it is known.
+    tell: called with the address, and the admin's password if it is new and random (else None).
 
     Raises:
         StorageError: the directory, its database or the address cannot be used.
@@ -74,7 +74,7 @@ def run(settings: Settings, listening: Listening, tell: Callable[[str, str | Non
 def configured(
     application: Callable[[], FastAPI], settings: Settings, listening: Listening
 ) -> uvicorn.Config:
-    """How uvicorn serves what `application` makes."""
+    """The configuration with which uvicorn serves the application that `application` makes."""
     patient = functools.partial(
         PatientProtocol, head_seconds=settings.head_seconds, stall_seconds=settings.stall_seconds
     )

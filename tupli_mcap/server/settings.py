@@ -1,4 +1,4 @@
-"""How a server is set up."""
+"""The settings of a server."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ __all__ = ["Settings"]
 
 @dataclass(frozen=True)
 class Settings:
-    """directory: what the server keeps, made if it is missing. database: a SQLAlchemy URL, by default SQLite in the
-    directory. blobs: the URL of a bucket for recordings and artifacts, by default the directory. presigned: whether
-    clients can reach the bucket, and are sent there. accel: where nginx, before this server, has the directory.
+    """The settings of a server; times in seconds, sizes in bytes.
 
-    open_signup: whether everybody may make a user. guests: whether what is published in `global` is shown without a
-    sign-in. access_seconds, refresh_seconds, ticket_seconds: how long tokens are valid, and addresses of recordings.
-    max_upload, max_body, max_message: bytes of a recording, of a benchmark or an artifact, and of any other request.
-    max_page: items of a page. max_uploads: unfinished ones of a user. quota: bytes that each user may keep, if that is
-    limited. query_seconds: how long a question may take. head_seconds, stall_seconds: how long a client may keep the
-    server waiting, see `patience`. pending_seconds: by then, a file has come or gone, or who moved it was killed.
-    upkeep_seconds: between two times of looking after what nobody needs. open_metrics: whether everybody may see them.
+    directory: the directory of all data; created if missing. database: a SQLAlchemy URL; by default, SQLite in the
+    directory. blobs: the URL of a bucket for recordings and artifacts; by default, the directory. presigned: whether
+    clients can reach the bucket, and are redirected there. accel: the internal location of nginx for the directory.
+
+    open_signup: whether everybody may create a user. guests: whether what is published in `global` is shown without a
+    sign-in. access_seconds, refresh_seconds, ticket_seconds: how long tokens and tickets are valid. max_upload,
+    max_body, max_message: most bytes of a recording, of a benchmark or an artifact, and of any other request. max_page:
+    most items of a page. max_uploads: most unfinished uploads of a user. quota: most bytes that each user may store;
+    None without a limit. query_seconds: how long a query may take. head_seconds, stall_seconds: how long a client may
+    keep the server waiting, see `patience`. pending_seconds: after this time, a pending file counts as left by a killed
+    process. upkeep_seconds: time between two clean-ups. open_metrics: whether metrics are shown without a sign-in.
     """
 
     directory: Path
@@ -48,10 +50,10 @@ class Settings:
 
     @property
     def own(self) -> Path:
-        """The directory of what is the server's alone: its database, its secret, uploads that are not finished."""
+        """The directory of the server's own files: its database, its secret, unfinished uploads."""
         return self.directory / "server"
 
     @property
     def making(self) -> Path:
-        """The directory of what is being made; what a killed process has left there is deleted some time."""
+        """The directory of files in the making; leftovers of killed processes are deleted later."""
         return self.own / "making"

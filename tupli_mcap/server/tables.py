@@ -28,7 +28,7 @@ __all__ = [
 
 METADATA: Final = MetaData()
 
-# Users and groups have one name space: a group that is named like a user would see what is that user's alone.
+# Users and groups share one name space: a group with the name of a user would see what is private to that user.
 PRINCIPAL: Final = Table(
     "principal",
     METADATA,
@@ -101,7 +101,7 @@ ITEM: Final = Table(
     Column("id", TEXT, nullable=False),
     Column("created_by", TEXT, nullable=False),
     Column("published_in", TEXT, nullable=False),  # JSON: a list of groups
-    Column("header", TEXT, nullable=False),  # JSON: what is listed of it, but who made it and who sees it
+    Column("header", TEXT, nullable=False),  # JSON: its header, without owner and groups
     Column("content", TEXT),  # a benchmark's environment as text
     Column("needs", TEXT, nullable=False),  # JSON: ids of the artifacts that a benchmark needs
     Column("size", NUMBER, nullable=False, server_default="0"),  # bytes of its content
@@ -109,7 +109,7 @@ ITEM: Final = Table(
     Index("ix_item_id", "id"),
 )
 
-# Which groups a list of groups names: how SQL looks into `published_in`.
+# The groups in each list of groups, with which SQL searches `published_in`.
 AUDIENCE: Final = Table(
     "audience",
     METADATA,
@@ -124,14 +124,14 @@ FILE: Final = Table(
     Column("path", TEXT, primary_key=True),
     Column("created_by", TEXT, nullable=False, index=True),
     Column("uuid", TEXT, nullable=False, index=True),
-    Column("place", TEXT, nullable=False),  # its name among the blobs: another one for each version
+    Column("place", TEXT, nullable=False),  # its name among the blobs; a new one for each version
     Column("digest", TEXT, nullable=False),  # SHA-256 in hex digits
     Column("size", NUMBER, nullable=False),
     Column("episodes", NUMBER, nullable=False),  # in the file, deleted ones too
     Column("deleted", TEXT, nullable=False),  # JSON: numbers of episodes
 )
 
-# Files on their way in or out: what nothing names by the next start is deleted then, and never taken for a new one.
+# Files that are being stored or deleted. A clean-up deletes those that the other tables do not name.
 PENDING: Final = Table(
     "pending",
     METADATA,
@@ -139,7 +139,7 @@ PENDING: Final = Table(
     Column("since", NUMBER, nullable=False),
 )
 
-# Recordings of which some bytes may have come, in a file that is named by the id.
+# Unfinished uploads of recordings; the received bytes are in a file named by the id.
 UPLOAD: Final = Table(
     "upload",
     METADATA,
@@ -151,7 +151,7 @@ UPLOAD: Final = Table(
     Column("since", NUMBER, nullable=False),
 )
 
-# Sign-ins of the last minute that failed.
+# Failed sign-ins of the last minute.
 FAILURE: Final = Table(
     "failure",
     METADATA,

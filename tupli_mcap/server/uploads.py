@@ -1,7 +1,7 @@
-"""Uploads of recordings that may be broken off and gone on with: rows of a table, each with a file that grows.
+"""Resumable uploads of recordings: rows of a table, each with a growing file.
 
-Every function that takes a connection works in a transaction of its caller's. Any process of the server may go on with
-an upload; who does holds a lock on its file.
+Every function that takes a connection works in the transaction of its caller. Any process of the server may continue an
+upload; it holds a lock on the file meanwhile.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ _KEPT_SECONDS: Final = 7 * 24 * 3600
 
 
 class BusyError(StorageError):
-    """Another request writes to the upload."""
+    """Another request is writing to the upload."""
 
 
 class GoneError(StorageError):
-    """There is no such upload: it was finished, given up, or is somebody else's."""
+    """There is no such upload: it was finished or given up, or is another user's."""
 
 
 class ChecksumError(StorageError):
-    """The bytes that have come are not those that were announced."""
+    """The received bytes do not have the announced SHA-256."""
 
 
 class TooLargeError(StorageError):
-    """What is sent is larger than it may be."""
+    """The sent content is too large."""
 
 
 class TooManyUploadsError(StorageError):
-    """A user has begun too many uploads."""
+    """A user has too many unfinished uploads."""
 
 
 class Upload(NamedTuple):
-    """id: what it goes by. path: the file that holds what has come. length, digest: its bytes and their SHA-256 in the
-    end. sent_before: episodes with lower numbers were sent before, in parts."""
+    """path: the file of the received bytes. length, digest: the final size (bytes) and SHA-256. sent_before: episodes
+    with lower numbers were sent before, in parts."""
 
     id: str
     path: Path
@@ -69,7 +69,7 @@ class Upload(NamedTuple):
 
     @property
     def offset(self) -> int:
-        """How many bytes have come."""
+        """The number of received bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
 
@@ -93,10 +93,10 @@ class Incoming:
             self._hash.update(data)
 
     def verify(self) -> None:
-        """Checks the bytes of an upload that is whole, and makes them durable.
+        """Checks the bytes of a complete upload, and writes them to the disk.
 
         Raises:
-            ChecksumError: they are not those that were announced.
+            ChecksumError: the bytes do not have the announced SHA-256.
         """
         with os_errors("cannot write", self.upload.path):
             os.fsync(self._file.fileno())
@@ -121,10 +121,10 @@ class Uploads:
     def begin(
         self, connection: Connection, caller: Caller, length: int, digest: str, *, sent_before: int, most: int
     ) -> Upload:
-        """A new upload, or the one of the same bytes that this user has begun.
+        """A new upload, or the user's unfinished upload of the same bytes.
 
         Raises:
-            TooManyUploadsError: they have begun `most` others.
+            TooManyUploadsError: the user has `most` unfinished uploads.
         """
         own = select(UPLOAD).where(UPLOAD.c.user == caller.name)
         same = own.where(UPLOAD.c.digest == digest, UPLOAD.c.length == length)
@@ -167,7 +167,7 @@ class Uploads:
             upload.path.unlink()
 
     def forget_old(self, connection: Connection) -> None:
-        """Deletes the uploads that nobody has gone on with for a week, and files that are of none."""
+        """Deletes uploads that were not continued for a week, and files without an upload."""
         old = time.time() - _KEPT_SECONDS
         known = {row.id: self._upload(row) for row in connection.execute(select(UPLOAD))}
         for row in connection.execute(select(UPLOAD.c.id).where(UPLOAD.c.since < old)).all():

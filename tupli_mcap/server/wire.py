@@ -1,4 +1,4 @@
-"""What goes over the wire: requests as models, answers as JSON, and errors as the status that clients expect."""
+"""The JSON of requests, answers and errors, and the status of each error."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLa
 __all__ = ["AskedFilter", "Error", "Found", "Listing", "answer", "listed", "paged", "tell_errors", "told"]
 
 _MOST_VALUES: Final = 20_000
-_MOST_OFFSET: Final = 1 << 53  # beyond it, programs disagree on what a number of JSON is
+_MOST_OFFSET: Final = 1 << 53  # larger numbers in JSON are not exact in all programs
 
 _STATUS: Final[dict[type[TupliError], int]] = {
     SignInError: 401,
@@ -51,13 +51,13 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     ConflictError: 409,
     GoneError: 410,
     BusyError: 423,
-    ChecksumError: 460,  # as tus has it
+    ChecksumError: 460,  # defined by tus
     TooLargeError: 413,
     TooManyUploadsError: 429,
     UnavailableError: 503,
     TooLongError: 400,
     UnmergeableError: 400,
-    RecordingError: 503,  # a file that is kept cannot be opened
+    RecordingError: 503,  # a stored file cannot be opened
     FullError: 507,
     LostError: 500,
     FilterError: 400,
@@ -91,11 +91,11 @@ def _affordable(filter: BaseFilter) -> BaseFilter:
 
 
 AskedFilter = Annotated[BaseFilter, AfterValidator(_affordable)]
-"""A filter that somebody asks with."""
+"""The filter of a request."""
 
 
 class Listing(BaseModel):
-    """What to list: a filter, and which page of what it is true of. `cursor` is the `next` of the page before."""
+    """What to list: a filter, and which page of the matching items. `cursor` is the `next` of the page before."""
 
     filter: AskedFilter | None = None
     limit: int | None = Field(default=None, ge=0)
@@ -104,14 +104,14 @@ class Listing(BaseModel):
 
 
 class Found(BaseModel):
-    """A page of what was asked for; `next` is the cursor of the one after it, None on the last."""
+    """A page of items; `next` is the cursor of the next page, None on the last."""
 
     items: list[dict[str, Any]]
     next: str | None = None
 
 
 def answer(value: Any) -> Response:
-    """A JSON answer; models as what they hold. Numbers that JSON lacks are tagged, as in our files."""
+    """A JSON answer; models become objects. Numbers that JSON lacks (NaN, infinities) are tagged, as in our files."""
     return Response(jsonvalue.dumps(_as_json(value)), media_type="application/json")
 
 
@@ -121,7 +121,7 @@ def listed(items: Iterable[BaseModel], following: str | None = None) -> Response
 
 
 def paged(items: Sequence[BaseModel], told: Listing, most: int) -> Response:
-    """A page of items that are all known."""
+    """A page of a list that is complete in memory."""
     if told.cursor is not None and not re.fullmatch("[0-9]{1,18}", told.cursor):
         raise StorageError("expected the cursor of the page before; list from the beginning")
     start = told.offset + int(told.cursor or 0)
@@ -138,7 +138,7 @@ def _as_json(value: Any) -> Any:
 
 
 def told(err: TupliError) -> tuple[int, str]:
-    """The status of an error, and what is said of it; the log is told of failures of the server."""
+    """The status and the message of an error. Failures of the server are logged."""
     status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
     if status >= 500 and status != _STATUS[FullError]:
         LOG.error("refused", extra={"status": status}, exc_info=err)
@@ -146,11 +146,11 @@ def told(err: TupliError) -> tuple[int, str]:
 
 
 def tell_errors(app: FastAPI) -> None:
-    """Makes answers of the errors of this package, and of requests that are none."""
+    """Makes the application answer errors of this package, and invalid requests."""
 
     @app.exception_handler(RequestValidationError)
     async def _tell_defect(request: Request, err: RequestValidationError) -> JSONResponse:
-        if not request.url.path.startswith("/v1/"):  # as PyTupli's server answers
+        if not request.url.path.startswith("/v1/"):  # PyTupli's client expects this form
             return await request_validation_exception_handler(request, err)
         first = err.errors()[0]
         where = ".".join(str(part) for part in first["loc"][1:])

@@ -1,8 +1,8 @@
 """Shows recordings in the Rerun viewer: in a window, a browser, a notebook, or as a file.
 
 `plan` makes Rerun recordings of chosen episodes, `scene` chooses their panels (`panels`) by the spaces, `blueprints`
-places them, `blocks` reads the steps, `sending` sends columns, and `targets` is where all goes. `live` shows a rollout
-while it is recorded; `foxglove_layout` makes Foxglove plot a recording.
+arranges the panels, `blocks` reads the steps, `sending` sends columns, and `targets` writes them to a file or a viewer.
+`live` shows a rollout while it is recorded; `foxglove_layout` makes Foxglove plot a recording.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ def save(
     tell: Callable[[str], None] | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Path:
-    """Writes episodes and their blueprint into a `.rrd` file, which `rerun FILE` opens.
+    """Write episodes and their blueprint into a `.rrd` file, which `rerun FILE` opens.
 
-    Of a file with several Rerun recordings ("split", or recordings of different spaces) it opens one; `rerun - < FILE`
-    opens them all. Those of different spaces are of different applications in the viewer, which keeps a blueprint for
-    each; opened as `rerun FILE`, it says so.
+    A file holds several Rerun recordings if `form` is "split", or if the sources have different spaces. `rerun FILE`
+    opens only one of them, `rerun - < FILE` all. Recordings of different spaces are different applications in the
+    viewer, so that each has its own blueprint.
 
     Args:
-        sources: a recording, its path or URL, a storage's directory, or several of them.
-        episodes: "best", "worst", "first", "last", "all", "3,7-9", or numbers; by default all, or of more than ten the
-            last, the best and the worst (of each recording, or of more than three recordings, of all).
+        sources: a recording, its path or URL, a directory, a storage, or several of these.
+        episodes: "best", "worst", "first", "last", "all", "3,7-9", or numbers. By default, all; if there are more than
+            ten, the last, the best and the worst (of each recording; of more than three recordings, of all together).
         filter: only episodes that match it.
         form: "joined" on one timeline, "split" into a Rerun recording each, or "compare" in the same plots.
         force: replace a file that exists.
-        tell: given the command that opens the file.
-        note: given a sentence on which episodes are shown, where that is a choice of ours.
+        tell: called with the command that opens the file.
+        note: called with a sentence on which episodes are shown, if the default has left some out.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -69,10 +69,10 @@ def show(
     connect: str | None = None,
     note: Callable[[str], None] | None = None,
 ) -> int | None:
-    """Opens the native viewer on episodes, chosen as for `save`; it stays open. Returns its process id.
+    """Open the native viewer on episodes, chosen as for `save`. It stays open; returns its process id.
 
     Args:
-        connect: send to this viewer instead, `rerun+http://HOST:PORT/proxy`.
+        connect: send to this running viewer instead: `rerun+http://HOST:PORT/proxy`. Then returns None.
         note: as for `save`.
 
     Raises:
@@ -95,12 +95,12 @@ def display(
     width: int | None = None,
     height: int | None = None,
 ) -> Display:
-    """Episodes, chosen as for `save`, as the result of a notebook's cell.
+    """Show episodes, chosen as for `save`, as the result of a notebook's cell.
 
-    Without `rerun-notebook`, the cell shows what is known of them, and what to install.
+    Without `rerun-notebook`, the cell shows facts about the episodes, and what to install.
 
     Args:
-        width, height: of the viewer (pixels); by default as wide as the cell.
+        width, height: size of the viewer (pixels); by default, as wide as the cell.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -118,7 +118,7 @@ def serve(
     tell: Callable[[str], None] = print,
     note: Callable[[str], None] | None = None,
 ) -> None:
-    """Serves the web viewer and the episodes on 127.0.0.1 until Ctrl-C; `tell` is given the URL, `note` as for `save`.
+    """Serve the web viewer and the episodes on 127.0.0.1 until Ctrl-C. `tell` gets the URL; `note` as in `save`.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -141,9 +141,9 @@ def blueprint(
 
 
 def send(recording: Recording, stream: Any = None, episodes: str | Sequence[int] | None = None) -> Any:
-    """Sends episodes, joined on one timeline, and their blueprint into a `rerun.RecordingStream`.
+    """Send episodes, joined on one timeline, and their blueprint into a `rerun.RecordingStream`; returns the stream.
 
-    Without a stream, it makes one, which is returned either way: `stream.save(...)` before, or give it a sink.
+    Without a stream, a new one is made. Give it a sink, such as `stream.save(...)`, to see its content.
     """
     with _planned(recording, episodes, None, "joined") as plans:
         for plan in plans:
@@ -161,7 +161,7 @@ def _planned(
     form: Form,
     note: Callable[[str], None] | None = None,
 ) -> Iterator[Iterator[Plan]]:
-    """The Rerun recordings to show, while the files they are of are open."""
+    """The Rerun recordings to show; the source files are open within the block."""
     rerun_sdk()
     with chosen_from(sources, episodes, filter) as chosen:
         some, choice = extremes_of(chosen) if episodes is None else (chosen, "")

@@ -32,7 +32,7 @@ def send_about(
     """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`.
 
     Args:
-        chosen: episodes that are marked among the returns.
+        chosen: episodes whose bars are marked.
     """
     import rerun as rr
 
@@ -59,7 +59,7 @@ def send_about(
 
 
 def _marks(recordings: Sequence[Recording], chosen: Sequence[Chosen]) -> Any:
-    """The bars of chosen episodes, in front of those of all; wide enough to be seen among many."""
+    """Bars of the chosen episodes in front of the others, wide enough to be seen among many."""
     import rerun as rr
 
     sizes = [len(recording.index) for recording in recordings]
@@ -113,7 +113,7 @@ def card(recording: Recording) -> str:
 
 
 def run_title(recording: Recording) -> str:
-    """The name of the run, else the file's; without what cannot be printed, and not too long."""
+    """The name of the run, else of the file; shortened, and without unprintable characters."""
     name = recording.readable_runs[0].name or Path(recording.name).stem
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 

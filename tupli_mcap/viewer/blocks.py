@@ -1,4 +1,4 @@
-"""Episodes as blocks of rows: what is sent to Rerun at once, and where its rows lie on the timelines."""
+"""Reads episodes as blocks of rows that are sent to Rerun at once, with the positions of the rows on the timelines."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class Piece(NamedTuple):
 
 
 class Finals(NamedTuple):
-    """What comes after the last steps of episodes, a row each: its final state, where that is `known`.
+    """A row after the last step of each episode, for its final state.
 
-    `before` are the rows of the block that they come before; `states` those of the known ones, nested as the
-    observation space is.
+    known: whether it was recorded (bool). before: the rows of the block before which these rows come. states: the known
+    final states, nested as the observation space is.
     """
 
     before: Array
@@ -43,10 +43,10 @@ class Finals(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Some rows, of one recording: steps, or states.
+    """Rows of one recording: steps, or states.
 
-    `number` counts the rows from 0 within what is shown, `times` are wall clock (ns). `finals` are rows that are none
-    of the block's; None if there are none, as in a rollout that goes on.
+    `number` counts the shown rows from 0; `times` are wall clock (ns). `finals` are further rows, for final states;
+    None if no episode ends here.
     """
 
     recording: Recording
@@ -61,11 +61,11 @@ class Block(NamedTuple):
 
     @property
     def seams(self) -> list[int]:
-        """The rows with which episodes begin behind others."""
+        """The first rows of episodes that follow another one."""
         return [piece.begin for piece in self.pieces if not piece.step and self.number[piece.begin]]
 
     def with_finals(self) -> Block:
-        """The states only, with the known final ones behind the last steps of their episodes."""
+        """Only the states, with the known final states inserted after the last steps of their episodes."""
         if self.finals is None or not self.finals.known.any():
             return self
         finals = self.finals
@@ -91,7 +91,7 @@ class Block(NamedTuple):
 
 
 def _moved(pieces: Sequence[Piece], before: Array) -> list[Piece]:
-    """Pieces of which those that end before the rows `before` have one row more."""
+    """The pieces after one row was inserted before each of the rows `before`."""
     ends = np.array([piece.end for piece in pieces])
     shifts = np.searchsorted(before, ends, side="right").tolist()
     return [
@@ -101,7 +101,7 @@ def _moved(pieces: Sequence[Piece], before: Array) -> list[Piece]:
 
 
 def _inserted(column: Any, before: Array, values: Any) -> Any:
-    """A leaf's column with each of `values` before the row that `before` says."""
+    """A leaf's column with `values[i]` inserted before row `before[i]`."""
     if not isinstance(column, list):
         return np.insert(column, before, values, axis=0)
     found: list[Any] = []
@@ -113,15 +113,15 @@ def _inserted(column: Any, before: Array, values: Any) -> Any:
 
 
 def row_counts(recording: Recording, positions: Sequence[int]) -> Array:
-    """How many rows each of some episodes takes: its steps, and its final state."""
+    """The number of rows of each episode: its steps, and one for its final state."""
     lengths = recording.index["length"][np.asarray(positions, np.int64)].astype(np.int64)
     return lengths + (lengths > 0)
 
 
 def blocks_of(recording: Recording, positions: Sequence[int], first: int = 0) -> Iterator[Block]:
-    """The steps of some episodes, in their order, at most 65,536 rows and some 32 MiB at a time.
+    """The steps of episodes, in their order, at most 65,536 rows and about 32 MiB at a time.
 
-    Behind the last step of each, there is room for its final state: known or not, it takes a row.
+    After the last step of each episode, a row number is reserved for its final state, known or not.
 
     Args:
         first: the number of the first row.
@@ -156,7 +156,7 @@ def _finals(block: Steps, ends: Array, first: int) -> Finals | None:
         return None
     known = block.rows["final_row"] >= 0
     states = [block.finals[leaf.name] for leaf in block.layout.state] if known.any() else None
-    # they were seen when the last step returned; a moment later, that one's own state can be looked at, too
+    # Final states were seen when the last step returned; 1 ns later, so that the viewer can show that step's state too.
     times = block.columns.times[ends - 1] + 1
     nested = None if states is None else block.layout.nest_state(states)
     return Finals(ends, known, nested, first + ends + np.arange(len(ends)), times)

@@ -1,4 +1,4 @@
-"""Makes the blueprint of a scene: where its panels are in the window."""
+"""Makes the blueprint of a scene: the arrangement of its panels in the window."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from tupli_mcap.viewer.panels import Camera, Grid, HeatMap, Infos, Lanes, Panel,
 from tupli_mcap.viewer.scene import Scene
 
 _STACKED, _A_PAGE = 4, 12
-_WINDOW = 500  # rows that are shown of a rollout that goes on
-_SHARE = 3.0  # of a column's height, a panel like any other
-_LANES, _LANE, _MOST_LANES = 1.2, 0.8, 6.0  # of a panel of lanes: itself, each of its lanes, at most
+_WINDOW = 500  # rows that are shown of a running rollout
+_SHARE = 3.0  # the share of a usual panel in the height of its column
+_LANES, _LANE, _MOST_LANES = (
+    1.2,
+    0.8,
+    6.0,
+)  # the share of a panel of lanes: without lanes, for each lane, at most
 _ABOVE, _ALONE, _BESIDE = (
     8.0,
     12.0,
@@ -32,15 +36,15 @@ def blueprint_of(
     """The blueprint of a scene whose panels are below each of `roots`.
 
     Args:
-        listed: the list of recordings is open.
-        overview: the returns of all episodes stand above what is shown of a few.
+        listed: whether the list of recordings is open.
+        overview: whether the returns of all episodes are at the top.
     """
     import rerun.blueprint as rrb
 
     axis = _newest() if scene.grows else _time_axis(linked=scene.linked)
     pictures = [panel for panel in scene.beside if isinstance(panel, Picture | Camera)]
     beside = [panel for panel in scene.beside if not isinstance(panel, Picture | Camera)]
-    if not scene.states and not pictures:  # texts take their place
+    if not scene.states and not pictures:  # texts move to the place of states
         states, beside = beside, []
     else:
         states = scene.states
@@ -87,7 +91,7 @@ def _pictures(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> Any:
 
 
 def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) -> Any:
-    """Views below each other; many of them side by side, and on several pages. Heat maps and their lines come last."""
+    """Views below each other; many views in two columns, and on several pages. Heat maps and their lines come last."""
     import rerun.blueprint as rrb
 
     maps = [panel for panel in panels if isinstance(panel, HeatMap)]
@@ -132,7 +136,7 @@ def _height(panel: Panel, episodes: int) -> float:
 
 
 def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
-    """How much of a column's height some panels need; what was seen takes what there is."""
+    """The share of some panels in the height of their column; `main` ones, the states, may take more."""
     return min(
         12.0 if main else 8.0,
         max(6.0 if main else 0.0, sum(_height(panel, episodes) for panel in panels)),
@@ -140,7 +144,7 @@ def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
 
 
 def _time_axis(*, linked: bool) -> Any:
-    """The time axis of plots: moved together, or each showing all its rows."""
+    """The time axis of plots: if linked, plots move together; else each shows all its rows."""
     import rerun.blueprint as rrb
 
     if linked:
@@ -150,7 +154,7 @@ def _time_axis(*, linked: bool) -> Any:
 
 
 def _newest() -> Any:
-    """The time axis of plots that grow: the last rows before the cursor, which follows them."""
+    """The time axis of growing plots: the last rows before the cursor, which follows the newest row."""
     import rerun.blueprint as rrb
 
     window = rrb.TimeRange(

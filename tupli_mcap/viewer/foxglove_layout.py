@@ -1,7 +1,7 @@
-"""A layout for Foxglove: a JSON file that makes it plot the fields of a recording's `/step` messages.
+"""Makes a layout for Foxglove: a JSON file that makes it plot the fields of a recording's `/step` messages.
 
-Foxglove decodes the recording by itself; the layout says which panel shows which field. Wide leaves get no plot, and
-neither does float16, which a message holds as bits.
+Foxglove decodes the recording itself; the layout says which panel shows which field. Wide leaves get no plot, nor does
+float16, which messages hold as bits.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ def write_layout(
     """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts).
 
     Args:
-        sources: as `tupli_mcap.viewer.save` has them, of one recording.
+        sources: as for `tupli_mcap.viewer.save`, but one recording.
         force: replace a file that exists.
 
     Raises:
-        RecordingError: it is not one recording, the recording has no step, or the file exists, is the recording itself,
-            or cannot be written.
+        RecordingError: `sources` is not one recording; the recording has no steps; the target exists, is the recording
+            itself, or cannot be written.
         FormatError: the recording is damaged.
     """
     path = Path(target)
@@ -57,11 +57,13 @@ def write_layout(
     with chosen_from(sources, None, None) as chosen:
         if len(chosen) != 1:
             raise RecordingError(
-                f"expected one recording to lay out, found {len(chosen)}; give them one by one"
+                f"expected one recording to make a layout for, found {len(chosen)}; give them one by one"
             )
         recording = chosen[0].recording
         if recording.path is not None and path.exists() and path.samefile(recording.path):
-            raise RecordingError(f"{path} is the recording, which is never written over; give another name")
+            raise RecordingError(
+                f"{path} is the recording itself, which is never overwritten; give another name"
+            )
         layout = foxglove_layout(recording)
     text = json.dumps(layout, indent=2) + "\n"  # in ASCII: keys of a space may hold lone surrogates
     with replacing(path) as (_, temporary):
@@ -70,13 +72,14 @@ def write_layout(
 
 
 def foxglove_layout(recording: Recording) -> dict[str, Any]:
-    """States and actions on the left, pictures, rewards and ends on the right; of the first sub-environment.
+    """A layout with states and actions on the left, pictures, rewards and ends on the right. Of a vector environment,
+    it shows the first sub-environment.
 
     Raises:
-        RecordingError: the recording has no step.
+        RecordingError: the recording has no steps.
     """
     if not recording.num_steps:
-        raise RecordingError(f"{recording.name} has no step, so there is nothing to plot")
+        raise RecordingError(f"{recording.name} has no steps to plot")
     topics = Topics.of(0 if recording.is_vector else None)
     layout = recording.layout
     panels: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""Plans the Rerun recordings of chosen episodes: one on a long timeline, one each, or all of them overlaid."""
+"""Plans the Rerun recordings of chosen episodes: all on one timeline, one for each, or all overlaid."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from tupli_mcap.viewer.sending import Times
 Form = Literal["joined", "split", "compare"]
 _MOST_SPLIT = 200
 _MOST_COMPARED = 16
-_FEW = 10  # episodes, each of which is told of, and which can be seen at once
-_EACH = 3  # recordings at most, of each of which some episodes are chosen
+_FEW = 10  # up to so many episodes are all shown, and described one by one
+_EACH = 3  # up to so many recordings, episodes are chosen from each
 
 
 class Part(NamedTuple):
@@ -76,7 +76,7 @@ class Plan(NamedTuple):
 
     @property
     def recordings(self) -> list[Recording]:
-        """The recordings that its episodes are of."""
+        """The recordings of its episodes."""
         return list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
 
     @property
@@ -134,9 +134,9 @@ def name_of(recording: Recording) -> str:
 
 
 def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
-    """The last, the best and the worst of many episodes, and what to say of it; all of them and "" if they are few.
+    """The last, the best and the worst of many episodes, and a sentence about this choice; all episodes and "" if few.
 
-    They are those of each recording, or of more recordings than three, of all.
+    They are chosen in each recording; if there are more than three recordings, among all.
     """
     total = sum(len(item.positions) for item in chosen)
     if total <= _FEW:
@@ -159,14 +159,14 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
     """The Rerun recordings that show the chosen episodes.
 
     Raises:
-        RecordingError: too many to be told apart.
+        RecordingError: there are too many episodes for this form.
     """
     total = sum(len(item.positions) for item in chosen)
     if form == "split":
         if total > _MOST_SPLIT:
             raise RecordingError(
-                f"expected at most {_MOST_SPLIT} episodes to show apart, found {total}; "
-                "choose some (--episodes), or join them"
+                f"expected at most {_MOST_SPLIT} episodes for --split, found {total}; "
+                "choose some with --episodes, or leave out --split"
             )
         yield from _split(chosen)
     elif form == "compare":
@@ -179,7 +179,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
         alike: dict[str, list[Chosen]] = {}
         for item in chosen:
             alike.setdefault(_spaces_of(item.recording), []).append(item)
-        for group in alike.values():  # other spaces need other plots
+        for group in alike.values():  # recordings of different spaces need different plots
             yield _joined(group)._replace(listed=len(alike) > 1)
 
 
@@ -214,7 +214,7 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
 
 
 def _told_in_turn(parts: Sequence[Part]) -> Iterator[str]:
-    """Where each episode begins on the timeline, and its facts."""
+    """For each episode, its begin on the timeline, and its facts."""
     yield "\n"
     for part in parts:
         recording, positions = part.chosen

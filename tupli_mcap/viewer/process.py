@@ -1,4 +1,4 @@
-"""The viewer's program, which comes with rerun-sdk, and its process: started on 127.0.0.1, waited for, ended."""
+"""Finds the viewer's program, which comes with rerun-sdk; starts its process on 127.0.0.1, waits for it, ends it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def viewer_program() -> Path:
     """The program `rerun`: that of the installed rerun-sdk, else one of the same version on the PATH.
 
     Raises:
-        ViewerError: there is none, or it is of another version than the data would be.
+        ViewerError: there is none, or it has another version than rerun-sdk.
     """
     sdk = rerun_sdk().__version__
     again = f"install it with pip install --force-reinstall rerun-sdk=={sdk}"
@@ -76,7 +76,7 @@ def has_display() -> bool:
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens on."""
+    """A free port of 127.0.0.1."""
     with socket.socket() as found:
         found.bind((LOCAL, 0))
         return int(found.getsockname()[1])
@@ -115,7 +115,7 @@ def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path
     """Returns once the viewer listens.
 
     Raises:
-        ViewerError: it ends before, or does not within half a minute; with its last words.
+        ViewerError: it ends before that, or takes longer than half a minute. The message quotes its last output.
     """
     until = time.monotonic() + _PATIENCE
     left = list(ports)
@@ -128,7 +128,7 @@ def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path
         words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last = next((line for line in reversed(words) if "rror" in line), words[-1] if words else "nothing")
         raise ViewerError(
-            f"the viewer did not start, its last words are {last.strip()[-200:]!r}; "
+            f"the viewer did not start; its last output is {last.strip()[-200:]!r}; "
             "write a file with --save, or look in a browser with --web"
         )
 
@@ -159,7 +159,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Ends the viewer and whatever it started."""
+    """Ends the viewer and all processes that it started."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)

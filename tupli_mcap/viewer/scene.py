@@ -32,14 +32,14 @@ from tupli_mcap.viewer.panels import (
     value_range,
 )
 
-MOST_LINES: Final = 12  # in one plot; more cannot be told apart
-_MOST_SMALL: Final = 48  # dimensions that get small plots besides their heat map
+MOST_LINES: Final = 12  # most lines in one plot; more cannot be told apart
+_MOST_SMALL: Final = 48  # up to so many dimensions get small plots besides their heat map
 _LINES_SMALL: Final = 6
 _MOST_LANES: Final = 12  # values of a Discrete leaf that get a colour each
 _MOST_LANE_ROWS: Final = 20_000  # the state timeline draws every change, however narrow
 _MOST_INFOS: Final = 12
 _MOST_LINKED: Final = 1000  # rows
-_TITLED: Final = 4  # dimensions that a title names
+_TITLED: Final = 4  # most dimensions that a title names
 _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
@@ -78,7 +78,7 @@ class Scene:
 
 
 class _Material(NamedTuple):
-    """What panels are chosen by: labels, a sample of columns, how many rows there are, and whether lines stay apart."""
+    """The facts by which panels are chosen: labels, a sample of columns, the number of rows, and `apart`."""
 
     labels: Labels
     sample: Sequence[Any]
@@ -94,7 +94,7 @@ def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = Fa
     """The panels for some episodes of a recording.
 
     Args:
-        apart: each dimension gets a view of its own, for several episodes to be in it.
+        apart: give each dimension its own view, in which several episodes are overlaid.
     """
     layout = recording.layout
     rows = int(recording.index["length"][np.asarray(positions, np.int64)].sum())
@@ -119,12 +119,12 @@ def live_scene(
     *,
     apart: bool,
 ) -> Scene:
-    """The panels for a rollout that goes on.
+    """The panels for a running rollout.
 
     Args:
         sample: columns of its first steps.
-        infos: keys of infos that are numbers.
-        apart: each dimension gets a view of its own, for several sub-environments to be in it.
+        infos: keys of numbers in infos.
+        apart: give each dimension its own view, in which several sub-environments are overlaid.
     """
     scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
     if camera is not None:
@@ -164,9 +164,9 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
 
 
 def _picture(leaf: Leaf, column: str, material: _Material) -> Picture | None:
-    """A picture of an image, or of an array that looks like one or like a stack of frames; None for anything else.
+    """The picture panel of an image, or of an array with the shape of an image or a stack of frames; None for others.
 
-    What is not uint8 is shown between its bounds, or between the values that there are where it has none.
+    Values that are not uint8 are scaled between the bounds of the space, or of the sample if the space has none.
     """
     entity, title = entity_of(leaf), title_of(leaf)
     if leaf.apart:
@@ -201,7 +201,7 @@ def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
 
 
 def _distinct(labels: Sequence[str]) -> list[str]:
-    """Makes labels differ, since the viewer takes equal ones for one state."""
+    """Makes equal labels differ: the viewer would take them for one state."""
     return [label if labels.index(label) == i else f"{label} ({i})" for i, label in enumerate(labels)]
 
 
@@ -221,7 +221,7 @@ def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Pan
 
 
 def _magnitudes(values: Array) -> list[float]:
-    """How large each column of `values` typically gets: the 95th percentile of its finite absolute values."""
+    """The typical size of each column of `values`: the 95th percentile of its finite absolute values."""
     found = []
     for column in values.T:
         finite = np.abs(column[np.isfinite(column)])
@@ -245,7 +245,7 @@ def _by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]
 
 
 def _some(names: Sequence[str]) -> str:
-    """The first names, as a title has room for."""
+    """The first names, as many as fit a title."""
     return ", ".join(names[:_TITLED]) + ("" if len(names) <= _TITLED else ", …")
 
 
@@ -270,7 +270,7 @@ def _spread(positions: Sequence[int]) -> list[int]:
 
 
 def _sample(recording: Recording, positions: Sequence[int]) -> list[Columns]:
-    """A few steps from the middle of a few episodes, without images: they tell how large the values get."""
+    """A few steps from the middle of a few episodes, without images, to measure how large values get."""
     at_once = _SAMPLE_BYTES // _SAMPLE_EPISODES // step_bytes(recording.layout, images=False)
     most = max(1, min(_SAMPLE_STEPS, at_once))
     sample = []

@@ -1,4 +1,4 @@
-"""rerun-sdk, imported where it is used, with one error where it is missing or too old."""
+"""Imports rerun-sdk where it is used, with one error if it is missing or too old."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OLDEST = (0, 39)
 
 
 class ViewerError(TupliError):
-    """A viewer cannot be started or reached, or there is nothing it could show."""
+    """A viewer cannot be started or reached, or has nothing to show."""
 
 
 def rerun_sdk() -> Any:

@@ -1,4 +1,4 @@
-"""Sends columns to Rerun: timelines, and one row of values for each of their times."""
+"""Sends columns to Rerun: times on timelines, and a row of values for each time."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from tupli_mcap.arrays import Array
 
 
 class Times:
-    """Where rows lie on the timelines.
+    """The positions of rows on the timelines.
 
     Args:
         step: number of the step.
         wall: wall clock (ns).
-        step_seconds: time that a step takes in the environment (s); None if it is not known, then there is no such
-            timeline.
-        seams: the rows with which episodes begin behind others.
+        step_seconds: duration of a step in the environment (s); None if unknown: then this timeline is left out.
+        seams: the first rows of episodes that follow another one.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class Times:
         return Times(self._step[rows], self._wall[rows], self._step_seconds)
 
     def moved(self, steps: int) -> Times:
-        """The same rows so many steps later, at the same wall clock."""
+        """The same rows `steps` later on the step timeline, at the same wall clock."""
         return Times(self._step + steps, self._wall, self._step_seconds)
 
     def inserted(self, before: Array, step: Array, wall: Array) -> Times:
@@ -59,12 +58,12 @@ class Times:
 
     @cached_property
     def broken(self) -> Times:
-        """With each of the seams twice."""
+        """The times with each of the seams twice."""
         return self.at(np.insert(np.arange(len(self._step)), self.seams, self.seams)) if self.seams else self
 
 
 def pooled(values: Array, most: int, axis: int = 0) -> tuple[Array, Array]:
-    """Means of neighbours along an axis, at most `most` of them, and the bounds of what each is the mean of."""
+    """Means of neighbours along an axis, at most `most` of them, and the bounds of the ranges that each one covers."""
     length = values.shape[axis]
     bounds = np.linspace(0, length, min(length, most) + 1).astype(int)
     if length <= most:
@@ -98,7 +97,7 @@ def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
     import pyarrow as pa
     import rerun as rr
 
-    # the SDK aborts the process if an array is of another order or not aligned
+    # the SDK aborts the process if an array is not contiguous or not aligned
     flat = np.require(values, np.float64, ("C", "ALIGNED")).reshape(-1)
     column = column_of(rr.Scalars.descriptor_scalars(), pa.array(flat), values.shape[1])
     stream.send_columns(entity, times.columns, [column])
@@ -120,7 +119,7 @@ def send_blobs(stream: Any, entity: str, times: Times, descriptor: Any, values: 
 
 
 def blob_array(data: Array, ends: Array) -> Any:
-    """Bytes cut into blobs. They must be declared as never null, or the viewer does not show them."""
+    """Cuts bytes into blobs. They must be declared as never null, or the viewer does not show them."""
     import pyarrow as pa
 
     blob = pa.list_(pa.field("item", pa.uint8(), nullable=False))

@@ -31,7 +31,7 @@ from tupli_mcap.viewer.process import (
 from tupli_mcap.viewer.sdk import ViewerError
 
 _ANSWER_SECONDS = 3.0
-_FLUSH_SECONDS = 600.0  # a viewer takes some millions of steps a second
+_FLUSH_SECONDS = 600.0  # seconds that a viewer may need to take all data
 
 
 def to_file(
@@ -41,15 +41,15 @@ def to_file(
     force: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Path:
-    """Writes a `.rrd` with its blueprint, in one rename. `tell` is given the command that opens it.
+    """Writes a `.rrd` with its blueprint, as a whole or not at all. `tell` is called with the command that opens it.
 
     Raises:
-        RecordingError: its name does not end in .rrd, it exists and `force` is False, or the system refuses.
+        RecordingError: its name does not end in .rrd, it exists and `force` is False, or it cannot be written.
     """
     goal = Path(target)
     if goal.suffix != ".rrd":
         raise RecordingError(
-            f"expected a name that ends in .rrd, by which the viewer knows such files, found {str(goal)!r}"
+            f"expected a name that ends in .rrd, by which the viewer recognises its files, found {str(goal)!r}"
         )
     check_new(goal, force=force)
     with replacing(goal) as (_, temporary):
@@ -59,7 +59,7 @@ def to_file(
         else:
             _write_all(several, temporary)
     if tell is not None:
-        # given a path, the viewer opens only one recording of the file
+        # with a path, the viewer opens only one of several recordings in a file
         tell(f"rerun {'- < ' if len(several) > 1 else ''}{shlex.quote(str(goal))}")
     return goal
 
@@ -71,7 +71,9 @@ def check_new(goal: Path, *, force: bool) -> None:
         RecordingError: it exists and `force` is False, or there is no directory for it.
     """
     if goal.exists() and not force:
-        raise RecordingError(f"{goal} exists already; choose another name, or replace it with --force")
+        raise RecordingError(
+            f"{goal} exists; choose another name, or replace it with --force (in Python: force=True)"
+        )
     if not goal.parent.is_dir():
         raise RecordingError(
             f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
@@ -147,11 +149,11 @@ def _viewer_errors(url: str) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError) as err:
-        raise ViewerError(f"the viewer at {url} took nothing: {err}") from err
+        raise ViewerError(f"the viewer at {url} did not take the data: {err}") from err
 
 
 def to_window(plans: Iterable[Plan]) -> int:
-    """Opens the native viewer, which stays when this process ends; returns its process id.
+    """Opens the native viewer, which stays open when this process ends; returns its process id.
 
     Raises:
         ViewerError: there is no display, or no viewer, or it does not start.
@@ -171,12 +173,12 @@ def to_window(plans: Iterable[Plan]) -> int:
         except BaseException:
             end(process)
             raise
-    process.returncode = 0  # it stays open; Popen is not to warn of it
+    process.returncode = 0  # keeps Popen from warning that the process still runs
     return process.pid
 
 
 def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
-    """Serves the web viewer and the data on 127.0.0.1, tells the URL, and goes on until Ctrl-C.
+    """Serves the web viewer and the data on 127.0.0.1 until Ctrl-C; `tell` is called with the URL.
 
     Raises:
         ViewerError: there is no viewer program, or it does not start, or ends.
@@ -193,7 +195,7 @@ def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
             data = quote(f"rerun+http://{LOCAL}:{ports[0]}/proxy", safe="")
             tell(f"http://{LOCAL}:{ports[1]}/?url={data}")
             process.wait()
-            raise ViewerError(f"the web viewer ended by itself, with exit code {process.returncode}")
+            raise ViewerError(f"the web viewer ended unexpectedly, with exit code {process.returncode}")
         except KeyboardInterrupt:
             return
         finally:

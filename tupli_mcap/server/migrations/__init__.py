@@ -1,7 +1,7 @@
-"""Changes of the tables of a server from version to version, in Alembic's revisions.
+"""Migrations of a server's tables from version to version, as revisions of Alembic.
 
-env         what Alembic runs
-versions/   the revisions; the last one makes what `server.tables` and `storage.catalog.tables` say
+env         the script that Alembic runs
+versions/   the revisions; the last one makes the tables of `server.tables` and `storage.catalog.tables`
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _FIRST = "1"  # whose tables were made without Alembic, too
 
 
 def upgrade(connection: Connection, revision: str = "head") -> None:
-    """Brings the tables up to date, or makes them, in the transaction of the caller, who keeps others out.
+    """Upgrades or creates the tables, in the caller's transaction, which has to lock out other writers.
 
     Raises:
         StorageError: they are of a later version than this one.

@@ -1,12 +1,12 @@
-"""The page of a server: what `tupli_mcap.page` shows, for who is signed in, and the pages about people.
+"""The pages of a server: those of `tupli_mcap.page` for signed-in users, and pages about people.
 
-shelf      what a caller may read, as a shelf of the page
-session    who asks: the cookie of a sign-in, and forms that nobody else can send
+shelf      the shelf of what a caller may read
+session    sign-in by a cookie, and protection of forms
 entrance   `/`, signing in and out
-account    `/account`: the password, tokens of machines
+account    `/account`: the password, tokens for machines
 people     `/users`, `/groups`
 sharing    `/share`: who sees a dataset; `/upload`
-forms      what these pages have in common
+forms      helpers of pages with forms
 """
 
 from tupli_mcap.server.pages import account, entrance, people, sharing

@@ -1,4 +1,4 @@
-"""One's own account: the password, and tokens of machines."""
+"""The user's own account: password, and tokens for machines."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _Days = Annotated[int, Form(ge=1, le=3650)]
 
 @router.get("/account")
 def show(request: Request, visit: Member) -> Response:
-    """Who one is, one's tokens, and the forms to change them."""
+    """The user's account and tokens, with forms to change them."""
     return _page(request, visit)
 
 
 @router.post("/account/password")
 def change_password(request: Request, visit: Code, old: _Text = "", new: _Text = "") -> Response:
-    """Gives oneself another password; every other sign-in ends."""
+    """Changes the user's password; every other sign-in ends."""
     library, name = visit.library, visit.caller.name
 
     def change() -> None:
@@ -55,7 +55,7 @@ def create_token(
     scope: _Text = "read",
     days: _Days = 90,
 ) -> Response:
-    """Makes a token for a machine, and shows it this once."""
+    """Creates a token for a machine, and shows it once."""
     library, made = visit.library, dict[str, Any]()
     with library.database.writing() as connection:
         audit(connection, visit.caller.name, "create_api_token", name)
@@ -77,7 +77,7 @@ def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
 
 @router.post("/account/access")
 def access(visit: Code) -> Response:
-    """An access token for the scripts of our own pages, which send what is uploaded with it."""
+    """An access token for the scripts of our own pages, which need it for uploads."""
     with visit.library.database.reading() as connection:
         token = visit.library.tokens.access_for(connection, visit.session)
     return JSONResponse({"access_token": token}, headers={"Cache-Control": "no-store"})

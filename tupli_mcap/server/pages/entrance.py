@@ -28,7 +28,7 @@ _Next = Annotated[str, Form(alias="next")]
 
 @router.get("/", response_model=None)
 def root(request: Request, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1) -> Response:
-    """What this is; for browsers, and with `?format=json`, the datasets."""
+    """Browsers, and `?format=json`, get the datasets; other clients get the server's name and version."""
     browser = "text/html" in request.headers.get("accept", "") or "format" in request.query_params
     if not browser:
         return JSONResponse({"name": "tupli-mcap", "version": tupli_mcap.__version__})
@@ -52,7 +52,7 @@ def sign_in(
     following: _Next = "/",
     new: Annotated[bool, Form()] = False,
 ) -> Response:
-    """Signs in, or first makes the user where the server is open to sign-ups."""
+    """Signs in; if the server is open to sign-ups, it may create the user first."""
     library = visit.library
     try:
         if not session.is_own_origin(request):

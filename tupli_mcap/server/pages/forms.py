@@ -1,4 +1,4 @@
-"""What the pages with forms have in common: they are shown again with what went wrong."""
+"""Helpers of pages with forms: after an error, a page is shown again with the message."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def form_page(
     status: int = 200,
     **more: Any,
 ) -> Response:
-    """A page with forms for somebody who is signed in. wrong: why the last one was refused."""
+    """A page with forms for a signed-in user. wrong: why the last form was refused."""
     shown: dict[str, Any] = {
         "shelf": shelf_of(request),
         "code": visit.code,
@@ -39,7 +39,7 @@ def form_page(
 
 
 def tried(change: Callable[[], None], again: Callable[[str, int], Response], address: str) -> Response:
-    """Makes a change and goes on to an address; shows the page `again` where it is refused."""
+    """Makes a change, and redirects to an address; if the change is refused, shows the page `again`."""
     try:
         change()
     except TupliError as err:
@@ -49,5 +49,5 @@ def tried(change: Callable[[], None], again: Callable[[str, int], Response], add
 
 
 def done(address: str) -> Response:
-    """Goes on to another page, which the browser asks for anew."""
+    """Redirects to another page, which the browser fetches with GET."""
     return RedirectResponse(address, 303)

@@ -1,4 +1,4 @@
-"""Users, groups, and who is in them."""
+"""Pages of users, groups and their members."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
 
 @router.post("/users/delete")
 def delete_user(request: Request, visit: Code, username: _Text = "") -> Response:
-    """Deletes a user, and what nobody else sees of what they made; the name stays taken."""
+    """Deletes a user, and what only they could see; the name cannot be used again."""
 
     def change() -> None:
         visit.library.delete_user(visit.caller, username)
@@ -58,13 +58,13 @@ def _users(request: Request, visit: Visit, wrong: str = "", status: int = 200) -
 
 @router.get("/groups")
 def show_groups(request: Request, visit: Member) -> Response:
-    """The groups that one may know of."""
+    """The groups that the user may see."""
     return _groups(request, visit)
 
 
 @router.post("/groups")
 def create_group(request: Request, visit: Code, name: _Text = "", description: _Text = "") -> Response:
-    """Makes a group that one leads."""
+    """Creates a group with the user as its admin."""
 
     def change() -> None:
         with visit.library.database.writing() as connection:
@@ -118,7 +118,7 @@ def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text =
 
 @router.post("/group/delete")
 def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
-    """Deletes a group; its name stays taken."""
+    """Deletes a group; its name cannot be used again."""
 
     def change() -> None:
         with visit.library.database.writing() as connection:

@@ -1,10 +1,10 @@
-"""Who asks for a page: the cookie of a sign-in, and forms that no page of somebody else can send.
+"""Sign-in by a cookie, and protection of forms against pages of other sites.
 
-1. Signing in puts a refresh token into a cookie that scripts cannot read, and that other sites do not send along with
-   anything but a link. It is revoked as every other: by signing out, a new password, the end of the user.
-2. The programming interface (`/v1`) takes no cookie, so nothing of it can be set off by a page of somebody else.
-3. A form is taken only with a code made of the server's secret and the sign-in, and never from another origin, which
-   browsers say.
+1. Signing in puts a refresh token into a cookie that scripts cannot read. Browsers send it from other sites only when
+   the user follows a link. Signing out, a new password and the deletion of the user revoke it.
+2. The HTTP API (`/v1`) ignores cookies, so that a page of another site cannot call it for the user.
+3. A form is accepted only with a code that is made of the server's secret and the sign-in, and only if the browser does
+   not report another origin.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ COOKIE: Final = "tupli_mcap_session"
 
 
 class Visit(NamedTuple):
-    """Who asks, by which sign-in (a refresh token; empty for a guest), and the code for forms."""
+    """The caller, the refresh token of the sign-in (empty for a guest), and the code for forms."""
 
     library: Library
     caller: Caller
@@ -35,7 +35,7 @@ class Visit(NamedTuple):
 
     @property
     def is_signed_in(self) -> bool:
-        """Whether it is no guest."""
+        """Whether the caller is signed in, and no guest."""
         return bool(self.session)
 
 
@@ -51,7 +51,7 @@ def _visit(request: Request) -> Visit:
 
 
 Visitor = Annotated[Visit, Depends(_visit)]
-"""Whoever it is."""
+"""A visit by anybody."""
 
 
 def _member(visit: Visitor) -> Visit:
@@ -61,23 +61,21 @@ def _member(visit: Visitor) -> Visit:
 
 
 Member = Annotated[Visit, Depends(_member)]
-"""Somebody who is signed in."""
+"""A visit by a signed-in user."""
 
 
 def _checked(request: Request, visit: Member, code: Annotated[str, Form()] = "") -> Visit:
     if not is_own_origin(request) or not visit.library.tokens.is_form_code(visit.session, code):
-        raise DeniedError(
-            "this form is not of a page of yours, or is out of date; reload the page and try again"
-        )
+        raise DeniedError("this form is out of date, or not from this sign-in; reload the page and try again")
     return visit
 
 
 Code = Annotated[Visit, Depends(_checked)]
-"""Somebody who is signed in, and has sent a form of our own page."""
+"""A visit by a signed-in user who has sent a form of our own page."""
 
 
 def is_own_origin(request: Request) -> bool:
-    """Whether a form is of a page of this server, as far as the browser says."""
+    """Whether a form is from a page of this server, according to the browser's headers."""
     site = request.headers.get("sec-fetch-site")
     if site is not None:
         return site in ("same-origin", "none")
@@ -86,7 +84,7 @@ def is_own_origin(request: Request) -> bool:
 
 
 def begin(request: Request, response: Response, refresh_token: str, seconds: int) -> None:
-    """Puts a sign-in into the browser."""
+    """Sets the cookie of a sign-in."""
     secure = request.url.scheme == "https"
     response.set_cookie(
         COOKIE, refresh_token, max_age=seconds, httponly=True, samesite="lax", secure=secure, path="/"
@@ -94,15 +92,15 @@ def begin(request: Request, response: Response, refresh_token: str, seconds: int
 
 
 def end(response: Response) -> None:
-    """Takes the sign-in out of the browser."""
+    """Removes the cookie of the sign-in."""
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="lax")
 
 
 def shelf_of(request: Request) -> LibraryShelf:
-    """What who asks may see.
+    """The shelf of what the caller may see.
 
     Raises:
-        SignInNeededError: nobody is signed in, and guests are shown nothing.
+        SignInNeededError: nobody is signed in, and the server has no guests.
     """
     visit = _visit(request)
     if not visit.is_signed_in and not visit.library.settings.guests:

@@ -1,4 +1,4 @@
-"""Who sees a dataset, and sending recordings."""
+"""Pages to publish datasets, and to upload recordings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _Text = Annotated[str, Form()]
 
 @router.get("/share")
 def show(request: Request, visit: Member, dataset: str, filter: str = "") -> Response:
-    """Who sees a dataset, or the episodes of it that a filter is true of, and the form to change it."""
+    """The page of who sees a dataset, or its episodes that match a filter, with the forms to change that."""
     return _page(request, visit, dataset, filter)
 
 
@@ -43,8 +43,8 @@ def change(
     group: _Text = "",
     published: Annotated[bool, Form()] = True,
 ) -> Response:
-    """Lets a group see one's own part of a dataset, or no more: the benchmark, its artifacts, one's episodes. With a
-    filter, only those of one's episodes that it is true of."""
+    """Publishes the user's own part of a dataset in a group, or unpublishes it: the benchmark, its artifacts, and the
+    user's episodes. With a filter, only the user's episodes that match it."""
 
     def work() -> None:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
@@ -68,7 +68,7 @@ def change(
 def _turn_benchmark(
     connection: Connection, visit: Visit, dataset: Dataset, group: str, *, published: bool
 ) -> bool:
-    """Lets a group see a benchmark and its artifacts, or the benchmark no more; says whether it is the caller's."""
+    """Publishes a benchmark and its artifacts, or unpublishes the benchmark; returns whether it is the caller's."""
     library, caller = visit.library, visit.caller
     if dataset.benchmark is None or dataset.benchmark.created_by != caller.name:
         return False
@@ -77,7 +77,7 @@ def _turn_benchmark(
         return True
     library.items.publish(connection, caller, "benchmark", dataset.benchmark_id, group)
     found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
-    with contextlib.suppress(FormatError):  # one of somebody else's making names no artifacts
+    with contextlib.suppress(FormatError):  # a benchmark of another program may not name its artifacts
         for artifact in unpack(found.serialized).artifacts:
             library.items.publish(connection, caller, "artifact", artifact, group)
     return True
@@ -103,14 +103,14 @@ def _page(
 
 
 def _groups(connection: Connection, visit: Visit) -> list[str]:
-    """The groups that somebody may publish in, `global` first."""
+    """The groups in which the user may publish, `global` first."""
     name = visit.caller.name
     groups = accounts.memberships_of(connection, name)
     return [group for group in groups if group != name and visit.caller.may(Right.EPISODE_CREATE, group)]
 
 
 def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str, Any]]:
-    """How many readable episodes of a dataset are whose, and seen by whom."""
+    """The numbers of readable episodes of a dataset, by owner and by the groups that see them."""
     seen = readable(visit.caller, Right.EPISODE_READ, TALLY.c.created_by, TALLY.c.published_in)
     query = (
         select(TALLY.c.created_by, TALLY.c.published_in, func.sum(TALLY.c.episodes))
@@ -126,6 +126,6 @@ def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str,
 
 @router.get("/upload")
 def show_upload(request: Request, visit: Member) -> Response:
-    """The page that recordings are dropped on."""
+    """The page for uploading recordings."""
     visit.caller.demand(Right.EPISODE_CREATE, visit.caller.name)
     return form_page(request, visit, "upload.html", {"most_bytes": visit.library.settings.max_upload})

@@ -1,4 +1,4 @@
-"""What a server keeps, as one caller sees it."""
+"""The recordings of a server that one caller may read."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ T = TypeVar("T")
 
 
 class LibraryShelf:
-    """A shelf of what a caller may read; see `page.shelf.Shelf`.
+    """The shelf of what a caller may read; see `page.shelf.Shelf`.
 
-    kept: recordings that are open, for all callers: the key of each says which episodes are in it.
+    kept: open recordings, shared by all callers; the key of each names the episodes in it.
     """
 
     def __init__(self, library: Library, caller: Caller, address: str, kept: OpenedRecordings) -> None:
@@ -58,17 +58,17 @@ class LibraryShelf:
         return readable(self._caller, Right.EPISODE_READ, created_by, published_in)
 
     def open(self, recording: str) -> Recording:
-        """The recording; where some of its episodes may not be read, one of the others."""
+        """The recording; if the caller may read only some of its episodes, a recording of these."""
         place, numbers = self._readable(recording)
         if numbers is None:
             return self._kept.get((place, None), lambda: self._opened(place, recording))
         return self._kept.get((place, numbers), lambda: self._cut(Selected(recording, place, numbers)))
 
     def _readable(self, recording: str) -> tuple[str, tuple[int, ...] | None]:
-        """Where a recording lies, and which of its episodes may be read; None for all.
+        """The place of a recording, and the episodes of it that the caller may read; None for all.
 
         Raises:
-            NotFoundError: there is none, or none of them.
+            NotFoundError: there is no such recording, or the caller may read none of its episodes.
         """
         file = select(FILE.c.place, FILE.c.episodes).where(FILE.c.path == escape_text(recording))
         numbers = (
@@ -86,11 +86,11 @@ class LibraryShelf:
 
     def _opened(self, place: str, name: str) -> Recording:
         recording = Recording(self._library.blobs.place(place), cache_bytes=CACHE_BYTES)
-        recording.name = name  # what errors say: where files lie is nobody else's business
+        recording.name = name  # for error messages, which must not reveal paths on the server
         return recording
 
     def _cut(self, selected: Selected) -> Recording:
-        """A recording of some episodes, in a file whose name is gone when it is open."""
+        """A recording of some episodes, in a temporary file that is deleted once it is open."""
         with tempfile.NamedTemporaryFile(prefix="tupli-mcap-", suffix=".mcap") as file:
             for piece in stream_excerpts(opened(self._library.blobs, [selected])):
                 file.write(piece)
@@ -101,7 +101,7 @@ class LibraryShelf:
 
     def address_of(self, recording: str) -> str | None:
         if self._readable(recording)[1] is not None:
-            return None  # what is made while it is sent cannot be read in pieces
+            return None  # a recording that is made while it is sent cannot be read in ranges
         ticket = self._library.tokens.ticket(self._caller, recording=recording)
         return f"/v1/files/{quote(recording)}?ticket={ticket}"
 

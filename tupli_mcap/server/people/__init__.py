@@ -1,8 +1,8 @@
-"""Who asks, and what they may do.
+"""Users and their rights.
 
 access      rights, roles, and the one condition for what a caller may read
 accounts    users, groups, roles
-tokens      how users and machines prove who they are
-quotas      how much each may keep
-throttle    passwords are not tried too often
+tokens      tokens with which users and machines identify themselves
+quotas      how much each user may store
+throttle    limits failed sign-ins
 """

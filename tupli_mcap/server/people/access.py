@@ -1,8 +1,8 @@
-"""Who may do what: rights, the roles that give them, and the one condition that says what a caller may read.
+"""Rights, the roles that give them, and the one condition for what a caller may read.
 
-A user has roles in groups. A right counts in the group where a role gives it, and everywhere if that group is
-`global`; reading is the exception: what is private stays so for an admin too. Everybody who is signed in has a group
-of their own, with their name. An item is read by who made it, and by who may read in a group it is published in.
+A user has roles in groups. A right counts in the group where a role gives it, and everywhere if that group is `global`.
+Reading is the exception: private items stay private for an admin too. Every user has a group of their own, with their
+name. An item can be read by its owner, and by users with the right to read in a group in which it is published.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ __all__ = [
 ]
 
 GLOBAL: Final = "global"
-"""The group of everybody who is signed in."""
+"""The group of all signed-in users."""
 GUEST: Final = "$$GUEST$$"
-"""The name of who is not signed in; no user can have it."""
+"""The name of a caller who is not signed in; no user can have it."""
 
 
 class DeniedError(TupliError):
-    """The caller has not the right to do this."""
+    """The caller lacks the right to do this."""
 
 
 def _content(*verbs: str) -> frozenset[Right]:
@@ -62,7 +62,7 @@ DEFAULT_ROLES: Final[Mapping[str, frozenset[Right]]] = {
 
 
 class Caller(NamedTuple):
-    """Who asks: a user, or a guest; the rights in each group, and whether the token at hand may change anything.
+    """The user or guest who sends a request: the rights in each group, and whether the token allows writing.
 
     epoch: how often the user's password was changed.
     """
@@ -78,15 +78,15 @@ class Caller(NamedTuple):
         return self.name == GUEST
 
     def may(self, right: Right, group: str = GLOBAL) -> bool:
-        """Whether a right is held in a group, or everywhere."""
+        """Whether the caller has a right in a group, or everywhere."""
         return any(right in self.rights.get(name, ()) for name in (group, GLOBAL))
 
     def groups_with(self, right: Right) -> list[str]:
-        """The groups in which a right is held."""
+        """The groups in which the caller has a right."""
         return [group for group, rights in self.rights.items() if right in rights]
 
     def demand(self, right: Right, group: str = GLOBAL) -> None:
-        """Raises DeniedError without the right in the group, or everywhere."""
+        """Raises DeniedError unless the caller has a right in a group, or everywhere."""
         if not self.may(right, group):
             raise DeniedError(f"Insufficient permissions in group: {group}. Required: {right}")
 
@@ -94,9 +94,9 @@ class Caller(NamedTuple):
 def readable(
     caller: Caller, right: Right, created_by: ColumnElement[Any], published_in: ColumnElement[Any]
 ) -> ColumnElement[bool]:
-    """What a caller may read: the only place that says so.
+    """The condition for what a caller may read. No other code decides this.
 
-    created_by, published_in: columns of the table that is asked.
+    created_by, published_in: columns of the queried table.
     """
     groups = [escape_text(group) for group in caller.groups_with(right)]
     seen = select(AUDIENCE.c.published_in).where(AUDIENCE.c.team.in_(groups))
@@ -121,9 +121,9 @@ def demand_audience(connection: Connection, caller: Caller, right: Right, group:
 
 
 def left_alone(created_by: ColumnElement[Any], published_in: ColumnElement[Any]) -> ColumnElement[bool]:
-    """What a deleted user has left, and nobody can see any more.
+    """The condition for what only deleted users could see.
 
-    created_by, published_in: columns of the table that is asked.
+    created_by, published_in: columns of the queried table.
     """
     users = select(USER.c.name)
     there = or_(

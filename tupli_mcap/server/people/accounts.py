@@ -1,4 +1,4 @@
-"""Users, groups and roles. Every function works in a transaction of its caller's."""
+"""Users, groups and roles. Every function works in the transaction of its caller."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ __all__ = [
     "verify_password",
 ]
 
-# What OWASP holds to be enough: a sign-in takes 19 MiB, and one core.
+# The minimum that OWASP recommends: a sign-in takes 19 MiB, and one core.
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))
 _DUMMY: Final = _HASHES.hash("nobody has this password")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}")
@@ -52,11 +52,11 @@ _MOST_PASSWORD: Final = 1024
 
 
 class ConflictError(StorageError):
-    """Something of that name is there already."""
+    """The name is taken."""
 
 
 def prepare(connection: Connection) -> None:
-    """Puts the names that nobody may take, and the default roles, where they are missing."""
+    """Adds missing reserved names and default roles."""
     for name in (GLOBAL, GUEST):
         _reserve(connection, name, "reserved")
     known = set(connection.execute(select(ROLE.c.name)).scalars())
@@ -69,11 +69,11 @@ def prepare(connection: Connection) -> None:
 
 
 def create_user(connection: Connection, name: str, password: str) -> None:
-    """Makes a user.
+    """Creates a user.
 
     Raises:
-        StorageError: the name or the password cannot be one.
-        ConflictError: a user or group of that name is there.
+        StorageError: the name or the password is not valid.
+        ConflictError: a user or a group has or had this name.
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise StorageError(
@@ -87,14 +87,14 @@ def create_user(connection: Connection, name: str, password: str) -> None:
 
 
 def verify_password(connection: Connection, name: str, password: str) -> bool:
-    """Whether a user has this password. It takes as long where there is no such user."""
+    """Whether a user has this password. Takes as long for an unknown user, so that the time does not reveal names."""
     found = connection.execute(select(USER.c.password).where(USER.c.name == name)).scalar()
     valid = _HASHES.verify(password[:_MOST_PASSWORD], found or _DUMMY)
     return valid and found is not None
 
 
 def change_password(connection: Connection, name: str, password: str) -> None:
-    """Gives a user another password, and ends all that was signed in with the old one.
+    """Changes a user's password, and ends all sign-ins and tokens of the user.
 
     Raises:
         NotFoundError: there is no such user.
@@ -109,9 +109,9 @@ def change_password(connection: Connection, name: str, password: str) -> None:
 
 
 def delete_user(connection: Connection, name: str) -> bool:
-    """Deletes a user with all tokens and memberships; says whether there was one.
+    """Deletes a user with all tokens and memberships; returns whether there was one.
 
-    The name stays taken: whoever got it next would own what this user made.
+    The name cannot be used again: another user of this name would own what this user stored.
     """
     gone = connection.execute(delete(USER).where(USER.c.name == name)).rowcount
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.user == name))
@@ -120,8 +120,8 @@ def delete_user(connection: Connection, name: str) -> bool:
 
 
 def demand_over(connection: Connection, caller: Caller, name: str) -> None:
-    """Raises DeniedError for a user with rights in `global` that the caller lacks: who sets their password has these
-    rights from then on, and who deletes them locks those out who run the server."""
+    """Raises DeniedError for a user with rights in `global` that the caller lacks: by setting their password, the
+    caller would get these rights; by deleting them, lock out the people who run the server."""
     other = caller_named(connection, name)
     if other is not None and name != caller.name:
         for right in sorted(other.rights[GLOBAL]):
@@ -129,12 +129,12 @@ def demand_over(connection: Connection, caller: Caller, name: str) -> None:
 
 
 def list_users(connection: Connection) -> list[str]:
-    """The names of all users, in the order of their making."""
+    """The names of all users, oldest first."""
     return list(connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars())
 
 
 def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:
-    """A user as the one who asks; None if there is no such user."""
+    """A user as a caller; None if there is no such user."""
     epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == name)).scalar()
     if epoch is None:
         return None
@@ -145,12 +145,12 @@ def caller_named(connection: Connection, name: str, *, may_write: bool = True) -
 
 
 def guest(connection: Connection) -> Caller:
-    """Who is not signed in."""
+    """The caller who is not signed in."""
     return Caller(GUEST, {GLOBAL: _rights_of(connection, "guest")}, may_write=False)
 
 
 def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
-    """The roles of a user by group, those that everybody has among them."""
+    """The roles of a user by group, with the roles that every user has."""
     found = {GLOBAL: list(_EVERYBODY_S_ROLES), name: list(_OWN_ROLES)}
     chosen = select(MEMBERSHIP.c.team, MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == name)
     for group, role in connection.execute(chosen.order_by(MEMBERSHIP.c.team, MEMBERSHIP.c.role)):
@@ -183,10 +183,10 @@ def _reserve(connection: Connection, name: str, kind: str) -> bool:
 
 
 def create_group(connection: Connection, caller: Caller, name: str, description: str | None) -> None:
-    """Makes a group that the caller leads.
+    """Creates a group with the caller as its admin.
 
     Raises:
-        ConflictError: a user or group of that name is there, or was.
+        ConflictError: a user or a group has or had this name.
     """
     caller.demand(Right.GROUP_CREATE)
     if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name):
@@ -202,7 +202,7 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
 
 
 def list_groups(connection: Connection, caller: Caller) -> list[dict[str, str | None]]:
-    """The groups that the caller may know of: their own, and all with `group_read` in `global`."""
+    """The groups that the caller may see: their own; all, with `group_read` in `global`."""
     query = select(GROUP.c.name, GROUP.c.description).order_by(GROUP.c.name)
     if Right.GROUP_READ not in caller.rights.get(GLOBAL, ()):
         query = query.where(GROUP.c.name.in_(list(caller.rights)))
@@ -210,10 +210,10 @@ def list_groups(connection: Connection, caller: Caller) -> list[dict[str, str | 
 
 
 def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, object]:
-    """A group with its description and members (`[{user, roles}]`), for who may read it.
+    """A group with its description and members (`[{user, roles}]`).
 
     Raises:
-        NotFoundError: there is no such group, or the caller may not know of it.
+        NotFoundError: there is no such group, or the caller may not see it.
     """
     _known(connection, caller, name)
     description = connection.execute(select(GROUP.c.description).where(GROUP.c.name == name)).scalar()
@@ -232,7 +232,7 @@ def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, o
 
 
 def delete_group(connection: Connection, caller: Caller, name: str) -> None:
-    """Deletes a group; its name stays taken. Raises NotFoundError, DeniedError."""
+    """Deletes a group; its name cannot be used again. Raises NotFoundError, DeniedError."""
     _known(connection, caller, name)
     caller.demand(Right.GROUP_DELETE, name)
     if name == GLOBAL:
@@ -243,7 +243,7 @@ def delete_group(connection: Connection, caller: Caller, name: str) -> None:
 
 
 def add_member(connection: Connection, caller: Caller, group: str, user: str, roles: Sequence[str]) -> None:
-    """Gives a user roles in a group, in addition to those held there; nobody can give a right they have not.
+    """Gives a user further roles in a group. Nobody can give a right that they lack.
 
     Raises:
         NotFoundError: there is no such group, role or user.
@@ -277,7 +277,7 @@ def remove_member(connection: Connection, caller: Caller, group: str, user: str)
 
 
 def _known(connection: Connection, caller: Caller, group: str) -> None:
-    """Raises NotFoundError for a group that is not there, and likewise for one that the caller may not read."""
+    """Raises NotFoundError for a group that does not exist, or that the caller may not see."""
     there = connection.execute(select(PRINCIPAL.c.kind).where(PRINCIPAL.c.name == group)).scalar()
     is_group = group == GLOBAL or (
         there == "group" and connection.execute(select(GROUP.c.name).where(GROUP.c.name == group)).first()
@@ -294,7 +294,7 @@ def _known(connection: Connection, caller: Caller, group: str) -> None:
 def create_role(
     connection: Connection, caller: Caller, name: str, rights: Sequence[str], description: str | None
 ) -> None:
-    """Makes a role. Raises ConflictError if there is one of that name, StorageError for an unknown right."""
+    """Creates a role. Raises ConflictError if the name is taken, StorageError for an unknown right."""
     caller.demand(Right.ROLE_MANAGEMENT)
     unknown = [right for right in rights if right not in set(Right)]
     if unknown or not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= 100:
@@ -312,10 +312,10 @@ def list_roles(connection: Connection) -> list[dict[str, object]]:
 
 
 def delete_role(connection: Connection, caller: Caller, name: str) -> None:
-    """Deletes a role, wherever it was given; nothing happens if there is none.
+    """Deletes a role, and takes it from all who have it; nothing happens if there is no such role.
 
     Raises:
-        DeniedError: it is one of those that the server needs.
+        DeniedError: it is a default role, or the caller may not manage roles.
     """
     caller.demand(Right.ROLE_MANAGEMENT)
     if name in DEFAULT_ROLES:
@@ -333,7 +333,7 @@ def _add_role(
 
 
 def _rights_of(connection: Connection, role: str) -> frozenset[Right]:
-    if role in DEFAULT_ROLES:  # of these, the code has the truth
+    if role in DEFAULT_ROLES:  # the code defines their rights, not the database
         return DEFAULT_ROLES[role]
     text = connection.execute(select(ROLE.c.rights).where(ROLE.c.name == role)).scalar()
     return frozenset(Right(right) for right in json.loads(text)) if text else frozenset()

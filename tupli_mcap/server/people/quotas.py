@@ -1,4 +1,4 @@
-"""How much a user keeps, and may keep. Every function works in a transaction of its caller's."""
+"""How much a user has stored, and may store. Every function works in the transaction of its caller."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["FullError", "demand_room", "quota_of", "set_quota", "used_by"]
 
 
 class FullError(StorageError):
-    """A user keeps as much as they may."""
+    """A user's quota is used up."""
 
 
 def used_by(connection: Connection, user: str) -> int:
-    """The bytes of what a user has stored, and of the uploads that are not finished, as long as they will be."""
+    """The bytes that a user has stored, with the final sizes of unfinished uploads."""
     sums = (
         select(func.coalesce(func.sum(size), 0)).where(owner == user)
         for size, owner in (
@@ -30,13 +30,13 @@ def used_by(connection: Connection, user: str) -> int:
 
 
 def quota_of(connection: Connection, settings: Settings, user: str) -> int | None:
-    """How many bytes a user may keep; None if nothing limits them."""
+    """How many bytes a user may store; None without a limit."""
     own: int | None = connection.execute(select(USER.c.quota).where(USER.c.name == user)).scalar()
     return settings.quota if own is None else own
 
 
 def set_quota(connection: Connection, user: str, size: int | None) -> None:
-    """Gives a user a quota of their own; None is that of everybody.
+    """Gives a user a quota of their own (bytes); None for the quota of the settings.
 
     Raises:
         NotFoundError: there is no such user.
@@ -46,7 +46,7 @@ def set_quota(connection: Connection, user: str, size: int | None) -> None:
 
 
 def demand_room(connection: Connection, settings: Settings, caller: Caller, size: int) -> None:
-    """Raises FullError if a caller may not keep so many bytes more."""
+    """Raises FullError if a caller may not store so many bytes more."""
     allowed = quota_of(connection, settings, caller.name)
     if allowed is None:
         return

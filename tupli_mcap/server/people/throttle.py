@@ -1,4 +1,4 @@
-"""Who tries passwords may not try many. Every function works in a transaction of its caller's."""
+"""Limits failed sign-ins. Every function works in the transaction of its caller."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SECONDS: Final = 60
 
 
 class TooManyError(TupliError):
-    """There were too many failures; `seconds` is how long to wait."""
+    """There were too many failures; wait for `seconds`."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__("too many failed attempts; wait a minute")
@@ -26,7 +26,7 @@ class TooManyError(TupliError):
 
 
 def seconds_to_wait(connection: Connection, most: Mapping[str, int]) -> int:
-    """Seconds until another try, where each key may have so many failures in a minute; 0 if it may be made now."""
+    """The seconds until the next attempt is allowed; 0 for now. most: by key, how many failures a minute may have."""
     now = int(time.time())
     counted = select(FAILURE.c.key, func.count(), func.min(FAILURE.c.time)).group_by(FAILURE.c.key)
     recent = counted.where(FAILURE.c.time > now - _SECONDS, FAILURE.c.key.in_(map(escape_text, most)))

@@ -1,9 +1,9 @@
-"""Tokens: what a signed-in user, a machine, or the address of one recording proves itself with.
+"""Tokens with which users, machines and addresses of recordings identify themselves.
 
-access    short-lived, signed (JWT), void after a change of the password
-refresh   kept as a digest, used once for a new pair; used twice, the whole sign-in is ended
-API       kept as a digest, for machines: reading, or reading and writing
-ticket    signed, for one recording or query, void after a change of the password
+access    signed (JWT), valid for a short time, void after a change of the password
+refresh   stored as a digest; exchanged once for a new pair; a second use ends the whole sign-in
+API       stored as a digest; for machines, to read, or to read and write
+ticket    signed; for one recording or query; void after a change of the password
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SignInError(TupliError):
 
 
 class Tokens:
-    """Makes tokens and says whose they are. Every method works in a transaction of its caller's."""
+    """Makes and checks tokens. Every method works in the transaction of its caller."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -60,10 +60,10 @@ class Tokens:
         }
 
     def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
-        """A new pair for a refresh token; None if that was used before, which ends the whole sign-in.
+        """A new pair for a refresh token; None if it was used before, which ends the whole sign-in.
 
         Raises:
-            SignInError: it is none, or has expired.
+            SignInError: it is not valid, or has expired.
         """
         table = REFRESH_TOKEN
         found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
@@ -76,10 +76,10 @@ class Tokens:
         return self.pair(connection, found.user, found.family)
 
     def access_for(self, connection: Connection, refresh: str) -> str:
-        """An access token for a refresh token, which stays as it is: PyTupli's client keeps one for good.
+        """An access token for a refresh token that is not exchanged: PyTupli's client always keeps the same.
 
         Raises:
-            SignInError: it is none, was used, or has expired.
+            SignInError: it is not valid, was used, or has expired.
         """
         found = _of_refresh_token(connection, refresh)
         if found is None:
@@ -87,32 +87,32 @@ class Tokens:
         return self._access(found.user, found.epoch)
 
     def of_session(self, connection: Connection, refresh: str) -> Caller | None:
-        """Who a browser is signed in as, by the refresh token in its cookie, which stays as it is; None for nobody."""
+        """The caller of a browser, by the refresh token in its cookie, which stays valid; None if not signed in."""
         found = _of_refresh_token(connection, refresh)
         return None if found is None else caller_named(connection, found.user)
 
     def form_code(self, refresh: str) -> str:
-        """What a form of a signed-in browser has to carry: a page of somebody else cannot know it."""
+        """The code that a form of a signed-in browser has to send. Pages of other sites cannot know it."""
         return hmac.new(self._secret, f"form {_digest(refresh)}".encode(), hashlib.sha256).hexdigest()
 
     def is_form_code(self, refresh: str, code: str) -> bool:
-        """Whether a form carries what it has to."""
+        """Whether a form has sent the right code."""
         return hmac.compare_digest(self.form_code(refresh).encode(), code.encode())
 
     def _access(self, user: str, epoch: int) -> str:
         return self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch)
 
     def end(self, connection: Connection, refresh: str) -> None:
-        """Ends the sign-in of a refresh token; nothing happens if it is none."""
+        """Ends the sign-in of a refresh token; nothing happens if it is not valid."""
         table = REFRESH_TOKEN
         family = select(table.c.family).where(table.c.digest == _digest(refresh)).scalar_subquery()
         connection.execute(delete(table).where(table.c.family == family))
 
     def caller(self, connection: Connection, token: str) -> Caller:
-        """Whose access or API token it is.
+        """The caller of an access token or an API token.
 
         Raises:
-            SignInError: it is none, has expired, or was revoked.
+            SignInError: it is not valid, has expired, or was revoked.
         """
         if token.startswith(_API_PREFIX):
             return _of_api_token(connection, token)
@@ -130,7 +130,7 @@ class Tokens:
     def create_api_token(
         self, connection: Connection, caller: Caller, name: str, scope: str, days: int | None
     ) -> dict[str, Any]:
-        """A token for a machine as they are listed, and, this once, the `token` itself."""
+        """A new token for a machine: its listed fields, and the `token` itself, which is not stored."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
         token, number = _API_PREFIX + secrets.token_urlsafe(32), secrets.token_hex(8)
@@ -151,7 +151,7 @@ class Tokens:
         """Revokes one of the caller's tokens.
 
         Raises:
-            NotFoundError: there is no such token of theirs.
+            NotFoundError: the caller has no such token.
         """
         own = (API_TOKEN.c.id == number, API_TOKEN.c.user == caller.name)
         if not connection.execute(delete(API_TOKEN).where(*own)).rowcount:
@@ -160,14 +160,14 @@ class Tokens:
     # --- tickets ---
 
     def ticket(self, caller: Caller, **what: Any) -> str:
-        """What opens a `recording`, or what a `query` means, as this caller may read it, for a while, or until their
-        password is changed."""
+        """A ticket for a `recording`, or for the episodes of a `query`, with this caller's rights. It is valid for a
+        while, or until the caller's password is changed."""
         return self._signed(
             "ticket", self._settings.ticket_seconds, sub=caller.name, epoch=caller.epoch, **what
         )
 
     def of_ticket(self, ticket: str) -> tuple[str, dict[str, Any]]:
-        """Who was given a ticket, and what it opens. Raises SignInError if it is none, or has expired."""
+        """The user who was given a ticket, and what it opens. Raises SignInError if it is not valid, or has expired."""
         told = self._told(ticket, "ticket")
         return str(told.get("sub")), told
 
@@ -215,7 +215,7 @@ def _digest(token: str) -> str:
 
 
 def _secret(path: Path) -> bytes:
-    """What tokens are signed with, made at the first start."""
+    """The key that signs tokens, made at the first start."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.suppress(FileExistsError):
         files.write_bytes(path, secrets.token_bytes(32), overwrite=False, permissions=0o600)

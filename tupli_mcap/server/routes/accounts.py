@@ -1,4 +1,4 @@
-"""Signing in, users, groups, roles, and tokens of machines."""
+"""Signing in, users, groups, roles, and tokens for machines."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class User(BaseModel):
 
 
 class Me(User):
-    """The caller, with the bytes that they keep, and may keep (None: as many as they like)."""
+    """The caller, with the bytes that they have stored, and may store (None: without a limit)."""
 
     used: int = 0
     quota: int | None = None
 
 
 class Quota(BaseModel):
-    """How many bytes a user may keep; None is what everybody may."""
+    """How many bytes a user may store; None for the server's quota."""
 
     bytes: int | None = Field(ge=0, le=1 << 60)
 
@@ -82,7 +82,7 @@ class Member(BaseModel):
 
 
 class GroupWithMembers(Group):
-    """A group, and who is in it as far as the caller may know."""
+    """A group, and its members that the caller may see."""
 
     members: list[Member]
 
@@ -96,7 +96,7 @@ class Role(BaseModel):
 
 
 class NewToken(BaseModel):
-    """A token for a machine: what it is called, `read` or `write`, and for how many days (None: for ever)."""
+    """A token for a machine: its name, its scope (`read` or `write`), and its days (None: for ever)."""
 
     name: str
     scope: str = "read"
@@ -142,7 +142,7 @@ def who_am_i(library: Served, caller: Reader) -> Me:
 
 @router.post("/users")
 def create_user(library: Served, caller: AnyCaller, told: Credentials) -> User:
-    """Makes a user: everybody may where the server is open to sign-ups, else who has the right to."""
+    """Creates a user. Everybody may if the server is open to sign-ups; else it takes the right `user_create`."""
     if not library.settings.open_signup:
         caller.demand(Right.USER_CREATE)
     with library.database.writing() as connection:
@@ -164,13 +164,13 @@ def list_users(library: Served, caller: Reader) -> list[User]:
 
 @router.delete("/users/{username}")
 def delete_user(library: Served, caller: Writer, username: str) -> None:
-    """Deletes a user, and what nobody else sees of what they made; the name stays taken."""
+    """Deletes a user, and what only they could see; the name cannot be used again."""
     library.delete_user(caller, username)
 
 
 @router.put("/users/{username}/quota")
 def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> None:
-    """Says how much a user may keep."""
+    """Sets how much a user may store."""
     caller.demand(Right.USER_UPDATE)
     with library.database.writing() as connection:
         quotas.set_quota(connection, username, told.bytes)
@@ -179,7 +179,7 @@ def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> No
 
 @router.put("/users/{username}/password")
 def change_password(library: Served, caller: Writer, username: str, told: Password) -> None:
-    """Changes a password, and ends everything that was signed in with the old one."""
+    """Changes a password, and ends all sign-ins and tokens of the user."""
     caller.demand(Right.USER_UPDATE, username)
     with library.database.writing() as connection:
         if username == caller.name and not accounts.verify_password(connection, username, told.old or ""):
@@ -191,7 +191,7 @@ def change_password(library: Served, caller: Writer, username: str, told: Passwo
 
 @router.post("/groups")
 def create_group(library: Served, caller: Writer, told: Group) -> Group:
-    """Makes a group that the caller leads."""
+    """Creates a group with the caller as its admin."""
     with library.database.writing() as connection:
         accounts.create_group(connection, caller, told.name, told.description)
     return told
@@ -199,7 +199,7 @@ def create_group(library: Served, caller: Writer, told: Group) -> Group:
 
 @router.get("/groups")
 def list_groups(library: Served, caller: Reader) -> list[Group]:
-    """The groups that the caller may know of."""
+    """The groups that the caller may see."""
     with library.database.reading() as connection:
         return [Group(**group) for group in accounts.list_groups(connection, caller)]  # type: ignore[arg-type]
 
@@ -213,14 +213,14 @@ def read_group(library: Served, caller: Reader, name: str) -> GroupWithMembers:
 
 @router.delete("/groups/{name}")
 def delete_group(library: Served, caller: Writer, name: str) -> None:
-    """Deletes a group; its name stays taken."""
+    """Deletes a group; its name cannot be used again."""
     with library.database.writing() as connection:
         accounts.delete_group(connection, caller, name)
 
 
 @router.put("/groups/{name}/members")
 def add_members(library: Served, caller: Writer, name: str, told: list[Member]) -> GroupWithMembers:
-    """Gives users roles in a group: all of them, or none."""
+    """Gives users roles in a group: to all of them, or to none."""
     with library.database.writing() as connection:
         for member in told:
             accounts.add_member(connection, caller, name, member.user, member.roles)
@@ -229,14 +229,14 @@ def add_members(library: Served, caller: Writer, name: str, told: list[Member]) 
 
 @router.delete("/groups/{name}/members/{user}")
 def remove_member(library: Served, caller: Writer, name: str, user: str) -> None:
-    """Takes a user out of a group."""
+    """Removes a user from a group."""
     with library.database.writing() as connection:
         accounts.remove_member(connection, caller, name, user)
 
 
 @router.post("/roles")
 def create_role(library: Served, caller: Writer, told: Role) -> Role:
-    """Makes a role."""
+    """Creates a role."""
     with library.database.writing() as connection:
         accounts.create_role(connection, caller, told.role, told.rights, told.description)
     return told
@@ -252,14 +252,14 @@ def list_roles(library: Served, caller: Reader) -> list[Role]:
 
 @router.delete("/roles/{role}")
 def delete_role(library: Served, caller: Writer, role: str) -> None:
-    """Deletes a role, wherever it was given."""
+    """Deletes a role, and takes it from all who have it."""
     with library.database.writing() as connection:
         accounts.delete_role(connection, caller, role)
 
 
 @router.post("/api-tokens")
 def create_api_token(library: Served, caller: Writer, told: NewToken) -> dict[str, Any]:
-    """Makes a token for a machine; it is shown this once."""
+    """Creates a token for a machine. Only this answer contains it."""
     with library.database.writing() as connection:
         audit(connection, caller.name, "create_api_token", told.name)
         return library.tokens.create_api_token(connection, caller, told.name, told.scope, told.days)

@@ -1,10 +1,10 @@
-"""Bodies of answers: what is kept under a name, whole or a range of it, from wherever it can be had soonest.
+"""Bodies of answers: stored bytes, whole or a range of them.
 
-1. From a directory: the file, or where nginx stands before this server, its name for nginx (`X-Accel-Redirect`).
-2. From a bucket: where clients reach it, an address that is good for a while (307); else, piece by piece through here.
+1. From a directory: the file itself; behind nginx, its name, and nginx sends it (`X-Accel-Redirect`).
+2. From a bucket: if clients can reach it, a redirect to a temporary address (307); else piece by piece.
 
-A name never changes its content, so a version is pinned by whatever the place that sends it takes for its `ETag`. Here
-that is the SHA-256.
+The content of a name never changes, so that any `ETag` pins a version: that of nginx, of the bucket, or ours, which is
+the SHA-256.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ def body_of(
     file_name: str = "",
     headers: dict[str, str] | None = None,
 ) -> Response:
-    """The answer to a GET or HEAD for what is kept under a name, and has this SHA-256.
+    """The answer to a GET or HEAD for the bytes that are kept under a name, and have this SHA-256.
 
-    headers: more of them; the answer then comes through here.
+    headers: further headers; with any, this server sends the bytes itself.
 
     Raises:
-        HTTPException: another version was asked for (412), or a range that is not there (416).
-        LostError: it is not there.
+        HTTPException: the request is for another version (412), or for a range beyond the end (416).
+        LostError: the bytes are missing.
         UnavailableError: the bucket does not answer.
     """
     blobs, settings = library.blobs, library.settings
@@ -65,7 +65,7 @@ def body_of(
     size = blobs.size(name)
     if size is None:
         raise LostError(f"the server has lost {name}; restore it from a backup")
-    # What is pinned by its SHA-256 comes through here: nginx would compare that with a tag of its own.
+    # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
     if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
         told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **_disposition(file_name)}
         return Response(headers=told, media_type=_MEDIA)
@@ -114,7 +114,7 @@ def _check_version(request: Request, tag: str) -> None:
 
 
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
-    """The one range of bytes that is asked for; None if all of them are."""
+    """The requested range of bytes; None for all."""
     found = _RANGE.fullmatch(request.headers.get("Range", "").strip())
     if found is None or not any(found.groups()) or request.headers.get("If-Range", tag) != tag:
         return None

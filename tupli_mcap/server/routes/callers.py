@@ -1,4 +1,4 @@
-"""Who asks: what every route takes to know the server and the caller."""
+"""The dependencies of all routes: the server's library, and the caller."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 
 def _any_caller(library: Served, credentials: _Credentials, request: Request) -> Caller:
-    """Whoever it is: a user, or a guest. A token that is given must be valid."""
+    """The caller: a user, or a guest. SignInError if a token is given and not valid."""
     with library.database.reading() as connection:
         if credentials is None:
             return accounts.guest(connection)
@@ -68,13 +68,13 @@ Writer = Annotated[Caller, Depends(_writer)]
 
 
 class Holder(NamedTuple):
-    """Who reads what an address shows: somebody who is signed in, or was given a ticket, which says what it opens."""
+    """The reader of an address: a signed-in caller, or the holder of a ticket, which names what it opens."""
 
     caller: Caller
     ticket: Mapping[str, Any] | None
 
     def of(self, recording: str) -> Caller:
-        """Who reads a recording. Raises SignInError if the ticket is for something else."""
+        """The caller with whose rights a recording is read. Raises SignInError if the ticket is for something else."""
         if self.ticket is not None and self.ticket.get("recording") != recording:
             raise SignInError("the ticket is for another recording; open it again")
         return self.caller

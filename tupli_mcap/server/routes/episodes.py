@@ -25,13 +25,13 @@ _MOST_KEYS = 100  # each is a row for every episode that has it
 
 
 class Chosen(BaseModel):
-    """What to count or delete: all that a filter is true of."""
+    """The episodes to count or delete: all that match a filter."""
 
     filter: AskedFilter | None = None
 
 
 class Shown(Chosen):
-    """Which episodes a group sees from now on, or sees no more."""
+    """The episodes to publish in a group, or to unpublish."""
 
     group: str
     published: bool = True
@@ -75,7 +75,7 @@ def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Bod
 
 @router.post("/publish")
 def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Body()]) -> Response:
-    """Lets a group see the episodes that match a filter, or no more: all, or none; `{"episodes": how many}`."""
+    """Publishes the episodes of a filter in a group, or unpublishes them: all, or none; `{"episodes": how many}`."""
     change = episodes.publish if told.published else episodes.unpublish
     with library.database.writing() as connection:
         return answer({"episodes": change(connection, caller, told.filter, told.group)})
@@ -83,7 +83,7 @@ def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Bod
 
 @router.post("/keys")
 def declare_key(library: Served, caller: Writer, told: Key) -> None:
-    """Indexes a key, so that filters on it stay fast."""
+    """Makes an index for a key of metadata, so that filters on it are fast."""
     with library.database.writing() as connection:
         known = queries.declared_keys(connection)
         if told.key not in known and len(known) >= _MOST_KEYS:
@@ -110,7 +110,7 @@ def publish_episode(library: Served, caller: Writer, uri: str, group: str) -> No
 
 @router.delete("/{uri}/published")
 def unpublish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
-    """Takes an episode away from a group."""
+    """Hides an episode from a group."""
     with library.database.writing() as connection:
         if not episodes.unpublish(connection, caller, FilterEQ(key="id", value=uri), group):
             raise episodes.no_episode(uri)

@@ -1,7 +1,7 @@
-"""What Foxglove's remote data loader asks: which recordings an address means, and their bytes.
+"""The routes for Foxglove's remote data loader: the recordings of a query, and their bytes.
 
-The loader hands on what stands in the address of a view, `&ds.filter=…&ds.recording=…` or the ticket of a query, and
-the bearer token of who looks, where it has one. All fields are shown, also where a query asks for some.
+The loader passes on the parameters of a view's address (`&ds.filter=…&ds.recording=…`, or the ticket of a query), and
+the user's bearer token if it has one. It always gets all fields, also if a query selects some.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["viewers"])
 _LONGEST_TICKET = 4096
-_MADE = 1  # counts on when the same episodes give other bytes
+_MADE = 1  # to be increased when the same episodes give different bytes
 _MARGIN_NS = 1_000_000
 
 
 class Address(BaseModel):
-    """The path of a manifest that is shown without signing in, for a while."""
+    """The path of a manifest that can be read for a while without signing in."""
 
     path: str
 
 
 class _Asked(NamedTuple):
-    """Who asks for which episodes; `ticket` is handed on to the addresses of what is found."""
+    """The caller and the query; `ticket` goes into the addresses in the manifest."""
 
     caller: Caller
     query: EpisodeQuery
@@ -89,14 +89,14 @@ _Wanted = Annotated[_Asked, Depends(_asked)]
 def manifest(
     library: Served, asked: _Wanted, filter: str | None = None, benchmark_filter: str | None = None
 ) -> dict[str, Any]:
-    """What Foxglove may load: of each recording the file, where all of it is meant, else a source that is made."""
+    """The manifest for Foxglove: for each recording its file if all is selected, else a source made of episodes."""
     with library.database.reading() as connection:
         selected = select_episodes(connection, asked.caller, library.items, asked.query)
         files = [episodes.file_of(connection, asked.caller, each.name) for each in selected]
     sources: list[dict[str, Any]] = []
     for each, file in zip(selected, files, strict=True):
         if file.whole and len(each.numbers) == file.episodes:
-            told = {"version": file.digest[:16]}  # what a loader keeps it by
+            told = {"version": file.digest[:16]}  # the loader's cache key
             if asked.ticket is not None:
                 told["ticket"] = library.tokens.ticket(asked.caller, recording=file.name)
             sources.append(
@@ -124,12 +124,12 @@ def data(library: Served, asked: _Wanted, id: Annotated[str, Query(max_length=64
 
 
 def _id(selected: Selected, digest: str) -> str:
-    """Equal for equal bytes: what a loader keeps what it has loaded by."""
+    """The id of a source, equal for equal bytes; the loader's cache key."""
     return hashlib.sha256(f"{_MADE} {digest} {sorted(selected.numbers)}".encode()).hexdigest()
 
 
 def _described(library: Library, selected: Selected) -> dict[str, Any]:
-    """The topics of a source, their schemas, and between which times its messages are."""
+    """The topics of a source, their schemas, and the time range of its messages."""
     with opened(library.blobs, [selected]) as excerpts:
         recording, rows = excerpts[0]
         contents, store = recording.file.contents, recording.file.store

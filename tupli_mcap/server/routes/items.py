@@ -63,7 +63,7 @@ def publish_benchmark(library: Served, caller: Writer, uri: str, group: str) -> 
 
 @router.delete("/benchmarks/{uri}/published")
 def unpublish_benchmark(library: Served, caller: Writer, uri: str, group: str) -> None:
-    """Takes a benchmark away from a group."""
+    """Hides a benchmark from a group."""
     with library.database.writing() as connection:
         library.items.unpublish(connection, caller, "benchmark", uri, group)
 
@@ -75,7 +75,7 @@ async def store_artifact(
     request: Request,
     metadata: Annotated[str, Header(alias="Artifact-Metadata", description="JSON in base64")],
 ) -> Response:
-    """Stores the bytes of the body, unless the caller has them already; answers with what is known of them."""
+    """Stores the bytes of the body, unless the caller has them already; answers with their metadata."""
     try:
         told = ArtifactMetadata.model_validate(jsonvalue.loads(base64.b64decode(metadata)))
     except ValidationError as err:
@@ -96,7 +96,7 @@ def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Bod
 
 @router.get("/artifacts/{uri}", response_class=Response, responses=BODY)
 def load_artifact(library: Served, caller: Reader, request: Request, uri: str) -> Response:
-    """The bytes of an artifact; their SHA-256 is the `ETag`, and 304 the answer to an `If-None-Match` with it."""
+    """The bytes of an artifact. Their SHA-256 is the `ETag`; with it in `If-None-Match`, the answer is 304."""
     with library.database.reading() as connection:
         item = library.items.load_artifact(connection, caller, uri)
     return body_of(library, request, artifact_key(item.id), digest=item.id)
@@ -111,7 +111,7 @@ def artifact_users(library: Served, caller: Reader, uri: str) -> list[str]:
 
 @router.delete("/artifacts/{uri}")
 def delete_artifact(library: Served, caller: Writer, uri: str, force: bool = False) -> None:
-    """Deletes an artifact; with `force` even one that a benchmark needs."""
+    """Deletes an artifact; with `force`, even one that a benchmark needs."""
     library.delete_artifact(caller, uri, force=force)
 
 
@@ -124,6 +124,6 @@ def publish_artifact(library: Served, caller: Writer, uri: str, group: str) -> N
 
 @router.delete("/artifacts/{uri}/published")
 def unpublish_artifact(library: Served, caller: Writer, uri: str, group: str) -> None:
-    """Takes an artifact away from a group."""
+    """Hides an artifact from a group."""
     with library.database.writing() as connection:
         library.items.unpublish(connection, caller, "artifact", uri, group)

@@ -1,4 +1,4 @@
-"""How the server is: for those who run it, and for what starts and stops it."""
+"""The state of the server, for its administrators and for container orchestration."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ router = APIRouter(tags=["operation"])
 
 @router.get("/health")
 def health() -> dict[str, str]:
-    """Whether the server answers; if not, it is to be started anew."""
+    """Answers if the process is alive; if it does not answer, restart it."""
     return {"status": "ok"}
 
 
 @router.get("/ready")
 def ready(library: Served) -> dict[str, str]:
-    """Whether the server reaches its database, and where it keeps recordings; if not (503), requests are to wait."""
+    """Whether the server reaches its database, and its directory or bucket; 503 if not: send no requests then."""
     library.reach()
     return {"status": "ok"}
 
 
 @router.get("/metrics", response_class=Response)
 def metrics(library: Served, caller: AnyCaller, request: Request) -> Response:
-    """Numbers for Prometheus, whose token must be of somebody who may manage roles, unless everybody may see them."""
+    """Numbers for Prometheus. Without open metrics, they need a token with the right `role_management`."""
     if not library.settings.open_metrics:
         if caller.is_guest:
             raise SignInError("guests are shown no metrics")

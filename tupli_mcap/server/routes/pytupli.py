@@ -1,6 +1,7 @@
-"""PyTupli's own routes, for its client as it is: the same functions under other names.
+"""The routes of PyTupli's server, for its unchanged client: the same functions under other names.
 
-Unlike the routes of `/v1`, they answer 403 both for what is unknown and for what may not be read, except to an admin.
+Unlike the routes of `/v1`, they answer 403 both for unknown items and for those that may not be read. An admin gets
+404.
 """
 
 from __future__ import annotations
@@ -90,12 +91,12 @@ def _changing(caller: Reader) -> Caller:
 
 
 Changing = Annotated[Caller, Depends(_changing)]
-"""Who changes something. A guest lacks the rights, and is told so."""
+"""A caller who changes something. A guest gets an error, as guests lack the rights."""
 
 
 @contextlib.contextmanager
 def _hidden(caller: Caller, text: str) -> Iterator[None]:
-    """Answers that something is not there only to an admin."""
+    """Reveals only to an admin that an item does not exist."""
     try:
         yield
     except NotFoundError as err:

@@ -23,11 +23,11 @@ router = APIRouter(prefix="/v1", tags=["episodes"])
 def query_episodes(
     library: Served, caller: Reader, told: Annotated[EpisodeQuery, Body()]
 ) -> StreamingResponse:
-    """A recording of exactly the episodes that are meant.
+    """A recording of exactly the episodes of a query.
 
-    Of one recording (`Recording-Count: 1`) they keep their numbers. Those of several are merged: numbered anew, in the
-    order of their times; where their spaces differ, the error names two that do. Where states or actions are not asked
-    for, their spaces are empty.
+    Episodes of one recording (`Recording-Count: 1`) keep their numbers. Episodes of several recordings are merged, and
+    numbered anew in the order of their times; if spaces differ, the error names two recordings. If states or actions
+    are not among the fields, their spaces are empty.
     """
     left_out = told.left_out
     with library.database.reading() as connection:

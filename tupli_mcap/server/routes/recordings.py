@@ -33,17 +33,17 @@ _FOR_VIEWERS = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
 }
-_PIECE = 1 << 20  # bytes that are written at once
+_PIECE = 1 << 20  # bytes that are written at a time
 
 
 class Named(BaseModel):
-    """A recording by the name that the headers of its episodes give."""
+    """A recording by its name, as in the headers of its episodes."""
 
     recording: str
 
 
 class Ticket(BaseModel):
-    """Where a recording can be read without signing in, for a while; not `whole` if some of it may not be read.
+    """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
 
     digest, size, episodes: of the whole file.
     """
@@ -78,7 +78,8 @@ def begin_upload(
         ),
     ],
 ) -> Response:
-    """Begins an upload, or goes on with the one of the same bytes; says where if they are stored already."""
+    """Begins an upload, or continues the caller's upload of the same bytes. If the server has them already, the answer
+    names the recording."""
     caller.demand(Right.EPISODE_CREATE, caller.name)
     if upload_length > library.settings.max_upload:
         raise TooLargeError(f"expected at most {library.settings.max_upload} bytes, found {upload_length}")
@@ -95,7 +96,7 @@ def begin_upload(
 
 @router.head("/uploads/{upload_id}", response_class=Response)
 def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
-    """How much of an upload has come."""
+    """How much of an upload has arrived."""
     upload = _find(library, caller, upload_id)
     told = {"Upload-Offset": str(upload.offset), "Upload-Length": str(upload.length)}
     return Response(headers={**_TUS, **told, "Cache-Control": "no-store"})
@@ -109,7 +110,7 @@ async def go_on_with_upload(
     upload_id: str,
     upload_offset: Annotated[int, Header(ge=0)],
 ) -> Response:
-    """Adds bytes to an upload. With the last ones it is stored, and `Recording` is its name, as URLs have it."""
+    """Adds bytes to an upload. The last ones store the recording; the header `Recording` is then its name (quoted)."""
     upload = await run_in_threadpool(_find, library, caller, upload_id)
     with library.uploads.writing(upload) as incoming:
         if incoming.offset != upload_offset:
@@ -125,7 +126,7 @@ async def go_on_with_upload(
 
 @router.delete("/uploads/{upload_id}", status_code=204)
 def end_upload(library: Served, caller: Writer, upload_id: str) -> Response:
-    """Forgets an upload."""
+    """Deletes an upload."""
     library.forget_upload(_find(library, caller, upload_id))
     return Response(status_code=204, headers=_TUS)
 
@@ -136,7 +137,7 @@ def _find(library: Library, caller: Caller, upload_id: str) -> Upload:
 
 
 async def _append(incoming: Incoming, pieces: AsyncIterator[bytes]) -> None:
-    """Writes what comes, while more is coming. What has come before a client went away is kept."""
+    """Writes bytes as they arrive. If the client disconnects, the bytes until then are kept."""
     room = incoming.upload.length - incoming.offset
     coming, written = bytearray(), None
     try:
@@ -157,7 +158,7 @@ async def _append(incoming: Incoming, pieces: AsyncIterator[bytes]) -> None:
 
 
 def _metadata(text: str) -> dict[str, str]:
-    """The pairs of an `Upload-Metadata` header; without those that have none in base64."""
+    """The pairs of an `Upload-Metadata` header, without pairs whose value is not valid base64."""
     found = {}
     for pair in text.split(","):
         key, _, value = pair.strip().partition(" ")
@@ -177,7 +178,7 @@ def _number(text: str) -> int:
 
 @router.post("/tickets")
 def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body()]) -> Ticket:
-    """An address at which programs that cannot sign in may read a recording for a while, and as long as it stays."""
+    """An address at which programs that cannot sign in may read a recording for a while."""
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, told.recording)
     ticket = library.tokens.ticket(caller, recording=found.name, digest=found.digest)
@@ -188,9 +189,9 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
 @router.get("/files/{name:path}", response_class=Response, responses=BODY)
 @router.head("/files/{name:path}", response_class=Response)
 def read_recording(library: Served, holder: TicketHolder, name: str, request: Request) -> Response:
-    """The bytes of a recording, or ranges of them; their SHA-256 is the `ETag`, and `If-Match` is heeded.
+    """The bytes of a recording, or ranges of them. Their SHA-256 is the `ETag`; `If-Match` is supported.
 
-    Where some episodes may not be read by who was given the ticket, a recording of the others is made.
+    If the holder of the ticket may not read all episodes, the answer is a recording of the others.
     """
     caller = holder.of(name)
     with library.database.reading() as connection:
@@ -204,6 +205,6 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
         return Response() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]
     body = body_of(library, request, found.place, digest=found.digest, file_name=file_name)
-    if holder.ticket is not None:  # which is no secret of the page that has it
+    if holder.ticket is not None:  # pages of other hosts may read it: they need the ticket, and no cookie
         body.headers.update(_FOR_VIEWERS)
     return body

@@ -1,4 +1,4 @@
-"""What viewers open: an episode as a Rerun recording."""
+"""An episode as a file for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RRD = {**MADE, 501: {"model": Error, "description": "The server has no rerun-sd
 
 @router.get("/episodes/{uri}.rrd", response_class=Response, responses=_RRD)
 def show_episode(request: Request, library: Served, holder: TicketHolder, uri: str) -> FileResponse:
-    """An episode with its blueprint, for the Rerun viewer; a ticket for its recording will do."""
+    """An episode with its blueprint, for the Rerun viewer. A ticket for its recording is enough."""
     shelf = LibraryShelf(library, holder.caller, "", request.app.state.kept)
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     holder.of(header.recording)

@@ -1,5 +1,5 @@
-"""Recordings that come to a server: new ones, those that go on in parts, and wholes that take the place of their parts.
-Every function works in a transaction of its caller's.
+"""New recordings on a server: whole ones, parts of running ones, and wholes that replace their parts.
+Every function works in the transaction of its caller.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
 
 def new_name(benchmark_id: str) -> str:
-    """A name for a recording that nothing has yet: time (UTC) and random digits."""
+    """A new name for a recording, of time (UTC) and random digits."""
     now = datetime.datetime.now(datetime.UTC)
     return f"recordings/{benchmark_id or _PLAIN}/{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
 
@@ -54,12 +54,12 @@ def register(
     deleted: Collection[int] = (),
     sent_before: int = 0,
 ) -> tuple[str, list[str]]:
-    """Lists the episodes of a recording whose file is kept at `place`, but those that are `deleted`; returns the
-    name of the recording, and the places of files to forget.
+    """Catalogs the episodes of a recording whose file is kept at `place`, without the `deleted` ones. Returns the name
+    of the recording, and the places of files to delete.
 
-    A recording that goes on may come in parts: files with some of its episodes, each in one of them. A file that has
-    all episodes of earlier ones takes their place: what was published stays published, and what was deleted deleted.
-    Deleted are, too, those with numbers below `sent_before` that are not there any more: the caller has sent them.
+    A running recording may come in parts: files with different episodes of it. A file with all episodes of earlier
+    parts replaces them; published episodes stay published, and deleted ones deleted. An episode with a number below
+    `sent_before` was sent before: if the server has it no more, it was deleted, and stays so.
 
     Raises:
         NotFoundError: its benchmark is not stored, or the caller may not read it.
@@ -99,7 +99,7 @@ def register(
 
 
 class _Part(NamedTuple):
-    """A file that is stored of a recording: who sees each of its episodes, and which of them were deleted."""
+    """A stored file of a recording: who sees each of its episodes, and which were deleted."""
 
     name: str
     seen_by: dict[int, list[str]]
@@ -120,8 +120,8 @@ def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_Part]:
 
 
 def _name_of(place: str, first: int, earlier: Sequence[str], replaced: Sequence[str]) -> str:
-    """The name of a file, with episodes from `first` on, among those of its recording: that of the whole where it is
-    free, so that who has listed a part opens what has taken its place."""
+    """A name for a file with episodes from `first` on. It is the name of the whole recording if that is free, so that a
+    client that has listed a part opens the file that has replaced it."""
     if not earlier:
         return place
     whole = whole_name(earlier[0])

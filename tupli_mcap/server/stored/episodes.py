@@ -1,4 +1,4 @@
-"""Recordings on a server, and their episodes. Every function works in a transaction of its caller's."""
+"""Recordings on a server, and their episodes. Every function works in the transaction of its caller."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _MOST_VALUES: Final = 1000
 
 
 class StoredFile(NamedTuple):
-    """The file of a recording: its place among the blobs, SHA-256, size, and how many episodes are in it; `whole` if
-    the caller may read all of it."""
+    """The file of a recording: its place among the blobs, SHA-256, size, number of episodes, and whether the caller may
+    read all of it (`whole`)."""
 
     name: str
     place: str
@@ -60,7 +60,7 @@ def find_episodes(
 
 
 def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
-    """How many readable episodes that match a filter."""
+    """The number of readable episodes that match a filter."""
     return queries.count_episodes(connection, filter, only=_seen(caller))
 
 
@@ -68,7 +68,7 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     """The file of a recording.
 
     Raises:
-        NotFoundError: there is none, or none of its episodes may be read.
+        NotFoundError: there is no such recording, or the caller may read none of its episodes.
     """
     for each in names_of(name):
         found = connection.execute(select(FILE).where(FILE.c.path == escape_text(each))).first()
@@ -82,7 +82,7 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
 
 
 def names_of(name: str) -> list[str]:
-    """The names under which a recording may be found now: its own, and that of the one it has become a part of."""
+    """The names under which a recording may be found: its own, and that of the recording that has replaced it."""
     return list(dict.fromkeys((name, whole_name(name))))
 
 
@@ -107,7 +107,7 @@ def publish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Lets a group see the caller's own episodes that match a filter: all, or none; done twice, nothing changes.
+    """Lets a group see the caller's own episodes that match a filter: all, or none. Doing it twice changes nothing.
 
     only: see `find_episodes`.
 
@@ -134,7 +134,7 @@ def unpublish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Takes episodes away from a group: the owner may, and who has the right to delete there.
+    """Hides episodes from a group. The owner may, and whoever has the right to delete in that group.
 
     only: see `find_episodes`.
 
@@ -150,17 +150,17 @@ def unpublish(
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
-    """Deletes the readable episodes that match a filter; returns how many, and the names of files to forget.
+    """Deletes the readable episodes that match a filter; returns how many, and the names of files to delete.
 
     Raises:
-        DeniedError: one of them is somebody else's, and the caller has not the right; none is deleted then.
+        DeniedError: an episode is somebody else's, and the caller may not delete it; then none is deleted.
     """
     found = list(find_episodes(connection, caller, filter))
     own = {header.id for header in found if header.created_by == caller.name}
     doomed = []
     for header in found:
         if header.created_by != caller.name and not caller.may(Right.EPISODE_DELETE):
-            if header.id in own:  # somebody else has stored the same recording
+            if header.id in own:  # another user has stored the same recording
                 continue
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may delete it")
         doomed.append(header)
@@ -169,7 +169,7 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
 
 
 def forget_unseen(connection: Connection) -> list[str]:
-    """Deletes the episodes that only users saw who are deleted; returns the names of files to forget."""
+    """Deletes the episodes that only deleted users could see; returns the names of files to delete."""
     owners = select(FILE.c.created_by).where(FILE.c.created_by.not_in(select(USER.c.name))).limit(1)
     if connection.execute(owners).first() is None:
         return []
@@ -178,7 +178,7 @@ def forget_unseen(connection: Connection) -> list[str]:
 
 
 def forget(connection: Connection, path: str) -> str:
-    """Forgets a recording; returns the place of its file, which is pending."""
+    """Removes a recording from the catalog; returns the place of its file, which is pending from then on."""
     place = connection.execute(select(FILE.c.place).where(FILE.c.path == escape_text(path))).scalar_one()
     queries.remove_recording(connection, path)
     connection.execute(delete(FILE).where(FILE.c.path == escape_text(path)))
@@ -213,7 +213,7 @@ def _delete(connection: Connection, doomed: Sequence[EpisodeHeader]) -> list[str
 def _set_audiences(
     connection: Connection, headers: Sequence[EpisodeHeader], changed: Callable[[list[str]], list[str]]
 ) -> None:
-    """Lets others see episodes: who, is a function of who saw them before."""
+    """Changes who sees episodes, by a function of the groups that saw them before."""
     for path, of_recording in _by_recording(headers).items():
         of = select(RECORDING.c.id).where(RECORDING.c.path == escape_text(path))
         recording = connection.execute(of).scalar_one()
@@ -230,7 +230,7 @@ def _set_audiences(
 def _note(
     connection: Connection, caller: Caller, action: str, headers: Sequence[EpisodeHeader], more: str = ""
 ) -> None:
-    """Notes in the audit what is done with episodes."""
+    """Logs a change of episodes in the audit table."""
     for path, of_recording in _by_recording(headers).items():
         numbers = ", ".join(str(header.episode) for header in of_recording)
         audit(connection, caller.name, action, f"{path}{more}: {numbers}")
@@ -244,7 +244,7 @@ def _by_recording(headers: Sequence[EpisodeHeader]) -> dict[str, list[EpisodeHea
 
 
 def _rows(recording: int, numbers: Sequence[int]) -> Iterator[ColumnElement[bool]]:
-    """Conditions that are true of episodes of a recording, each of some: a statement has so many values at most."""
+    """Conditions that together match episodes of a recording; several, as a statement may hold only so many values."""
     ordered = sorted(numbers)
     for start in range(0, len(ordered), _MOST_VALUES):
         some = ordered[start : start + _MOST_VALUES]

@@ -1,7 +1,7 @@
-"""Benchmarks and artifacts on a server. Every function works in a transaction of its caller's.
+"""Benchmarks and artifacts on a server. Every function works in the transaction of its caller.
 
-What is stored twice by one user is one item. Two users who store the same content have one each, of which the other
-is told nothing.
+Content that a user stores twice is one item. Two users who store the same content have an item each, and neither learns
+of the other's.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Items:
         return _benchmark(own)
 
     def load_benchmark(self, connection: Connection, caller: Caller, uri: str) -> Benchmark:
-        """As `TupliStorage.load_benchmark`; what may not be read is not there."""
+        """As `TupliStorage.load_benchmark`; NotFoundError also if the caller may not read it."""
         row = self._find(connection, caller, "benchmark", uri)
         content = connection.execute(select(ITEM.c.content).where(ITEM.c.number == row.number)).scalar_one()
         return Benchmark(**dict(_benchmark(row)), serialized=content or "")
@@ -90,7 +90,7 @@ class Items:
         return sorted((h for h in found if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
 
     def delete_benchmark(self, connection: Connection, caller: Caller, uri: str) -> None:
-        """Deletes the caller's own benchmark, or with the right to, what others have published."""
+        """Deletes the caller's own benchmark; with the right to, also one that others have published."""
         self._delete(connection, caller, "benchmark", uri)
 
     # --- artifacts ---
@@ -98,7 +98,7 @@ class Items:
     def store_artifact(
         self, connection: Connection, caller: Caller, data: bytes, metadata: ArtifactMetadata
     ) -> ArtifactMetadataItem:
-        """As `TupliStorage.store_artifact`; the bytes are kept under `artifact_key` by now."""
+        """As `TupliStorage.store_artifact`; the bytes have to be kept under `artifact_key` before."""
         caller.demand(Right.ARTIFACT_CREATE, caller.name)
         uri = sha256(data)
         own = self._own(connection, caller, "artifact", uri)
@@ -114,7 +114,7 @@ class Items:
         return self._own(connection, caller, "artifact", sha256(data)) is not None
 
     def load_artifact(self, connection: Connection, caller: Caller, uri: str) -> ArtifactMetadataItem:
-        """What is known of a readable artifact, whose bytes are under `artifact_key`."""
+        """The metadata of a readable artifact; its bytes are kept under `artifact_key`."""
         return _artifact(self._find(connection, caller, "artifact", uri))
 
     def list_artifacts(
@@ -133,7 +133,7 @@ class Items:
         ]
 
     def delete_artifact(self, connection: Connection, caller: Caller, uri: str, *, force: bool) -> None:
-        """Deletes the caller's own artifact, or with the right to, what others have published.
+        """Deletes the caller's own artifact; with the right to, also one that others have published.
 
         Raises:
             StorageError: a benchmark of its owners needs it, and `force` is not given.
@@ -155,7 +155,7 @@ class Items:
     # --- both ---
 
     def forget_unseen(self, connection: Connection) -> list[str]:
-        """Deletes what only users saw who are deleted; returns the names of files to forget."""
+        """Deletes items that only deleted users could see; returns the names of files to delete."""
         unseen = left_alone(ITEM.c.created_by, ITEM.c.published_in)
         rows = connection.execute(select(ITEM.c.number, ITEM.c.kind, ITEM.c.id).where(unseen)).all()
         for row in rows:
@@ -166,7 +166,7 @@ class Items:
         return names
 
     def publish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
-        """Lets a group see the caller's own item; done twice, nothing changes."""
+        """Lets a group see the caller's own item. Doing it twice changes nothing."""
         row = self._owned(connection, caller, kind, uri)
         groups = published_in(json.loads(row.published_in), group)
         demand_audience(connection, caller, _CREATE[kind], group)
@@ -174,7 +174,7 @@ class Items:
         audit(connection, caller.name, f"publish_{kind}", f"{uri} in {group}")
 
     def unpublish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
-        """Takes an item away from a group: the owner may, and who has the right to delete there."""
+        """Hides an item from a group. The owner may, and whoever has the right to delete in that group."""
         for row in self._visible(connection, caller, kind, uri):
             groups = json.loads(row.published_in)
             if row.created_by == caller.name or caller.may(_DELETE[kind], group):
@@ -250,11 +250,11 @@ class Items:
         return list(chosen.values())
 
     def _doomed(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
-        """What a deletion takes: the caller's own item, or else with the right to, all readable ones of that id.
+        """The items to delete: the caller's own one, or else, with the right to, all readable ones of this id.
 
         Raises:
-            NotFoundError: there is none, or none that the caller may know of.
-            DeniedError: it may be read, but not deleted.
+            NotFoundError: there is no such item that the caller may read.
+            DeniedError: the caller may read it, but not delete it.
         """
         found = self._visible(connection, caller, kind, uri)
         if found and found[0].created_by == caller.name:
@@ -278,7 +278,7 @@ _COLUMNS: Final[Select[Any]] = select(
 
 
 def artifact_key(uri: str) -> str:
-    """Where the bytes of an artifact lie."""
+    """The name under which the bytes of an artifact are kept."""
     return f"artifacts/{uri}"
 
 

@@ -1,4 +1,4 @@
-"""Episodes that a query means, as a recording that is made while it is sent."""
+"""Selects the episodes of a query, and opens them for a recording that is made while it is sent."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["EpisodeQuery", "Selected", "opened", "select_episodes"]
 
-_MOST: Final = 256  # recordings in one answer: all of them are open
-_CACHE_BYTES: Final = 32 << 20  # of all recordings of an answer
+_MOST: Final = 256  # most recordings of an answer: all of them are open at the same time
+_CACHE_BYTES: Final = 32 << 20  # cache of all recordings of an answer together
 
 
 class EpisodeQuery(BaseModel):
-    """Which episodes: those of which all that is given is true.
+    """A query for the episodes that meet all given conditions.
 
-    recordings: names of recordings, as headers of episodes give them. episodes: numbers, where one recording is named.
-    fields: what of the steps: "states", "actions", "infos", "frames"; rewards, flags and times are always there.
+    recordings: names of recordings, as in headers of episodes. episodes: numbers, if one recording is named. fields:
+    "states", "actions", "infos", "frames"; rewards, flags and times are always included.
     """
 
     filter: AskedFilter | None = None
@@ -46,7 +46,7 @@ class EpisodeQuery(BaseModel):
 
     @property
     def left_out(self) -> list[str]:
-        """The fields that are not asked for. Raises StorageError where there is no such field."""
+        """The fields that the query leaves out. Raises StorageError for an unknown field."""
         if self.fields is None:
             return []
         wanted = field_names(self.fields, error=StorageError)
@@ -65,12 +65,12 @@ class Selected(NamedTuple):
 def select_episodes(
     connection: Connection, caller: Caller, items: Items, query: EpisodeQuery
 ) -> list[Selected]:
-    """The episodes that a query means, of those that the caller may read.
+    """The episodes of a query that the caller may read.
 
     Raises:
         NotFoundError: there are none.
         StorageError: they are of more recordings than one answer can hold.
-        FilterError: a filter names what there is not.
+        FilterError: a filter names an unknown key.
     """
     if query.episodes is not None and len(query.recordings or ()) != 1:
         raise StorageError(
@@ -101,7 +101,7 @@ def select_episodes(
 def _each_once(
     connection: Connection, caller: Caller, numbers: Mapping[str, Sequence[int]]
 ) -> list[Selected]:
-    """Episodes by the names of their recordings; of what several people have stored, the caller's own alone."""
+    """Episodes by the names of their recordings; of those that several users have stored, the caller's own copy."""
     columns = (FILE.c.path, FILE.c.place, FILE.c.uuid, FILE.c.created_by)
     found = connection.execute(select(*columns).where(FILE.c.path.in_(map(escape_text, numbers)))).all()
     files = {unescape_text(file.path): file for file in found}
@@ -117,10 +117,10 @@ def _each_once(
 
 @contextlib.contextmanager
 def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]]:
-    """The episodes of recordings that are open in the block.
+    """Opens the selected episodes; their recordings are closed at the end of the block.
 
     Raises:
-        NotFoundError: they have been deleted meanwhile.
+        NotFoundError: some have been deleted meanwhile.
         RecordingError, FormatError: a file is gone, or damaged.
     """
     with contextlib.ExitStack() as stack:
@@ -128,7 +128,7 @@ def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]
         for name, place, numbers in selected:
             source = Recording(blobs.place(place), cache_bytes=_CACHE_BYTES // len(selected))
             recording = stack.enter_context(source)
-            recording.name = name  # what errors say: where files lie is nobody else's business
+            recording.name = name  # for error messages, which must not reveal paths on the server
             rows = recording.index[np.isin(recording.index["episode"], list(numbers))]
             if len(rows):
                 excerpts.append(Excerpt(recording, rows))

@@ -1,7 +1,7 @@
-"""What comes to a server: requests and connections, which are limited, counted and logged.
+"""Limits, counts and logs the requests and connections of a server.
 
-gate        what every request goes through
-patience    connections whose clients keep the server waiting
-metrics     what is counted, for Prometheus
+gate        wraps every request
+patience    ends connections whose clients keep the server waiting
+metrics     counters for Prometheus
 logs        the log
 """

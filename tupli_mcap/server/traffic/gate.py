@@ -1,5 +1,4 @@
-"""What every request goes through: it gets an id, its body is not too large, it is counted and logged, and what fails
-in it is told to the log alone."""
+"""Wraps every request: gives it an id, limits its body, counts and logs it, and writes errors only into the log."""
 
 from __future__ import annotations
 
@@ -51,14 +50,14 @@ class Gate:
                 if not passing.status:
                     await passing.answer(500, "the server has failed; its log says more")
                 else:
-                    raise  # the connection is broken off, so that nobody takes the answer for a whole one
+                    raise  # ends the connection, so that the client does not take the answer for complete
             finally:
                 self._note(scope, passing)
 
     def _refusal(self, scope: Scope) -> str | None:
-        """Why a body is not read."""
+        """The reason for refusing a body; None to read it."""
         headers = dict(scope["headers"])
-        if scope["method"] == "PATCH":  # whose body is measured as it comes
+        if scope["method"] == "PATCH":  # its body is measured while it arrives
             return None
         most = self._settings.max_body if scope["path"] in _CONTENT else self._settings.max_message
         said = headers.get(b"content-length", b"0")
@@ -69,7 +68,7 @@ class Gate:
     def _note(self, scope: Scope, passing: _Passing) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "-"
         route, seconds = _route(scope), time.monotonic() - passing.begun
-        status = passing.status or 499  # nobody was there any more
+        status = passing.status or 499  # the client has disconnected
         self._metrics.requests.labels(method, route, str(status)).inc()
         self._metrics.seconds.labels(method, route).observe(seconds)
         self._metrics.received.inc(passing.received)
@@ -91,7 +90,7 @@ class Gate:
 
 
 class _Passing:
-    """A request on its way through."""
+    """A request on its way through the gate."""
 
     def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
         self.id = secrets.token_hex(8)
@@ -123,6 +122,6 @@ class _Passing:
 
 
 def _route(scope: Scope) -> str:
-    """The path of a route, with the names of its parameters for their values."""
+    """The path of a route, with names of parameters in place of their values."""
     found: Any = getattr(scope.get("route"), "path", None)
     return str(found) if found else "-"

@@ -1,7 +1,7 @@
-"""The log of a server: a line for each request and each failure, JSON unless somebody reads it in a terminal.
+"""The log of a server: a line for each request and each failure, as JSON unless stderr is a terminal.
 
-Nothing of a request is written but its route, so that no token, password, ticket or name gets there. What an error says
-may have come from a stranger: nothing in a line acts on a terminal, or looks like another line.
+Of a request, only its route is written, so that no token, password, ticket or name gets into the log. Error messages
+may hold text from a stranger: control characters and line breaks in them are escaped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import structlog
 __all__ = ["LOG", "set_up"]
 
 LOG: Final = logging.getLogger("tupli_mcap.server")
-"""What is told with a message, in `extra`, gets into the line."""
+"""The logger. Fields in `extra` become fields of the line."""
 
 _SECRET: Final = re.compile(
     r"(?i)((?:ticket|token|password|secret|signature|credential|authorization|bearer)\w*[\"']?(?:\s*[=:]\s*|\s+)[\"']?)"
@@ -61,7 +61,7 @@ def _without_secrets(_logger: object, _method: str, event: MutableMapping[str, A
 
 
 def _harmless(_logger: object, _method: str, event: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Shows control characters, but the ends of the lines of a traceback, as Python writes them."""
+    """Escapes control characters, except line breaks of a traceback."""
     return {
         key: _CONTROL.sub(lambda found: repr(found[0])[1:-1], value) if isinstance(value, str) else value
         for key, value in event.items()

@@ -1,4 +1,4 @@
-"""What a server counts, for Prometheus."""
+"""The counters of a server, for Prometheus."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from tupli_mcap.storage.catalog.tables import TALLY
 
 __all__ = ["Metrics"]
 
-_SHARED: Final = "PROMETHEUS_MULTIPROC_DIR"  # where several processes of one server count together
+_SHARED: Final = (
+    "PROMETHEUS_MULTIPROC_DIR"  # the directory in which the processes of one server count together
+)
 _SECONDS: Final = (0.005, 0.02, 0.1, 0.5, 2, 10, 60, 600)
 
 
 class Metrics:
-    """Counters of requests. Usable from any thread."""
+    """Counters of requests. Thread-safe."""
 
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
@@ -39,7 +41,7 @@ class Metrics:
         )
 
     def text(self, connection: Connection) -> bytes:
-        """All that was counted, by all processes of the server, and what is kept at the moment."""
+        """The counters of all processes of the server, and the current amounts of stored data."""
         registry = CollectorRegistry()
         if os.environ.get(_SHARED):
             MultiProcessCollector(registry)  # type: ignore[no-untyped-call]

@@ -1,5 +1,5 @@
-"""Connections whose clients keep the server waiting are ended: who never finishes the head of a request, stops in the
-middle of a body, or does not take the answer; and those whose heads do not end."""
+"""Ends connections whose clients keep the server waiting: those that do not finish the head of a request, stop in the
+middle of a body, or do not read the answer; and those with endless heads."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _MOST_HEAD: Final = 128 << 10  # bytes; a piece of the body may have come with i
 
 
 class PatientProtocol(HttpToolsProtocol):
-    """A connection of uvicorn that is ended `head_seconds` after a request began and its head is not there, or when its
-    client has neither sent what it has announced nor taken what it has asked for, in `stall_seconds`."""
+    """A connection of uvicorn. It is ended if the head of a request takes longer than `head_seconds`, or if the client
+    has neither sent nor read anything for `stall_seconds` while it should."""
 
     def __init__(self, *args: Any, head_seconds: float, stall_seconds: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.access_log = False  # whoever listens: its lines hold addresses with tickets
+        self.access_log = False  # because its lines hold addresses with tickets
         self._patience = head_seconds, stall_seconds
-        self._head_since: float | None = None  # a request has begun then, and its head is not there
-        self._head_size = 0  # what has come of it
-        self._moved = 0.0  # when the client has sent or taken something
+        self._head_since: float | None = None  # when a request began whose head is not complete
+        self._head_size = 0  # bytes of it that have arrived
+        self._moved = 0.0  # when the client last sent or read something
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

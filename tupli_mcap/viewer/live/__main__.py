@@ -1,8 +1,8 @@
-"""The process that shows a rollout: follows the recording until nobody records any more.
+"""The process that shows a rollout: follows the recording until the recorder has finished.
 
 The recorder writes a line of JSON to its stdin for each file: path, UUID, and the offset at which this session begins.
-It says nothing else: a recorder that closes its file, or is killed, lets go of the file's lock. The process sleeps 50
-times as long as it kept a core busy, and longer while no viewer is there.
+It sends nothing else: when a recorder closes its file, or is killed, the file's lock is released. The process sleeps 50
+times as long as it kept a core busy, and longer while no viewer is connected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from tupli_mcap.viewer.live.target import Target, parse_target
 _SHORTEST_REST = 1 / 20  # seconds between two looks
 _IDLE_REST = 0.25  # the same while there is no viewer
 _LONGEST_REST = 3.0
-_REST = 50.0  # times as long as the last look kept a core busy
+_REST = 50.0  # the process sleeps so many times as long as its last look kept a core busy
 _PATIENCE = 60.0  # seconds for the recorder to name a file
 
 
@@ -36,11 +36,11 @@ class LiveView(Protocol):
         ...
 
     def go_on(self, path: Path) -> None:
-        """Goes on with another file of the same rollout."""
+        """Continues with another file of the same rollout."""
         ...
 
     def close(self) -> None:
-        """Lets go of the viewer, which stays open."""
+        """Disconnects from the viewer, which stays open."""
         ...
 
 
@@ -70,7 +70,7 @@ class _Files:
 
 
 def _run(view: LiveView, files: _Files) -> None:
-    """Shows the files one after the other, each until nobody records it any more."""
+    """Shows the files one after another, each until its recorder has finished it."""
     file = files.next(_PATIENCE)
     while file is not None:
         _show(view, files, *file)
@@ -107,22 +107,22 @@ def _view_of(target: Target, title: str) -> LiveView:
 
 
 def _say(text: str) -> None:
-    """Writes to stderr, which is that of the recorder's process."""
+    """Writes to stderr, which this process shares with the recorder."""
     with contextlib.suppress(OSError, ValueError):
         print(f"tupli-mcap: {text}", file=sys.stderr, flush=True)
 
 
 def main() -> None:
-    """Shows the rollout. Whatever fails here is said once, and the recorder goes on."""
+    """Shows the rollout. An error is printed once, and does not disturb the recorder."""
     live, title = sys.argv[1:]
     try:
         view = _view_of(parse_target(live), title)
-    except (OSError, RuntimeError, TupliError) as err:  # the port is taken, say
+    except (OSError, RuntimeError, TupliError) as err:  # for example, the port is taken
         _say(f"live={live!r} cannot show the rollout ({err}); it is recorded all the same")
         return
     try:
         _run(view, _Files())
-    except Exception as err:  # noqa: BLE001 - of what kind ever
+    except Exception as err:  # noqa: BLE001 - a bug of ours
         _say(f"the live view has ended ({type(err).__name__}: {err}); the recording goes on")
     with contextlib.suppress(Exception):
         view.close()
