@@ -1,6 +1,6 @@
-"""What a server stores, in transactions of whoever calls.
+"""The stored items of a server. Every function works in the transaction of its caller.
 
 items                benchmarks and artifacts
-episodes, arrivals   recordings and their episodes: those that are there, and those that come
-selection            the episodes that a query means, as one recording
+episodes, arrivals   recordings and their episodes: stored ones, and new ones
+selection            the episodes of a query, as one recording
 """
