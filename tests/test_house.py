@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,18 @@ def test_each_folder_says_what_is_in_it(folder: Path) -> None:
     text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
     assert text
     assert len(text.splitlines()) <= LONGEST.get(folder.name, 15)
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=name_of)
+def test_a_door_names_every_room_and_module(folder: Path) -> None:
+    """Of one or two modules, the names say enough; revisions are found by their numbers."""
+    names = {path.stem for path in folder.glob("*.py")} | {
+        path.parent.name for path in folder.glob("*/__init__.py")
+    }
+    names -= {"__init__", "__main__"}
+    text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text())) or ""
+    missing = sorted(name for name in names if not re.search(rf"\b{name}\b", text))
+    assert len(names) <= 2 or folder.name == "versions" or not missing
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=name_of)

@@ -5,12 +5,14 @@ recording                  one file: read, written, recovered, edited, checked, 
 journal, mcap, messages    what protects the steps of a killed process; the container; what is in it
 spaces, environment        leaves of Gymnasium's spaces; environments as data, and rebuilt
 schema                     the records and filters of PyTupli
-storage, benchmark         a directory of recordings; environments that are stored, and loaded again
+storage, benchmark         benchmarks and recordings in a directory or on a server; environments that have a place there
 dataset, torch             `open`: episodes wherever they lie; DataLoaders
-viewer, plots              shown by Rerun and Foxglove, live too; drawn without a viewer
+server, page, remote       shares a storage over HTTP; its pages, and `browse`; reads files at URLs
+viewer, plots              shows recordings in Rerun and Foxglove, live too; draws them without a viewer
 doctor, replay             what is odd in a recording; the same actions once more
 trust, signing             whom this user trusts, and who signed
 cli                        the commands
+errors, progress, files, jsonvalue, arrays    what all of them use
 """
 
 from __future__ import annotations

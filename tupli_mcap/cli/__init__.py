@@ -1,9 +1,18 @@
 """The command line: `tupli-mcap`. Every command parses, calls one library function, and prints.
 
-`app` lists the commands and where each of them is: `record`, `lists` (ls, episodes), `info`, `doctor`, `verify`,
-`edit` (tag, edit, merge, split, filter, recover), `replay`, `render` (render, plot), `storage` (list-..., compact,
-reindex), `bundle` (bundle, import, export), `trust` (trust, untrust). What they print is formatted by `output` and
-written by `terminal`, which lets nothing from a file reach the terminal as a control character.
+app            lists the commands, with the module of each; turns an error into a line and an exit code
+record         record
+lists, info    ls, episodes; info
+replay         view
+render         render, plot
+edit           tag, edit, merge, split, filter, trim, recover
+doctor         doctor
+verify         verify
+storage        delete, restore, compact, rename, reindex, list-benchmarks, list-artifacts, list-episodes
+share/         bundles, trust, servers
+options        options of several commands
+output         formats what is printed
+terminal       prints it, and lets no control character of a file through
 """
 
 from tupli_mcap.cli.app import app, main

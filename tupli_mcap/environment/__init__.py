@@ -1,4 +1,10 @@
-"""An environment as data: captured from a live one, rebuilt from a record, executed only where trusted."""
+"""An environment as data: captured from a live one, rebuilt from a record, executed only where trusted.
+
+_capture, _build             from an environment to an `EnvironmentRecord` (`_record`), and back
+_changes, _local_code        whether an environment is as its constructors left it; which code is the user's own
+_pickling, _imports          pickles of environments; what a pickle imports
+_arguments                   arguments that are more than data, and so need trust
+_docs                        names of dimensions and actions"""
 
 from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust

@@ -1,4 +1,5 @@
-"""The journal: what keeps each step safe before it is in the file. Both sides of each layout are here.
+"""The journal: what keeps each step safe before it is in the file. `messages.encode_rows` and `recording.write.rows`
+write rows into it.
 
 file        the mapped file, its areas, and who it belongs to
 logs        records of variable size: append, and group by channel

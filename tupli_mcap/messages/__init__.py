@@ -9,5 +9,7 @@ episodes               `/episode_start`, `/episode_end`, `/final_state`
 infos, frames          `/info`; `/camera` and `/frame`
 images/                leaves that are images: how they are compressed
 variable/              Text, Sequence, Graph and OneOf
+encode_values          the part of that function that checks and packs one value
 shared_dtypes          one dtype for values of several recordings
+cdr                    the encoding of primitives
 """

@@ -1,9 +1,11 @@
 """Runs recorded episodes again in their rebuilt environment, and compares them bit for bit.
 
-`certify` does this for a recording and returns a `Certificate`; `render` also keeps the frames that the environment
-renders. `starts` decides how each episode is started, `reapply` resets and steps the environment, `compare` compares
-with `recorded_values`, `attempt` does these three for one episode, `movie` keeps frames and writes films.
-`recorded_film` makes films of recorded pictures, and executes nothing.
+certify, certificate      takes a whole recording again, and says in a `Certificate` what agreed
+starts                    how each episode is started again
+reapply, compare          resets and steps the environment; compares what it returns with `recorded_values`
+attempt                   the three together, for one episode
+render, movie             keeps what the environment renders, too; writes it as a film
+recorded_film             a film of recorded pictures, for which nothing is executed
 """
 
 from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped

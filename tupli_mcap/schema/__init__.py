@@ -1,4 +1,10 @@
-"""What benchmarks, artifacts, episodes and people are described by, and the filters over them. No I/O."""
+"""What benchmarks, artifacts, episodes and people are described by, and the filters over them. No I/O.
+
+models, people               benchmarks, artifacts, episodes; users, groups, roles
+filters, field, parse        filters; built with `F`, read from text
+keys, values, times          what a filter names, and how it compares
+facts                        whether a filter fits what it is asked of
+predicate                    filters evaluated in memory"""
 
 from tupli_mcap.schema.facts import bound, check_keys, filter_keys
 from tupli_mcap.schema.field import F

@@ -1,8 +1,16 @@
 """Shows recordings in the Rerun viewer: in a window, a browser, a notebook, or as a file.
 
-`plan` makes Rerun recordings of chosen episodes, `scene` chooses their panels (`panels`) by the spaces, `blueprints`
-arranges the panels, `blocks` reads the steps, `sending` sends columns, and `targets` writes them to a file or a viewer.
-`live` shows a rollout while it is recorded; `foxglove_layout` makes Foxglove plot a recording.
+plan                  makes Rerun recordings of chosen episodes
+scene, panels/        the panels of a recording, chosen by its spaces
+about                 panels about recordings as a whole
+blueprints            places the panels
+names                 names of panels and dimensions, safe for Rerun
+blocks, sending       reads steps, and sends them as columns
+targets               where all of it goes: a window, a browser, a file
+notebook              the viewer in a notebook
+process, sdk          the viewer's program; rerun-sdk
+live/                 a rollout while it is recorded
+foxglove_layout       a layout that makes Foxglove plot a recording
 """
 
 from __future__ import annotations

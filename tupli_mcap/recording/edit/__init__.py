@@ -1,8 +1,8 @@
 """New recordings out of others.
 
 assemble                          the new file: writes chunks, or copies them as they are, index and summary
-copy_episodes                     episodes of a recording into it
-merge, split                      several recordings into one, with new numbers; one into several
+copy_episodes                     episodes of a recording into it, under new numbers
+merge, split                      several recordings into one, numbered on; one into several
 stream                            a recording of some episodes, handed on while it is made
 rewrite                           a recording with fewer episodes
 relabel, trim                     a recording with other values of steps; with fewer steps of episodes

@@ -8,4 +8,6 @@ entries             what it holds of a recording, read here or by other processe
 rows                episodes as rows
 filter_sql          filters as SQL that finds what may match; Python looks at that again
 metadata_sql        what SQL finds in metadata
+order               the order of episodes, and where a page goes on
+tallies             numbers of each recording, without its episodes
 """

@@ -1,7 +1,7 @@
-"""Rows that are not in the file yet, a class for each kind of channel: they commit rows to a half of the journal, and
-when it is full, go on in the other one and hand over a chunk.
+"""Rows that are not in the file yet, a class for each kind of channel. Each class commits rows to a half of the
+journal; when the half is full, it goes on in the other one and hands the full one over as a chunk.
 
-contract          what all of them keep to
+contract          the interface, and the rules that every class keeps
 single, vector    steps of constant size, of one environment (put by `messages.encode_rows`) and of many
 variable          steps of variable size
 images            the images of a leaf
