@@ -18,9 +18,7 @@ from tupli_mcap.spaces.leaves import Leaf
 __all__ = ["Packed", "Source", "access_to", "add_fields", "add_structure_checks", "flag_check"]
 
 _BOOLS = b"\0\1"
-
 _LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
-
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """One recording being written: the file, its journal, its channels and its episodes.
 
-The wrappers' recorders (`single`, `vector`) put steps into the row stores made here; everything that happens once an
-episode or once a chunk is in this module. Not thread-safe.
+The recorders (`recorders`) put steps into the row stores made here (`rows`), which come into the file through `chunks`;
+what happens once an episode is in this module. Not thread-safe.
 """
 
 from __future__ import annotations

@@ -26,7 +26,6 @@ from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 __all__ = ["RecordingFiles"]
 
 _OLD_CATALOG = [f"catalog.sqlite{end}" for end in ("", "-wal", "-shm", "-journal", ".lock", ".new")]
-
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
