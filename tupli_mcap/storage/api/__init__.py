@@ -1,9 +1,9 @@
 """A storage on a server.
 
-client, people, recordings    `TupliAPIClient`: the contract of a storage, the server's people, its files
-session, answers, tokens      requests, signed in; what is answered; where tokens are kept
-outbox, waiting               recordings that are written here first and sent behind; what state they are in
-upload                        sending one of them
+client, people, recordings    `TupliAPIClient`: the methods of a storage, for people, and for recordings
+session, answers, tokens      requests with a sign-in; their answers and errors; where tokens are kept
+outbox, waiting               recordings that are written on this machine first, and sent in the background
+upload                        sending one recording
 """
 
 from tupli_mcap.storage.api.client import TupliAPIClient

@@ -1,4 +1,4 @@
-"""What a server answers: as models, or as the errors that a storage here would raise."""
+"""Turns answers of a server into models, or into the errors that a local storage would raise."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _T = TypeVar("_T")
 
 
 class UnreachableError(StorageError):
-    """The server does not answer, or not now."""
+    """The server does not answer, or cannot answer now."""
 
 
 class ConflictError(StorageError):
-    """Something else is there already."""
+    """Something with this name or id exists already."""
 
 
 class SignInError(StorageError):
@@ -60,7 +60,7 @@ class TokenPair(BaseModel):
 
 
 def as_told(kind: type[_T], value: Any) -> _T:
-    """What a server tells, as a model, or a list of them. StorageError if it is something else."""
+    """An answer as a model, or a list of models. StorageError if it does not fit."""
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as err:

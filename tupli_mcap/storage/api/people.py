@@ -24,19 +24,19 @@ __all__ = ["People"]
 
 
 class People:
-    """What a client says to a server of people. Every method may raise StorageError: the caller has not the right."""
+    """Methods for the people of a server. Every method raises StorageError if the user lacks the right."""
 
     _session: Session
 
     # --- users ---
 
     def signup(self, username: str, password: str) -> UserOut:
-        """Make a user: everybody may where the server is open to sign-ups, else who has the right to."""
+        """Create a user. Everybody may if the server is open to sign-ups; else it takes the right `user_create`."""
         wanted = {"username": username, "password": password}
         try:
             try:
                 return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted)))
-            except SignInError:  # a token that is not valid any more is worse than none
+            except SignInError:  # an expired token would be refused, but no token is needed
                 return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted, anonymous=True)))
         except TupliError as err:
             raise StorageError(f"Signup failed: {err}") from err
@@ -50,7 +50,7 @@ class People:
         return [_user(user) for user in as_told(list[_User], self._session.ask("GET", "/v1/users"))]
 
     def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
-        """Give a user another password; to change one's own, `old` is needed. All sign-ins with the old one end."""
+        """Change a user's password; for your own, `old` is needed. All sign-ins of the user end."""
         wanted = {"password": new_password, "old": old}
         self._session.ask("PUT", f"/v1/users/{_name(username)}/password", wanted)
 
@@ -61,11 +61,11 @@ class People:
     # --- groups ---
 
     def create_group(self, group: Group) -> Group:
-        """Make a group that you lead."""
+        """Create a group with you as its admin."""
         return as_told(Group, self._session.ask("POST", "/v1/groups", group.model_dump()))
 
     def list_groups(self) -> list[Group]:
-        """The groups that you may know of."""
+        """The groups that you may see."""
         return as_told(list[Group], self._session.ask("GET", "/v1/groups"))
 
     def read_group(self, group_name: str) -> GroupWithMembers:
@@ -73,17 +73,17 @@ class People:
         return _group(as_told(_Group, self._session.ask("GET", f"/v1/groups/{_name(group_name)}")))
 
     def delete_group(self, group_name: str) -> None:
-        """Delete a group; afterwards, only its owners see what was published in it."""
+        """Delete a group; what was published in it is then seen only by its owners."""
         self._session.ask("DELETE", f"/v1/groups/{_name(group_name)}")
 
     def add_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
-        """Give users roles in a group, in addition to those that they hold; all are given, or none."""
+        """Give users further roles in a group: all of them, or none."""
         wanted = [member.model_dump(exclude_none=True) for member in group_membership_query.members]
         path = f"/v1/groups/{_name(group_membership_query.group_name)}/members"
         return _group(as_told(_Group, self._session.ask("PUT", path, wanted)))
 
     def remove_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
-        """Take users out of a group, with all of their roles; who is not in it is passed over."""
+        """Remove users from a group, with all of their roles; users who are not in it are ignored."""
         name = group_membership_query.group_name
         for member in group_membership_query.members:
             self._session.ask("DELETE", f"/v1/groups/{_name(name)}/members/{_name(member.user)}")
@@ -92,7 +92,7 @@ class People:
     # --- roles ---
 
     def create_role(self, role: UserRole) -> UserRole:
-        """Make a role."""
+        """Create a role."""
         return as_told(UserRole, self._session.ask("POST", "/v1/roles", role.model_dump(mode="json")))
 
     def list_roles(self) -> list[UserRole]:
@@ -100,17 +100,18 @@ class People:
         return as_told(list[UserRole], self._session.ask("GET", "/v1/roles"))
 
     def delete_role(self, role_name: str) -> None:
-        """Delete a role, wherever it was given; nothing happens if there is none."""
+        """Delete a role, and take it from all who have it; nothing happens if there is no such role."""
         self._session.ask("DELETE", f"/v1/roles/{_name(role_name)}")
 
     # --- tokens for machines ---
 
     def create_token(self, name: str, scope: str = "read", days: int | None = 90) -> ApiToken:
-        """Make a token for a machine, which has it in TUPLI_MCAP_TOKEN. It may do what you may: read, or with the scope
-        `write` all of it, for so many days, or for ever.
+        """Create a token that gives a machine your rights. On the machine, put it into TUPLI_MCAP_TOKEN.
+
+        scope: "read", or "write" to read and write. days: how long it is valid; None for ever.
 
         Returns:
-            The token. Its text is in it this once only.
+            The token. Only this result contains its text.
         """
         wanted = {"name": name, "scope": scope, "days": days}
         return _token(as_told(_Token, self._session.ask("POST", "/v1/api-tokens", wanted)))
@@ -125,7 +126,7 @@ class People:
 
 
 def _name(name: str) -> str:
-    """A name in a path."""
+    """A name, quoted for a path."""
     return quote(str(name), safe="")
 
 

@@ -25,7 +25,7 @@ __all__ = ["Recordings"]
 
 
 class Recordings:
-    """What a client does with the files of a server."""
+    """Methods for the recordings of a server."""
 
     _session: Session
 
@@ -40,7 +40,7 @@ class Recordings:
         return self._cut(recording, episodes)
 
     def _cut(self, recording: str, episodes: Sequence[int] | None) -> Recording:
-        """A recording of some episodes of another one, which the server makes; here it is a file while it is open."""
+        """A recording of some episodes, made by the server; a temporary file holds it while it is open."""
         asked = {"recordings": [recording], "episodes": None if episodes is None else list(episodes)}
         handle, name = tempfile.mkstemp(prefix="tupli-mcap-", suffix=".mcap")
         place = Path(name)
@@ -55,12 +55,12 @@ class Recordings:
 
     @contextlib.contextmanager
     def downloaded(self, recording: str, episodes: int, what: str = "") -> Iterator[Path | None]:
-        """The file of a recording, valid in the block; None where it has other than so many episodes that may be read.
+        """The downloaded file of a recording, valid in the block; None if it has another number of readable episodes.
         `what` is part of a progress bar's text.
 
         Raises:
-            NotFoundError: there is no such recording, or another file has taken its place meanwhile.
-            FormatError: its bytes are not those that the server has named.
+            NotFoundError: there is no such recording, or another file has replaced it meanwhile.
+            FormatError: its bytes do not have the SHA-256 that the server has named.
         """
         ticket = self._ticket(recording)
         if not ticket.whole or ticket.episodes != episodes:
@@ -81,9 +81,9 @@ class Recordings:
         return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
 
     def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
-        """Store a recording that lies here; returns the name that `open_recording` takes. `tell` is told of bytes sent.
+        """Store a local recording; returns its name for `open_recording`. `tell` is called with numbers of sent bytes.
 
-        Stored twice, nothing changes; stored again after it has grown, it takes the place of the earlier one.
+        Storing it twice changes nothing; a recording that has grown replaces its earlier version.
 
         Raises:
             StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.

@@ -1,5 +1,5 @@
-"""Where a user's tokens are kept, by server: in the system's keyring where there is one, else in a file that this user
-alone can read.
+"""Keeps a user's tokens, by server: in the system's keyring if there is one, else in a file that only this user can
+read.
 
 `servers.json` in the directory of this user's configuration names the servers and who is signed in there, the one that
 was used last at the end. It is written anew whenever tokens change, in the keyring too: what was read holds for as long
@@ -28,7 +28,7 @@ _Servers = dict[str, dict[str, Any]]
 
 
 class TokenStore:
-    """Tokens by server. Usable from any thread and process.
+    """Tokens by server. Safe for threads and processes.
 
     Raises:
         StorageError: the file cannot be written, or the keyring does not give what it keeps.
@@ -41,7 +41,7 @@ class TokenStore:
         self._known: _Servers = {}
 
     def alone(self) -> contextlib.AbstractContextManager[object]:
-        """Keeps out the other processes and threads; reentrant in a thread."""
+        """A lock against other processes and threads; reentrant in a thread."""
         return self._lock
 
     def last(self) -> str:
@@ -53,14 +53,14 @@ class TokenStore:
         return str(self._servers().get(url, {}).get("username", ""))
 
     def tokens(self, url: str) -> dict[str, str]:
-        """`access_token` and `refresh_token`; empty where nobody is signed in."""
+        """`access_token` and `refresh_token`; empty if nobody is signed in."""
         found = self._servers().get(url, {})
         if "keyring" in found and "access_token" not in found:
             found |= _from_keyring(found["keyring"])
         return {name: str(found[name]) for name in _TOKENS if name in found}
 
     def put(self, url: str, username: str, tokens: dict[str, Any]) -> None:
-        """Keeps the tokens of a user of a server, which is the last one from now on."""
+        """Keeps the tokens of a user, and makes the server the last used one."""
         told, account = {name: str(tokens[name]) for name in _TOKENS}, f"{username} at {url}"
         if _into_keyring(account, told):
             told = {"keyring": account}
@@ -76,7 +76,7 @@ class TokenStore:
             self._write({**self._others(url), url: {}})
 
     def use(self, url: str) -> None:
-        """Notes a server as the last one."""
+        """Makes a server the last used one."""
         with self._lock:
             if self.last() != url:
                 self._write({**self._others(url), url: self._stored().get(url, {})})
@@ -110,7 +110,7 @@ class TokenStore:
 
 
 def _keyring() -> KeyringBackend | None:
-    """The system's keyring; None where there is none, or nothing that speaks to it."""
+    """The system's keyring; None if there is none, or the package `keyring` is not installed."""
     try:
         import keyring
     except ImportError:

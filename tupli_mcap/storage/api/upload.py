@@ -1,5 +1,5 @@
-"""A recording on its way to a server, by the tus protocol: broken off, it goes on where it was; its SHA-256 is checked
-there; sent twice, it is stored once."""
+"""Uploads a recording to a server with the tus protocol: an interrupted upload continues, the server checks the
+SHA-256, and a recording that is sent twice is stored once."""
 
 from __future__ import annotations
 
@@ -28,12 +28,13 @@ _TUS: Final = {"Tus-Resumable": "1.0.0"}
 
 
 def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell = lambda _: None) -> str:
-    """Sends a recording; returns what the server calls it.
+    """Sends a recording; returns its name on the server.
 
-    sent_before: episodes with lower numbers were sent before, in parts; those that are not there any more stay deleted.
+    sent_before: episodes with lower numbers were sent before, in parts; those that the server lacks were deleted there,
+        and stay so.
 
     Raises:
-        UnreachableError: the server does not answer, or breaks off again and again.
+        UnreachableError: the server does not answer, or the connection breaks again and again.
         StorageError: the server refuses it, or the file cannot be read.
     """
     with os_errors("cannot read", path), path.open("rb") as file:
