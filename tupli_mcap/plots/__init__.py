@@ -1,4 +1,4 @@
-"""Recordings as one page of pictures, without a viewer; needs the extra `plot`.
+"""Draws recordings as one page of plots, without a viewer; needs the extra `plot`.
 
 - `report` makes the page, a `Report`, and saves it as PNG, SVG, PDF or HTML.
 - `measure` reads what it shows: numbers of episodes, values of all steps, and chosen episodes step by step.

@@ -1,4 +1,4 @@
-"""Recordings as runs, runs in groups that differ by their seeds only, and where their episodes lie on the x axis."""
+"""Joins recordings to runs, and runs that differ only by their seeds to groups; places episodes on the x axis."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class PlottedRun(NamedTuple):
 
 
 class Group:
-    """What is drawn in one colour: a run, or several that differ by their seeds only; all values together."""
+    """A run, or several runs that differ only by their seeds: drawn in one colour, with all values together."""
 
     def __init__(self, name: str, runs: Sequence[PlottedRun]) -> None:
         self.name, self.runs = name, runs
@@ -113,8 +113,8 @@ def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]
 
 
 def _seedless(one: Measured) -> tuple[str, ...] | None:
-    """What runs of a group have in common: their name without the seed, with its directory where a run is named as its
-    file; environment and split. None if it names no seed."""
+    """The key that runs of a group share: the name without the seed (with the directory, if the run is named after its
+    file), the environment and the split. None if the run names no seed."""
     seed, path, given = one.run.metadata.get("seed"), Path(one.facts.name), one.run.name[:_LONGEST]
     name = _SEED.sub("", given)
     if name == given and seed is None:

@@ -1,4 +1,4 @@
-"""What a report shows of a recording: numbers of its episodes, the values in its steps, and episodes step by step."""
+"""Reads what a report shows of a recording: numbers of its episodes, values of its steps, and episodes step by step."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 class Measured:
     """One recording.
 
-    index: the rows of all its episodes. positions: of the chosen ones. rows: of those. run: whose they are.
-    numbers: of each chosen episode, NaN where there is none: `success` (0 or 1), `metadata: key`, and `info: key`, the
-    mean over those of its steps that are read. info_steps: how many steps have an info, read_infos: are read.
-    read_episodes, read_steps: how many of the chosen ones the values are from.
-    states, actions, rewards: their leaves. seeds: of the chosen episodes, each once, ascending.
+    index: the index rows of all episodes. positions, rows: positions and rows of the chosen episodes. run: their run.
+    numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata: key`, and `info: key`, the
+    mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
+    read_episodes, read_steps: how many episodes and steps the values are from.
+    states, actions, rewards: the values of their leaves. seeds: the different seeds of the chosen episodes, ascending.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Measured:
         return [*self.states, *self.actions, *self.rewards]
 
     def notes(self) -> list[str]:
-        """What the report leaves out, and what it takes a sample of; sentences."""
+        """Sentences about what the report leaves out, and what it samples."""
         notes = []
         if self.read_steps < self.steps:
             notes.append(
@@ -94,7 +94,7 @@ class Measured:
 
 
 def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES) -> Measured:
-    """Reads the episodes at some positions; of more bytes than that, randomly chosen ones.
+    """Reads the episodes at some positions; if they have more than `read_bytes`, a random choice of them.
 
     Raises:
         FormatError: the recording is damaged.
@@ -142,7 +142,7 @@ def _read(recording: Recording, positions: Array, most: int) -> tuple[dict[str, 
 
 
 def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array]:
-    """What the metadata of some episodes say in numbers, and whether the episodes succeeded."""
+    """The numbers in the metadata of some episodes, and whether the episodes succeeded."""
     texts = recording.all_metadata()
     numbers: dict[str, Array] = {}
     for at, position in enumerate(positions.tolist()):
@@ -157,7 +157,7 @@ def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array
 
 
 def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
-    """The entries of an info or of metadata that are numbers, but for those that say success."""
+    """The entries of an info or of metadata that are numbers, except those for success."""
     for key, value in said.items() if isinstance(said, Mapping) else ():
         if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
             if isinstance(value, np.floating):

@@ -1,4 +1,4 @@
-"""`report`: recordings in, one page of pictures out."""
+"""`report`: draws recordings as one page of plots."""
 
 from __future__ import annotations
 
@@ -50,16 +50,17 @@ def report(
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
             `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out.
-        episode: whose steps are shown: a number, "best", "worst", "first" or "last"; with one recording also
-            several, such as "3,7".
+        episode: the episode whose steps are shown: a number, "best", "worst", "first" or "last"; for one recording
+            also several, such as "3,7".
         episode_filter: show only episodes that match it.
-        x: what returns, lengths and the like are drawn over: "steps" of the run, "episodes" (their numbers) or "time"
-            since its start, each when an episode ended. By default episodes of one recording, and steps of several.
+        x: the horizontal axis of returns, lengths and the like: "steps" of the run, "episodes" (their numbers), or
+            "time" since its start; each at the end of an episode. By default, "episodes" for one recording, and "steps"
+            for several.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        RecordingError: there is no recording or no such episode, or `x` is none of these.
-        FilterError: the filter names an unknown field, or `episode` is none of these words.
+        RecordingError: there is no recording or no such episode, or `x` is not valid.
+        FilterError: the filter names an unknown field, or `episode` is not valid.
         FormatError: a recording is damaged.
     """
     if x is not None and x not in get_args(X):
@@ -128,11 +129,11 @@ class Report:
         return _saved(self.figure, "svg")
 
     def pdf(self) -> bytes:
-        """The bytes of a PDF of one page, as long as it has to be; its texts are texts."""
+        """The bytes of a PDF of one long page; its texts can be selected."""
         return _saved(self.figure, "pdf")
 
     def html(self) -> bytes:
-        """A page that needs nothing else: no network, no script."""
+        """A self-contained page, without network or scripts."""
         return texts.html_page(self.title, self._fragment()).encode()
 
     def _fragment(self) -> str:
@@ -191,7 +192,7 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
 
 
 def _saved(figure: Any, format: str) -> bytes:
-    """A picture's bytes, without its date and who made it: the same report gives the same bytes."""
+    """The bytes of a picture, without date and author, so that the same report gives the same bytes."""
     unnamed = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
     unnamed["pdf"] = {"CreationDate": None, "Creator": None, "Producer": None}
     with styled():
@@ -243,7 +244,7 @@ def _traces(subjects: Sequence[Subject], measured: Sequence[Measured], episode: 
 
 
 def _make_comparable(measured: Sequence[Measured]) -> list[str]:
-    """Takes the values away where spaces differ; what to say about it."""
+    """Removes values whose spaces differ between recordings; returns sentences about it."""
     spaces = [(one.layout.observation_space, one.layout.action_space) for one in measured if one.layout]
     if all(pair == spaces[0] for pair in spaces):
         return []

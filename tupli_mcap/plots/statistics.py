@@ -1,4 +1,4 @@
-"""What plots draw of many numbers: statistics of a leaf, running means, bands, and bins."""
+"""Statistics that plots draw: statistics of a leaf, running means, bands, and bins."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class LeafValues:
         return np.asarray(100 * self.counts[i] / max(1, self.values.shape[1]))
 
     def notes(self) -> list[str]:
-        """What is not shown of the leaf; sentences."""
+        """Sentences about what is not shown of the leaf."""
         name = short_path(self.leaf)
         if self.kind == "variable":
             return [f"{name} is of variable size ({type(self.leaf.space).__name__}) and not shown."]

@@ -1,4 +1,4 @@
-"""How reports look: colours that colour-blind readers tell apart, fonts, texts, axes, and a page of panels."""
+"""The look of reports: colours that colour-blind readers can tell apart, fonts, texts, axes, and a page of panels."""
 
 from __future__ import annotations
 
