@@ -23,7 +23,7 @@ from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageEr
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR, parse_filter
 from tupli_mcap.storage import FileStorage
-from tupli_mcap.storage.catalog import place
+from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
 from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
@@ -53,9 +53,14 @@ def row(episode: int = 0, metadata: Any = None, **changes: Any) -> EpisodeRow:
 
 
 def put(
-    catalog: Catalog, path: str = "a.mcap", rows: Any = (), uuid: str = "u", benchmark_id: str = "b"
+    catalog: Catalog | ServerCatalog,
+    path: str = "a.mcap",
+    rows: Any = (),
+    uuid: str = "u",
+    benchmark_id: str = "b",
+    runs: str = "[{}]",
 ) -> None:
-    catalog.put_recording(path, STAMP, uuid=uuid, benchmark_id=benchmark_id, rows=rows)
+    catalog.put_recording(path, STAMP, uuid=uuid, benchmark_id=benchmark_id, rows=rows, runs=runs)
 
 
 @pytest.fixture
@@ -242,7 +247,7 @@ class TestOrder:
                 )
                 for i in range(40)
             ]
-            put(any_catalog, path, rows, uuid=path)
+            put(any_catalog, path, rows, uuid=path, runs=json.dumps([{"name": f"run 1% {path}"}]))
         return any_catalog
 
     @pytest.mark.parametrize("text", ["", "steps > 1", "metadata.score != 3"])
@@ -252,7 +257,9 @@ class TestOrder:
         for key, descending in itertools.product(keys, (False, True)):
             self.check_pages(mixed, wanted, key, descending)
 
-    def check_pages(self, mixed: Catalog | ServerCatalog, wanted: Any, key: str, descending: bool) -> None:
+    def check_pages(
+        self, mixed: Catalog | ServerCatalog, wanted: Any, key: str, descending: bool, limit: int = 7
+    ) -> None:
         sort = Sort(key, descending) if key else None
         with mixed._read() as connection:
             whole = [header.id for header in find_episodes(connection, wanted, sort=sort)]
@@ -261,11 +268,50 @@ class TestOrder:
             for backwards in (False, True):
                 after, paged = None, []
                 while page := list(
-                    find_episodes(connection, wanted, limit=7, sort=sort, after=after, backwards=backwards)
+                    find_episodes(
+                        connection, wanted, limit=limit, sort=sort, after=after, backwards=backwards
+                    )
                 ):
                     paged += [header.id for header in page]
                     after = After(page[-1].recording, page[-1].episode)
                 assert paged == (whole[::-1] if backwards else whole)
+
+    @pytest.mark.parametrize("few", [0, 5, 1000])
+    def test_each_way_to_a_page_leads_to_the_same_episodes(
+        self, mixed: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch, few: int
+    ) -> None:
+        """By an index that names few; through the next episodes; by several indexes; by nothing of the kind."""
+        for name, value in {"_FEW": few, "_NEAR": 9, "_MOST": 50, "_RECORDINGS": 1}.items():
+            monkeypatch.setattr(pages, name, value)
+        mixed.declare_key("metadata.score")
+        score, time = F("metadata.score"), F("created_at")
+        second = CREATED_NS // 1000 * 1000 + 10**9
+        for wanted in (
+            (score > 0) & (F("steps") > 1),
+            (score >= 0) & (score < 3.2) & (F("return") == 1),
+            (score == "a") | (score == 3),
+            score.isin([3, "b", None, 2**70]) & (F("steps").isin([1, 3])),
+            (score < "b") & ((F("steps") >= 2) & (F("steps") < 3)),
+            ~(score == 3) & (F("return") < 0),
+            score > 10**400,
+            (time >= second) & (time < second + 2 * 10**9) & (F("recording") != "a.mcap"),
+            (time == second) | (time > second + 3 * 10**9),
+            (F("run.name") == "run 1% a.mcap") & (F("benchmark_id") == "b"),
+            F("run.name").isin(["run 1% b.mcap", "run"]) & (score == 3),
+            F("run.name") == "run _% a.mcap",
+        ):
+            for key, descending in (("", False), ("return", True)):
+                self.check_pages(mixed, wanted, key, descending)
+
+    def test_recordings_of_few_episodes_are_asked_about_together(
+        self, any_catalog: Catalog | ServerCatalog
+    ) -> None:
+        paths = [f"{number:03}.mcap" for number in range(250)]
+        for path in reversed(paths):
+            put(any_catalog, path, [row(i, {"n": i}) for i in range(2)], uuid=path)
+        put(any_catalog, "100a.mcap", [row(i, {"n": i}) for i in range(1200)], uuid="a")
+        for wanted in (None, F("metadata.n") == 1, F("recording") >= "1"):
+            self.check_pages(any_catalog, wanted, "", False, 90)
 
     def test_a_page_after_what_is_gone(self, mixed: Catalog | ServerCatalog) -> None:
         gone = After("a.mcap", 99)

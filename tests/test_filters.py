@@ -305,6 +305,7 @@ class TestOneMeaning:
         for catalog in catalogs:
             fill(catalog, headers)
             assert [header.episode for header in catalog.episodes(filter)] == expected
+            assert [header.episode for header in catalog.episodes(filter, limit=2)] == expected[:2]
             assert [header.episode for header in catalog.episodes(~again)] == [
                 header.episode for header in headers if not predicate(header)
             ]

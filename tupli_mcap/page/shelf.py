@@ -12,8 +12,9 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 from tupli_mcap.storage.catalog.tables import EPISODE
+from tupli_mcap.storage.catalog.tallies import recordings_seen
 
-__all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes"]
+__all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes", "seen_recordings"]
 
 T = TypeVar("T")
 
@@ -69,6 +70,11 @@ class Shelf(Protocol):
 def seen_episodes(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
     """A condition for the episodes that the reader may see and that meet all conditions."""
     return and_(shelf.seen(EPISODE.c.created_by, EPISODE.c.published_in), *conditions)
+
+
+def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
+    """The recordings of which some episodes may be read, and that all conditions are true of."""
+    return and_(recordings_seen(shelf.seen), *conditions)
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:

@@ -22,7 +22,7 @@ from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import of_dataset
 from tupli_mcap.page.routes.episode import Seen, look
-from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes
+from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes, seen_recordings
 from tupli_mcap.page.sparks import sparks_of
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
@@ -93,8 +93,8 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
         if uris:
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        only = seen_episodes(shelf, *([of_dataset(dataset)] if dataset else []))
-        return each_once(find_episodes(connection, wanted, only=only), shelf.user)
+        of = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
+        return each_once(find_episodes(connection, wanted, only=seen_episodes(shelf), of=of), shelf.user)
 
     headers = shelf.ask(ask)
     if not headers:

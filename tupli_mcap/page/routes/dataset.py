@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from markupsafe import Markup
-from sqlalchemy import ColumnElement, Connection
+from sqlalchemy import Connection
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
@@ -24,7 +24,7 @@ from tupli_mcap.page.samples import (
     sample_numbers,
     sample_values,
 )
-from tupli_mcap.page.shelf import Shelf, python_line, seen_episodes
+from tupli_mcap.page.shelf import Shelf, python_line, seen_episodes, seen_recordings
 from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import describe
@@ -112,8 +112,9 @@ def shown_first(shelf: Shelf, connection: Connection, dataset: Dataset, show: st
     else:
         chosen = min(known, key=lambda item: item.return_least or 0.0)
         order = Sort("return")
-    only: ColumnElement[bool] = seen_episodes(shelf, of_dataset(dataset.key), of_recording(chosen.recording))
-    return next(find_episodes(connection, None, limit=1, only=only, sort=order), None)
+    of = seen_recordings(shelf, of_dataset(dataset.key), of_recording(chosen.recording))
+    found = find_episodes(connection, None, limit=1, only=seen_episodes(shelf), of=of, sort=order)
+    return next(found, None)
 
 
 def _ends(values: Array) -> str:

@@ -17,7 +17,7 @@ from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
 from tupli_mcap.page.datasets import Dataset, dataset_of, of_dataset, of_recording
 from tupli_mcap.page.pictures import Camera, cameras_of
-from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes
+from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
 from tupli_mcap.page.texts import iso
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_bound
@@ -175,7 +175,8 @@ def _neighbours(
                 wanted,
                 limit=1,
                 after=at,
-                only=seen_episodes(shelf, *of),
+                only=seen_episodes(shelf),
+                of=seen_recordings(shelf, *of),
                 sort=order,
                 backwards=backwards,
             ),

@@ -18,7 +18,7 @@ from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
-from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes
+from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
 
@@ -132,7 +132,8 @@ def table_of(
     try:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         order = Sort.parse(sort)
-        only = seen_episodes(shelf, *([of_dataset(dataset)] if dataset else []))
+        only = seen_episodes(shelf)
+        of_some = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
         at = find_episode(shelf, connection, after or before) if after or before else None
         found = list(
             find_episodes(
@@ -140,6 +141,7 @@ def table_of(
                 wanted,
                 limit=most + 1,
                 only=only,
+                of=of_some,
                 sort=order,
                 after=None if at is None else After(at.recording, at.episode),
                 backwards=bool(before),
@@ -150,7 +152,7 @@ def table_of(
     more, rows = len(found) > most, found[:most]
     if before:
         rows.reverse()
-    count = count_episodes(connection, wanted, only=only, most=_COUNTED + 1)
+    count = count_episodes(connection, wanted, only=only, of=of_some, most=_COUNTED + 1)
     return Table(
         rows,
         count=count if count <= _COUNTED else None,

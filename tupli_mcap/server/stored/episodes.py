@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import Connection, and_, delete, select, update
@@ -18,7 +19,7 @@ from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.queries import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
-from tupli_mcap.storage.catalog.tallies import tally
+from tupli_mcap.storage.catalog.tallies import Seen, recordings_seen, tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
@@ -55,13 +56,19 @@ def find_episodes(
     only: ColumnElement[bool] | None = None,
 ) -> Iterator[EpisodeHeader]:
     """The readable episodes that match a filter, see `queries.find_episodes`."""
-    seen = _seen(caller) if only is None else and_(_seen(caller), only)
-    return queries.find_episodes(connection, filter, limit=limit, offset=offset, after=after, only=seen)
+    seen = _seen(caller)
+    rows, of = seen(EPISODE.c.created_by, EPISODE.c.published_in), recordings_seen(seen)
+    rows = rows if only is None else and_(rows, only)
+    return queries.find_episodes(
+        connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of
+    )
 
 
 def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
     """The number of readable episodes that match a filter."""
-    return queries.count_episodes(connection, filter, only=_seen(caller))
+    seen = _seen(caller)
+    rows, of = seen(EPISODE.c.created_by, EPISODE.c.published_in), recordings_seen(seen)
+    return queries.count_episodes(connection, filter, only=rows, of=of)
 
 
 def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
@@ -92,8 +99,8 @@ def whole_name(name: str) -> str:
     return f"{stem}.mcap" if part else name
 
 
-def _seen(caller: Caller) -> ColumnElement[bool]:
-    return readable(caller, Right.EPISODE_READ, EPISODE.c.created_by, EPISODE.c.published_in)
+def _seen(caller: Caller) -> Seen:
+    return partial(readable, caller, Right.EPISODE_READ)
 
 
 # --- changing ---

@@ -1,6 +1,7 @@
 """The catalog of a storage: a database of its episodes, a cache that may be deleted at any time.
 
 catalog             answers queries, and takes in recordings
+pages               a page of episodes, found without a look at all others
 queries             what is asked of the tables, in any SQL database
 database, tables    the database, and what is in it
 place               where it lies, for this user alone

@@ -15,10 +15,25 @@ import math
 import operator
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import and_, case, false, func, not_, or_, select, true, union_all
+from sqlalchemy import (
+    CompoundSelect,
+    Select,
+    and_,
+    case,
+    exists,
+    false,
+    func,
+    intersect,
+    not_,
+    or_,
+    select,
+    true,
+    tuple_,
+    union_all,
+)
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.messages.episodes import END_NAMES
@@ -29,17 +44,37 @@ from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import kind_at, text_at, value_at
 from tupli_mcap.storage.catalog.rows import indexed_text, nearest_float
-from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE, first_of
+from tupli_mcap.storage.catalog.tables import (
+    EPISODE,
+    EPISODE_BITS,
+    INDEXED_FACTS,
+    RECORDING,
+    TALLY,
+    VALUE,
+    first_of,
+)
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["Narrowed", "merged", "narrowed"]
+__all__ = [
+    "Condition",
+    "Narrowed",
+    "Source",
+    "merged",
+    "narrowed",
+    "recordings_of",
+    "sources",
+    "with_recording",
+]
 
 Condition = ColumnElement[bool]
+Source = Select[Any] | CompoundSelect[Any]
+"""A query of ids of episodes."""
 
 # A statement has so many comparisons with so many values each at most: databases have limits of both.
 _MOST_COMPARISONS: Final = 64
 _MOST_VALUES: Final = 250
 
+_PLAIN: Final = re.compile(r"[ !#-.0-\[\]-~]{0,1000}")  # printable ASCII without " \ and /
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 # SQLite reads a decimal number to within a few units in the last place.
 _READ_WITHIN: Final = 1e-12
@@ -105,6 +140,78 @@ def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narr
     return found if len(kept) == len(parts) else found._replace(exact=False)
 
 
+def recordings_of(filter: BaseFilter) -> Condition:
+    """A condition on rows of `RECORDING` alone that is true of all whose episodes a filter may be true of."""
+    if filter.type is FilterType.AND:
+        return and_(true(), *(recordings_of(part) for part in filter.filters))
+    if filter.type in COMBINING:
+        return true()
+    path = path_of(filter)
+    if path[0] in ("recording", "benchmark_id"):
+        return _compared(filter).condition
+    if path == ("created_at",):
+        return _recorded(filter)
+    if path == ("run", "name") and filter.type in (FilterType.EQ, FilterType.IN):
+        return _of_runs(filter)
+    return true()
+
+
+def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
+    """Queries of ids of episodes that an index answers: what a filter is true of is in the result of each.
+
+    Those of ranges are in the order of their index: a database that thinks that a few of many are asked for would look
+    for them in the table.
+    """
+    if filter.type is FilterType.AND:
+        parts = [*_leaves(filter)]
+    else:
+        parts = [] if filter.type in COMBINING else [filter]
+    values: dict[int, list[list[Condition]]] = {}
+    facts: dict[str, list[Condition]] = {}
+    for part in parts:
+        path = path_of(part)
+        if part.type in _NOT_INDEXED:
+            continue
+        if path[0] in INDEXED_FACTS:
+            facts.setdefault(path[0], []).append(_compared(part).condition)
+        elif path in indexed:
+            values.setdefault(indexed[path], []).append(_near_value(part))
+    of_facts = (
+        select(EPISODE.c.id).where(*conditions).order_by(EPISODE.c[name], EPISODE.c.id)
+        for name, conditions in facts.items()
+    )
+    return [*of_facts, *(_in_order(_ids_of(key, values[key])) for key in values)]
+
+
+def with_recording(source: Source) -> Select[Any]:
+    """Ids of episodes, and of their recordings: PostgreSQL hashes ids alone so that many of them collide."""
+    row_id = source.subquery().c[0]
+    return select(row_id, row_id // (1 << EPISODE_BITS))
+
+
+def _in_order(source: Source) -> Source:
+    by = (VALUE.c.number, VALUE.c.text, VALUE.c.episode_id)
+    return source.order_by(*by) if isinstance(source, Select) else source
+
+
+def _ids_of(key: int, parts: Sequence[Sequence[Condition]]) -> Source:
+    """The ids of episodes that `VALUE` has at a key; one of the alternatives of each part has to be true there."""
+    most = max(parts, key=len)
+    if len(most) == 1:
+        return select(VALUE.c.episode_id).where(VALUE.c.key == key, *(part[0] for part in parts))
+    each = (select(VALUE.c.episode_id).where(VALUE.c.key == key, either) for either in most)
+    return union_all(*each)  # an index leads to each of them, and not to what one OR says
+
+
+def _leaves(filter: BaseFilter) -> Iterator[BaseFilter]:
+    """The comparisons that all have to be true for a filter to be."""
+    for part in filter.filters:
+        if part.type is FilterType.AND:
+            yield from _leaves(part)
+        elif part.type not in COMBINING:
+            yield part
+
+
 def merged(filter: BaseFilter) -> BaseFilter:
     """The same filter, where parts of an OR that ask one key for one value each are one IN."""
     if filter.type not in COMBINING:
@@ -134,21 +241,24 @@ def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], negated:
 def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
     """Where all filters are true; what asks `VALUE` for one key is asked together."""
     parts: list[Narrowed] = []
-    values: dict[int, list[Condition]] = {}
+    values: dict[int, list[list[Condition]]] = {}
     few = not negated and any(_names_few(part) for part in filters)
     for part in filters:
         if part.type in COMBINING:
             parts.append(_narrow(part, indexed, negated))
             continue
-        narrow = _compared(part)
+        path, narrow = path_of(part), _compared(part)
         if negated:
             narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else _ALL
-        elif path_of(part) in indexed and part.type not in _NOT_INDEXED and not few:
-            near = _near(part, VALUE.c.number, VALUE.c.text)
-            values.setdefault(indexed[path_of(part)], []).append(near)
+        elif path in indexed and part.type not in _NOT_INDEXED and not few:
+            values.setdefault(indexed[path], []).append(_near_value(part))
+            narrow = _ALL if path[0] == "metadata" else narrow
         parts.append(narrow)
-    held = (select(VALUE.c.episode_id).where(VALUE.c.key == key, *values[key]) for key in values)
-    conditions = [*(part.condition for part in parts), *(EPISODE.c.id.in_(ids) for ids in held)]
+    conditions = [part.condition for part in parts]
+    if values:
+        held = [with_recording(_ids_of(key, values[key])) for key in values]
+        both = tuple_(EPISODE.c.id, EPISODE.c.recording_id)
+        conditions.append(both.in_(held[0] if len(held) == 1 else intersect(*held)))
     return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))
 
 
@@ -212,26 +322,63 @@ def _one_of(column: ColumnElement[Any], values: Sequence[Any]) -> Narrowed:
     return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
 
 
-def _near(
-    filter: BaseFilter, number: ColumnElement[Any], text: ColumnElement[Any] | None = None
-) -> Condition:
-    """A comparison, other than NE, with what is stored as the nearest float, or the beginning of a text."""
+def _recorded(filter: BaseFilter) -> Condition:
+    """Recordings of the time that a filter names."""
+    parts = []
+    if filter.type in (FilterType.GT, FilterType.GEQ, FilterType.EQ):
+        parts.append(_of_integers(filter.model_copy(update={"type": FilterType.GEQ}), TALLY.c.last).condition)
+    if filter.type in (FilterType.LT, FilterType.LEQ, FilterType.EQ):
+        parts.append(
+            _of_integers(filter.model_copy(update={"type": FilterType.LEQ}), TALLY.c.first).condition
+        )
+    return exists().where(TALLY.c.recording_id == RECORDING.c.id, *parts) if parts else true()
+
+
+def _of_runs(filter: BaseFilter) -> Condition:
+    """Recordings whose runs, which are JSON, hold a text that is the same in all JSON."""
+    texts = filter.value if filter.type is FilterType.IN else [filter.value]
+    if len(texts) > _MOST_VALUES or not all(
+        isinstance(text, str) and _PLAIN.fullmatch(text) for text in texts
+    ):
+        return true()
+    return or_(false(), *(RECORDING.c.runs.contains(f'"{text}"', autoescape=True) for text in texts))
+
+
+def _near(filter: BaseFilter, number: ColumnElement[Any]) -> Condition:
+    """A comparison, other than NE, with what is stored as the nearest float."""
+    numbers, _ = _wanted(filter)
+    if filter.type in ORDERING:
+        return _ordered(filter, number, numbers)
+    null = any(value is None for value in (filter.value if filter.type is FilterType.IN else [filter.value]))
+    return or_(_any_of(number, numbers), number.is_(None) if null else false())
+
+
+def _near_value(filter: BaseFilter) -> list[Condition]:
+    """A comparison, other than NE, with what `VALUE` holds, where one of several conditions has to be true: an index
+    leads to each of them, but not to all in one OR."""
+    number, text = VALUE.c.number, VALUE.c.text
+    numbers, texts = _wanted(filter)
+    if filter.type in ORDERING:
+        return [_ordered(filter, number, numbers) if numbers else _ordered(filter, text, texts)]
+    conditions = [and_(number.is_(None), text.is_(None))]  # null, a list, ...
+    conditions += [_any_of(number, numbers)] if numbers else []
+    conditions += [and_(number.is_(None), _any_of(text, texts))] if texts else []
+    return conditions
+
+
+def _wanted(filter: BaseFilter) -> tuple[list[float], list[str]]:
+    """The values that are compared, as they are stored: the nearest floats, and the beginnings of texts."""
     wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
     numbers = [nearest_float(scalar.value) for scalar in wanted if scalar.kind in ("number", "bool")]
-    texts = [indexed_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
-    if filter.type not in (FilterType.EQ, FilterType.IN):
-        rising = filter.type in (FilterType.GT, FilterType.GEQ)
-        if numbers:
-            return number >= numbers[0] if rising else number <= numbers[0]
-        if text is None or not texts:
-            return false()
-        return text >= texts[0] if rising else text <= texts[0]
-    parts = [_any_of(number, numbers)]
-    if any(scalar.kind == "null" for scalar in wanted):
-        parts.append(number.is_(None))
-    if text is not None:
-        parts.append(and_(number.is_(None), or_(text.is_(None), _any_of(text, texts))))  # neither: a list
-    return or_(*parts)
+    return numbers, [indexed_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
+
+
+def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[Any]) -> Condition:
+    if not wanted:
+        return false()
+    rising = filter.type in (FilterType.GT, FilterType.GEQ)
+    condition: Condition = column >= wanted[0] if rising else column <= wanted[0]
+    return condition
 
 
 def _in_metadata(filter: BaseFilter) -> Condition:

@@ -12,7 +12,7 @@ from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.schema import EpisodeHeader, join_key
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.storage.catalog.metadata_sql import number_at, text_at
-from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
+from tupli_mcap.storage.catalog.tables import EPISODE, LAST_EPISODE, RECORDING, first_of, of_one_recording
 from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["After", "Place", "Sort", "beyond", "places"]
@@ -58,16 +58,23 @@ class Place(NamedTuple):
     descending: bool
 
 
-def places(sort: Sort | None, *, few: bool, backwards: bool = False) -> list[Place]:
+def places(
+    sort: Sort | None,
+    *,
+    few: bool,
+    backwards: bool = False,
+    row_id: ColumnElement[int] = EPISODE.c.id,
+) -> list[Place]:
     """What episodes are ordered by, the most important first.
 
     few: whether they are few among many. Given the bare path to sort by, SQLite walks all episodes in order.
+    row_id: the column that has their ids.
 
     Raises:
         FilterError: there is no such key, or it cannot be sorted by.
     """
     path = func.coalesce(RECORDING.c.path, "") if few else RECORDING.c.path
-    found = [*([] if sort is None else _of_key(sort)), Place(path, False), Place(EPISODE.c.id, False)]
+    found = [*([] if sort is None else _of_key(sort)), Place(path, False), Place(row_id, False)]
     return [Place(value, not falling) for value, falling in found] if backwards else found
 
 
@@ -79,8 +86,7 @@ def beyond(connection: Connection, order: Sequence[Place], after: After) -> Colu
     """
     reached: Sequence[Any] | None
     if len(order) == _BY_RECORDING:
-        order = [order[0], Place(EPISODE.c.episode, order[1].descending)]
-        reached = (escape_text(after.recording), after.episode)
+        reached = (escape_text(after.recording), first_of(RECORDING.c.id) + min(after.episode, LAST_EPISODE))
     else:
         this = and_(RECORDING.c.path == escape_text(after.recording), EPISODE.c.episode == after.episode)
         values = select(*(value for value, _ in order)).join(RECORDING, of_one_recording()).where(this)

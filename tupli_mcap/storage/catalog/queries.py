@@ -13,17 +13,28 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from sqlalchemy import Connection, Select, Table, and_, delete, func, insert, select, true
+from sqlalchemy import (
+    Connection,
+    CursorResult,
+    Select,
+    Table,
+    and_,
+    delete,
+    func,
+    insert,
+    select,
+    true,
+)
 from sqlalchemy.exc import DBAPIError
-from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
-from tupli_mcap.storage.catalog.filter_sql import Narrowed, merged, narrowed
-from tupli_mcap.storage.catalog.order import After, Place, Sort, beyond, places
+from tupli_mcap.storage.catalog.filter_sql import Condition, Narrowed, merged, narrowed, recordings_of
+from tupli_mcap.storage.catalog.order import After, Sort, beyond
+from tupli_mcap.storage.catalog.pages import Asked, candidates
 from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
     StoredRow,
@@ -62,6 +73,8 @@ __all__ = [
 ]
 
 _ROWS_AT_ONCE: Final = 20_000
+_MOST_NEAR: Final = 200  # episodes of a page, and those before it
+_FIRST_ROWS: Final = 100
 _ROWS_OF_ANSWER: Final = 500  # as many recordings are named in a statement at most
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
@@ -97,13 +110,15 @@ def find_episodes(
     limit: int | None = None,
     offset: int = 0,
     after: After | None = None,
-    only: ColumnElement[bool] | None = None,
+    only: Condition | None = None,
+    of: Condition | None = None,
     sort: Sort | None = None,
     backwards: bool = False,
 ) -> Iterator[EpisodeHeader]:
     """The episodes that match a filter, by default ordered by recording (path) and episode number.
 
-    after: where to go on. only: a condition on rows of EPISODE and RECORDING that holds besides the filter.
+    after: where to go on. only, of: conditions that hold besides the filter: on rows of EPISODE and RECORDING, and on
+    rows of RECORDING alone, which spares a look at the episodes of others.
     backwards: in the opposite order; `after` is then the episode before which they lie.
 
     Raises:
@@ -111,14 +126,19 @@ def find_episodes(
             the key to sort by is unknown.
         NotFoundError: The episode to go on after is gone.
     """
-    meant, order = _bound(filter), places(sort, few=filter is not None, backwards=backwards)
-    found = _narrowed(connection, meant, only)
-    if after is not None:
-        found = found._replace(condition=and_(found.condition, beyond(connection, order, after)))
-    if found.exact:
-        return _headers(connection, meant, found, order, limit, offset)
-    headers = _headers(connection, meant, found, order, None, 0)
-    return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
+    asked = _asked(connection, filter, only, of)._replace(sort=sort, after=after, backwards=backwards)
+    if limit is None:
+        return _all_of_them(connection, asked, None, offset)
+    wanted = offset + limit
+    if wanted <= (_MOST_NEAR if filter is not None else _ROWS_AT_ONCE):
+        for ids, most in candidates(connection, asked, wanted):
+            if filter is None:
+                return _looked_at(connection, asked, itertools.islice(ids, offset, None))
+            counted = _Counted(ids)
+            found = list(itertools.islice(_looked_at(connection, asked, counted), wanted))
+            if len(found) == wanted or counted.count < most:
+                return iter(found[offset:])
+    return _all_of_them(connection, asked, limit, offset)
 
 
 def each_once(headers: Iterable[EpisodeHeader], user: str) -> list[EpisodeHeader]:
@@ -134,26 +154,26 @@ def count_episodes(
     connection: Connection,
     filter: BaseFilter | None,
     *,
-    only: ColumnElement[bool] | None = None,
+    only: Condition | None = None,
+    of: Condition | None = None,
     most: int | None = None,
 ) -> int:
     """How many episodes match a filter, counted up to `most`. Raises as `find_episodes` does."""
-    meant = _bound(filter)
-    found = _narrowed(connection, meant, only)
+    asked = _asked(connection, filter, only, of)
+    found = _narrowed(asked)
     if found.exact and most is None:
-        return int(connection.execute(_query(meant, found, func.count())).scalar_one())
+        return int(connection.execute(_query(asked, found, func.count())).scalar_one())
     if found.exact:
-        some = _query(meant, found, EPISODE.c.id).limit(most).subquery()
+        some = _query(asked, found, EPISODE.c.id).limit(most).subquery()
         return int(connection.execute(select(func.count()).select_from(some)).scalar_one())
-    headers = _headers(connection, meant, found, places(None, few=True), None, 0)
-    return sum(1 for _ in itertools.islice(headers, most))
+    return sum(1 for _ in itertools.islice(_all_of_them(connection, asked, None, 0), most))
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
     """The SQL of a filter, its parameters, the database's plan for it, and whether Python looks at what that finds."""
-    meant = _bound(filter)
-    found = _narrowed(connection, meant, None)
-    compiled = _query(meant, found, EPISODE.c.id).compile(
+    asked = _asked(connection, filter, None, None)
+    found = _narrowed(asked)
+    compiled = _query(asked, found, EPISODE.c.id).compile(
         connection, compile_kwargs={"render_postcompile": True}
     )
     values: Any = compiled.params
@@ -206,71 +226,106 @@ def remove_recording(connection: Connection, relpath: str) -> None:
 
 
 _OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.path)
-_EVERYTHING: Final = Narrowed(true(), exact=True)
 
 
-def _bound(filter: BaseFilter | None) -> BaseFilter | None:
-    return None if filter is None else merged(bound(filter, EpisodeHeader))
+def _asked(
+    connection: Connection, filter: BaseFilter | None, only: Condition | None, of: Condition | None
+) -> Asked:
+    meant = None if filter is None else merged(bound(filter, EpisodeHeader))
+    indexed = {} if filter is None else _indexed(connection)
+    return Asked(meant, indexed, true() if only is None else only, true() if of is None else of)
 
 
-def _narrowed(
-    connection: Connection, filter: BaseFilter | None, only: ColumnElement[bool] | None
-) -> Narrowed:
-    found = _EVERYTHING if filter is None else narrowed(filter, _indexed(connection))
-    return found if only is None else found._replace(condition=and_(found.condition, only))
+def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
+    """The condition on rows of EPISODE and RECORDING; by_index: what leads to the rows, too."""
+    also = and_(asked.only, asked.of)
+    if asked.filter is None:
+        return Narrowed(also, exact=True)
+    found = narrowed(asked.filter, asked.indexed if by_index else {})
+    return found._replace(condition=and_(found.condition, recordings_of(asked.filter), also))
 
 
-def _query(filter: BaseFilter | None, found: Narrowed, *columns: Any) -> Select[Any]:
-    of = of_one_recording() if filter is not None else in_order()
+def _query(asked: Asked, found: Narrowed, *columns: Any) -> Select[Any]:
+    of = of_one_recording() if asked.filter is not None else in_order()
     return select(*columns).select_from(EPISODE.join(RECORDING, of)).where(found.condition)
 
 
-def _headers(
-    connection: Connection,
-    filter: BaseFilter | None,
-    found: Narrowed,
-    order: Sequence[Place],
-    limit: int | None,
-    offset: int,
+class _Counted:
+    """What an iterable gives, counted."""
+
+    def __init__(self, items: Iterable[int]) -> None:
+        self._items = iter(items)
+        self.count = 0
+
+    def __iter__(self) -> Iterator[int]:
+        for item in self._items:
+            self.count += 1
+            yield item
+
+
+def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iterator[EpisodeHeader]:
+    """The episodes that match, of those with some ids, in the same order."""
+    found = _narrowed(asked, by_index=False)
+    of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
+    ids, size = iter(ids), _FIRST_ROWS
+    while some := list(itertools.islice(ids, size)):
+        rows = connection.execute(of_them.where(EPISODE.c.id.in_(some), found.condition))
+        known = {row.id: row for row in rows}
+        yield from _headers(connection, asked, found, [known[number] for number in some if number in known])
+        size = _ROWS_OF_ANSWER
+
+
+def _all_of_them(
+    connection: Connection, asked: Asked, limit: int | None, offset: int
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that match a filter; `limit` and `offset` count those that SQL finds.
+    """The episodes that match, as the database finds all of them."""
+    found, order = _narrowed(asked), asked.order(few=asked.filter is not None)
+    if asked.after is not None:
+        found = found._replace(condition=and_(found.condition, beyond(connection, order, asked.after)))
+    by = [value.desc() if descending else value for value, descending in order]
+    if limit is not None and found.exact:  # a database puts ids in order quicker than whole rows
+        ids = _query(asked, found, EPISODE.c.id).order_by(*by).limit(limit).offset(offset or None)
+        return _looked_at(connection, asked, connection.execute(ids).scalars().all())
+    query = _query(asked, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
+    if found.exact:
+        query, offset = query.offset(offset or None), 0
+    rows = connection.execute(query, execution_options={"yield_per": _ROWS_OF_ANSWER})
+    headers = _in_pages(connection, asked, found, rows)
+    return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
+
+
+def _in_pages(
+    connection: Connection, asked: Asked, found: Narrowed, rows: CursorResult[Any]
+) -> Iterator[EpisodeHeader]:
+    with contextlib.closing(rows):
+        for page in rows.partitions(_ROWS_OF_ANSWER):
+            yield from _headers(connection, asked, found, page)
+
+
+def _headers(
+    connection: Connection, asked: Asked, found: Narrowed, rows: Iterable[Any]
+) -> Iterator[EpisodeHeader]:
+    """The episodes of rows, of `_COLUMNS` and `_OF_RECORDING`, that match.
 
     Raises:
         FilterError: the connection has the option `tupli_deadline`, and that has passed.
     """
-    by = [value.desc() if descending else value for value, descending in order]
-    query = _query(filter, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
-    if limit is None:
-        rows = connection.execute(
-            query.offset(offset or None), execution_options={"yield_per": _ROWS_OF_ANSWER}
-        )
-    else:  # first which ones they are: a database puts ids in order quicker than whole rows
-        few = _query(filter, found, EPISODE.c.id).order_by(*by).limit(limit).offset(offset or None)
-        rows = connection.execute(query.where(EPISODE.c.id.in_(few)))
-    matches = None if filter is None or found.exact else bound_predicate(filter)
-    width = len(_COLUMNS)
-    deadline = connection.get_execution_options().get("tupli_deadline", math.inf)
-    runs: dict[int, list[dict[str, Any]]] = {}
-    with contextlib.closing(rows):
-        for page in rows.partitions(_ROWS_OF_ANSWER):
-            if time.monotonic() > deadline:
-                raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
-            stored = [StoredRow(*row[:width]) for row in page]
-            _add_runs(connection, runs, {row.recording_id for row in stored})
-            for row, (*_, uuid, benchmark_id, path) in zip(stored, page, strict=True):
-                made = header(row, uuid, benchmark_id, path, runs[row.recording_id][row.run])
-                if matches is None or matches(made):
-                    yield made
+    if time.monotonic() > connection.get_execution_options().get("tupli_deadline", math.inf):
+        raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
+    matches = None if asked.filter is None or found.exact else bound_predicate(asked.filter)
+    width, rows = len(_COLUMNS), list(rows)
+    runs = _runs(connection, {row.recording_id for row in rows})
+    for row in rows:
+        stored, (uuid, benchmark_id, path) = StoredRow(*row[:width]), row[width:]
+        made = header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
+        if matches is None or matches(made):
+            yield made
 
 
-def _add_runs(
-    connection: Connection, known: dict[int, list[dict[str, Any]]], recordings: Collection[int]
-) -> None:
-    """Adds the runs that the episodes of recordings are of, by their places."""
-    missing = [number for number in recordings if number not in known]
-    if missing:
-        found = select(RECORDING.c.id, RECORDING.c.runs).where(RECORDING.c.id.in_(missing))
-        known.update((number, jsonvalue.loads(runs)) for number, runs in connection.execute(found))
+def _runs(connection: Connection, recordings: Collection[int]) -> dict[int, list[dict[str, Any]]]:
+    """The runs that the episodes of recordings are of, by their places."""
+    found = select(RECORDING.c.id, RECORDING.c.runs).where(RECORDING.c.id.in_(recordings))
+    return {number: jsonvalue.loads(runs) for number, runs in connection.execute(found)}
 
 
 def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:

@@ -25,6 +25,8 @@ __all__ = [
     "DECLARED",
     "EPISODE",
     "EPISODE_BITS",
+    "INDEXED_FACTS",
+    "LAST_EPISODE",
     "METADATA",
     "NUMBER",
     "RECORDING",
@@ -39,10 +41,12 @@ __all__ = [
 ]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 7
+VERSION: Final = 8
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
+
+LAST_EPISODE: Final = (1 << EPISODE_BITS) - 1
 
 METADATA: Final = MetaData()
 
@@ -89,6 +93,11 @@ EPISODE: Final = Table(
     Column("run", NUMBER, nullable=False),  # its place among the recording's
     Column("exact", TEXT),  # JSON of the fields of which the columns do not say all
 )
+
+INDEXED_FACTS: Final = ("n_tuples", "episode_return", "created_at")
+"""What of episodes is found, and put in order, by an index."""
+for _name in INDEXED_FACTS:
+    Index(f"ix_episode_{_name}", EPISODE.c[_name], EPISODE.c.id)
 
 # Sums over the episodes of a recording that the same people see: what is shown of many recordings looks at no episode.
 # They are made anew, by `tallies.tally`, in each transaction that changes episodes of the recording.

@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import ColumnElement, Connection, Float, case, cast, delete, func, insert, select, true
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Float,
+    case,
+    cast,
+    delete,
+    exists,
+    func,
+    insert,
+    select,
+    true,
+)
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, episodes_of
 from tupli_mcap.storage.texts import unescape_text
 
-__all__ = ["Tally", "tallies", "tally"]
+__all__ = ["Seen", "Tally", "recordings_seen", "tallies", "tally"]
+
+Seen = Callable[[ColumnElement[str], ColumnElement[str]], ColumnElement[bool]]
+"""What may be seen: a condition on `created_by` and `published_in` of any table that has them."""
 
 _LARGE: Final = 1e290
 
@@ -42,6 +57,13 @@ class Tally(NamedTuple):
     succeeded: int
     first: int
     last: int
+
+
+def recordings_seen(seen: Seen) -> ColumnElement[bool]:
+    """The recordings of which some episodes may be seen, as a condition on RECORDING."""
+    return exists().where(
+        TALLY.c.recording_id == RECORDING.c.id, seen(TALLY.c.created_by, TALLY.c.published_in)
+    )
 
 
 def tally(connection: Connection, recording_id: int) -> None:

@@ -1,0 +1,162 @@
+"""A page of episodes: the first in some order that a filter is true of, without a look at all others.
+
+1. Where an index names few episodes that may match, these are put in order and looked at one after another.
+2. Where it names many, or there is none, the next episodes in order are looked at: of many, some are among them.
+3. If they are not, all that may match by all indexes are put in order, and looked at one after another.
+
+The statements of 1 and 2 leave a database one way to go: from columns that depend on each other, as `VALUE` has, it
+cannot tell how many rows it will find.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, intersect, or_, select
+
+from tupli_mcap.schema import BaseFilter
+from tupli_mcap.storage.catalog.filter_sql import Source, recordings_of, sources, with_recording
+from tupli_mcap.storage.catalog.order import After, Place, Sort, beyond, places
+from tupli_mcap.storage.catalog.tables import (
+    EPISODE,
+    EPISODE_BITS,
+    LAST_EPISODE,
+    RECORDING,
+    TALLY,
+    episodes_of,
+    of_one_recording,
+)
+from tupli_mcap.storage.texts import escape_text
+
+__all__ = ["Asked", "candidates"]
+
+_FEW: Final = 20_000
+_MOST: Final = 200_000
+_NEAR: Final = 10_000
+_RECORDINGS: Final = 100  # at once
+_GROUP: Final = 500  # episodes that are worth a statement
+
+
+class Asked(NamedTuple):
+    """What is asked: which episodes, and in which order.
+
+    filter: bound to headers of episodes. indexed: see `filter_sql.narrowed`. only, of: conditions that hold besides the
+    filter: on rows of EPISODE, and on rows of RECORDING alone. after: where the page begins.
+    """
+
+    filter: BaseFilter | None
+    indexed: Mapping[tuple[str, ...], int]
+    only: ColumnElement[bool]
+    of: ColumnElement[bool]
+    sort: Sort | None = None
+    after: After | None = None
+    backwards: bool = False
+
+    def recordings(self) -> ColumnElement[bool]:
+        """The recordings that may have such episodes."""
+        return self.of if self.filter is None else and_(self.of, recordings_of(self.filter))
+
+    def order(self, *, few: bool, row_id: ColumnElement[int] = EPISODE.c.id) -> list[Place]:
+        """What decides on the places of episodes, see `places`."""
+        return places(self.sort, few=few, backwards=self.backwards, row_id=row_id)
+
+
+def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tuple[Iterable[int], int]]:
+    """The ids of episodes, in order, among which the first `wanted` that match are likely to be; and how many ids these
+    are at most: if they are fewer, all that match are among them. If those were not enough, others that start anew."""
+    given = [] if asked.filter is None else sources(asked.filter, asked.indexed)
+    fewest = _fewest(connection, given)
+    if fewest is not None:
+        yield _ids(connection, asked, fewest, _FEW + 1), _FEW + 1
+        return
+    near = wanted if asked.filter is None else max(wanted, _NEAR)
+    yield _next(connection, asked, near) if asked.sort is None else _ids(connection, asked, None, near), near
+    if given:
+        each = [with_recording(source.order_by(None)) for source in given]
+        common = each[0] if len(each) == 1 else intersect(*each)
+        yield _ids(connection, asked, common.subquery(), _MOST), _MOST
+
+
+def _fewest(connection: Connection, given: Iterable[Source]) -> Subquery | None:
+    """The source that has the fewest ids, if they are few."""
+    fewest, least = None, _FEW + 1
+    for source in given:
+        some = source.limit(_FEW + 1).subquery()
+        count = connection.execute(select(func.count()).select_from(some)).scalar_one()
+        if count < least:
+            fewest, least = some, count
+    return fewest
+
+
+def _ids(connection: Connection, asked: Asked, source: Subquery | None, most: int) -> list[int]:
+    """The ids of a source in order, or, without one, of all episodes; at most so many."""
+    query: Select[Any]
+    row_id: ColumnElement[int]
+    if source is None:
+        row_id, order = EPISODE.c.id, asked.order(few=False)
+        query = select(row_id).select_from(EPISODE.join(RECORDING, of_one_recording())).where(asked.only)
+    else:
+        row_id = source.c[0]
+        joined = source.join(RECORDING, RECORDING.c.id == row_id // (1 << EPISODE_BITS))
+        if asked.sort is not None:
+            joined, row_id = joined.join(EPISODE, EPISODE.c.id == row_id), EPISODE.c.id
+        order = asked.order(few=True, row_id=row_id)
+        query = select(row_id).select_from(joined)
+    query = query.where(asked.recordings())
+    if asked.after is not None:
+        query = query.where(beyond(connection, order, asked.after))
+    by = (value.desc() if descending else value for value, descending in order)
+    return list(connection.execute(query.order_by(*by).limit(most)).scalars())
+
+
+def _next(connection: Connection, asked: Asked, most: int) -> Iterator[int]:
+    """The ids of the next episodes in the order of their recordings, looked for as they are needed."""
+    sign = -1 if asked.backwards else 1
+    for group in _groups(connection, asked):
+        if most <= 0:
+            return
+        query = select(EPISODE.c.id).where(asked.only, or_(*(_part(asked, item) for item in group)))
+        if len(group) == 1:  # of many, all are put in order below
+            query = query.order_by(EPISODE.c.id.desc() if asked.backwards else EPISODE.c.id).limit(most)
+        places = {number: i for i, (number, _) in enumerate(group)}
+        found = connection.execute(query).scalars().all()
+        found = sorted(found, key=lambda row_id: (places[row_id >> EPISODE_BITS], sign * row_id))[:most]
+        yield from found
+        most -= len(found)
+
+
+def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:
+    """Where an episode is of a recording, and not before the page."""
+    number, path = recording
+    own = episodes_of(number, EPISODE.c.id)
+    if asked.after is None or path != escape_text(asked.after.recording):
+        return own
+    reached = (number << EPISODE_BITS) + min(asked.after.episode, LAST_EPISODE)
+    return and_(own, EPISODE.c.id < reached if asked.backwards else EPISODE.c.id > reached)
+
+
+def _groups(connection: Connection, asked: Asked) -> Iterator[list[tuple[int, str]]]:
+    """Recordings in order, by id and path: one of many episodes, or several of few, as often as there are more."""
+    path, reached = RECORDING.c.path, None if asked.after is None else escape_text(asked.after.recording)
+    sums = select(func.sum(TALLY.c.episodes)).where(TALLY.c.recording_id == RECORDING.c.id).scalar_subquery()
+    query = select(RECORDING.c.id, path, sums).where(asked.recordings()).limit(_RECORDINGS)
+    query = query.order_by(path.desc() if asked.backwards else path)
+    if reached is not None:
+        found = connection.execute(query.where(path <= reached if asked.backwards else path >= reached)).all()
+    else:
+        found = connection.execute(query).all()
+    while found:
+        group, size = [], 0
+        for number, name, episodes in found:
+            group.append((number, name))
+            size += episodes or 0
+            if size >= _GROUP:
+                yield group
+                group, size = [], 0
+        if group:
+            yield group
+        if len(found) < _RECORDINGS:
+            return
+        last = found[-1][1]
+        found = connection.execute(query.where(path < last if asked.backwards else path > last)).all()
