@@ -29,7 +29,8 @@ class NoPostgresError(Exception):
 
 
 class Cluster:
-    """A running PostgreSQL. Only the user who starts it may connect; the superuser is `postgres`."""
+    """A running PostgreSQL, new or of the directory of an earlier one. Only the user who starts it may connect; the
+    superuser is `postgres`."""
 
     def __init__(self, directory: Path) -> None:
         found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb")) or list(
@@ -43,7 +44,8 @@ class Cluster:
         if os.getuid() == 0:  # as whom PostgreSQL refuses to run
             self._own = ["runuser", "-u", "postgres", "--"]
             os.chown(directory, pwd.getpwnam("postgres").pw_uid, -1)
-        self._run("initdb", "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8")
+        if not (directory / "PG_VERSION").exists():
+            self._run("initdb", "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8")
 
     def start(self) -> None:
         """Starts it, also after it was killed."""

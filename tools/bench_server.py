@@ -1,14 +1,12 @@
-"""What a server costs: transfers beside nginx, questions of many clients, memory while it streams. Everything is on
-this machine's loopback, and shares its cores.
+"""What a server costs: transfers beside nginx, and memory while it streams. Everything is on this machine's loopback,
+and shares its cores. What questions cost is in `bench_questions.py`.
 
     python tools/bench_server.py transfers [--mib 1024] [--rounds 3]
-    python tools/bench_server.py questions [--episodes 1000000] [--clients 32] [--workers 2] [--database ENGINE]
     python tools/bench_server.py memory [--mib 256] [--clients 32]
 
 transfers   A recording goes up and comes down through curl: to `tupli-mcap serve`, to the same behind nginx with the
             configuration that is shipped (but without TLS), and to nginx alone (a static file; PUT by its dav module).
             Ours ends when the recording is checked by its SHA-256, durable and listed; nginx's when it is written.
-questions   Clients ask for pages of 20 episodes, by filters, without a pause, and then each once a second.
 memory      What the processes of a server hold in the end beyond what they held before, while clients fetch whole
             recordings slowly.
 
@@ -18,22 +16,18 @@ Exits with 1 where a figure is missed that the server must reach.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import base64
 import contextlib
 import hashlib
 import json
 import os
-import random
 import socket
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -41,12 +35,10 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import nginx
-import postgres
-from served import Process, served, sign_in
+from served import served, sign_in
 
 MIB = 1 << 20
-RATE, P95_MS, MEMORY_MIB = 0.6, {"postgresql": 100.0, "sqlite": 150.0}, 150
-EACH = 10_000  # episodes of a recording
+RATE, MEMORY_MIB = 0.6, 150
 _DAV = """
     server {{
         listen 127.0.0.1:{port};
@@ -169,169 +161,6 @@ def transfers(options: argparse.Namespace, folder: Path) -> bool:
     return good
 
 
-# --- questions ---
-
-
-def fill(url: str, directory: Path, episodes: int) -> None:
-    """Makes the database of a server with so many episodes, of which no file is there."""
-    from tupli_mcap.server.database import audience
-    from tupli_mcap.server.library import Library
-    from tupli_mcap.server.settings import Settings
-    from tupli_mcap.server.tables import FILE
-    from tupli_mcap.storage.catalog import queries
-    from tupli_mcap.storage.catalog.rows import EpisodeRow
-    from tupli_mcap.storage.listing import RecordingStamp
-
-    library, rng = Library(Settings(directory, database=url)), random.Random(0)
-    library.first_password()
-    for number in range(-(-episodes // EACH)):
-        rows = [
-            EpisodeRow(
-                i, 0, rng.randint(8, 500), "terminal", rng.uniform(0, 500), i, 1_700_000_000 * 10**9 + i, "admin",
-                '["admin"]', json.dumps({"score": rng.random(), "success": i % 2 == 0, "task": f"t{i % 50}"}),
-            )
-            for i in range(EACH)
-        ]  # fmt: skip
-        name = f"recordings/plain/{number:04}.mcap"
-        with library.database.writing() as connection:
-            audience(connection, ["admin"])
-            told: dict[str, Any] = {
-                "uuid": f"{number:032x}",
-                "benchmark_id": "",
-                "rows": rows,
-                "runs": "[{}]",
-            }
-            queries.put_recording(connection, name, RecordingStamp(1, 2, 3), **told)
-            file = {
-                "path": name,
-                "place": name,
-                "created_by": "admin",
-                "uuid": f"{number:032x}",
-                "deleted": "[]",
-            }
-            connection.execute(FILE.insert().values(**file, digest="0" * 64, size=1, episodes=EACH))
-    library.close()
-
-
-def questions_of(rng: random.Random) -> Iterator[tuple[str, bytes]]:
-    """What clients ask, at random: kinds of questions, and bodies of `POST /v1/episodes/list`."""
-
-    def leaf(kind: str, key: str, value: Any) -> dict[str, Any]:
-        return {"type": kind, "key": key, "value": value}
-
-    while True:
-        score, steps = rng.random(), rng.randint(8, 490)
-        known: dict[str, dict[str, Any] | None] = {
-            "the first page": None,
-            "of a recording": leaf("EQ", "recording", f"recordings/plain/{rng.randrange(50):04}.mcap"),
-            "score > x": leaf("GT", "metadata.score", 0.99 + score / 100),
-            "steps in [x, x + 2)": {
-                "type": "AND", "filters": [leaf("GEQ", "steps", steps), leaf("LT", "steps", steps + 2)]
-            },
-            "a task, score > x": {
-                "type": "AND",
-                "filters": [leaf("EQ", "metadata.task", f"t{rng.randrange(50)}"), leaf("GT", "metadata.score", score)],
-            },
-        }  # fmt: skip
-        kind = rng.choice(list(known))
-        yield kind, json.dumps({"filter": known[kind], "limit": 20}).encode()
-
-
-async def asking(
-    port: int, head: bytes, seed: int, end: float, pause: float, taken: dict[str, list[float]]
-) -> None:
-    """A client that asks until an end, with a pause of so many seconds between two questions; notes what each took."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    rng = random.Random(seed)
-    await asyncio.sleep(rng.random() * pause)
-    for kind, body in questions_of(rng):
-        begun = time.perf_counter()
-        if begun > end:
-            break
-        writer.write(head + b"Content-Length: %d\r\n\r\n" % len(body) + body)
-        told = (await reader.readuntil(b"\r\n\r\n")).lower()
-        answer = await reader.readexactly(int(told.partition(b"content-length: ")[2].partition(b"\r\n")[0]))
-        if b" 200 " not in told.split(b"\r\n")[0]:
-            print(f"    {kind}: refused after {time.perf_counter() - begun:.1f} s: {answer.decode():.100}")
-        taken.setdefault(kind, []).append((time.perf_counter() - begun) * 1e3)
-        if pause:
-            await asyncio.sleep(max(0.0, pause - (time.perf_counter() - begun)))
-    writer.close()
-
-
-def questions(options: argparse.Namespace, folder: Path) -> bool:
-    good = True
-    with contextlib.ExitStack() as stack:
-        wanted: dict[str, str] = {}
-        if options.database in ("", "postgresql"):
-            cluster = stack.enter_context(postgres.cluster())
-            wanted["postgresql"] = stack.enter_context(cluster.database())
-        if options.database in ("", "sqlite"):
-            wanted["sqlite"] = f"sqlite:///{folder / 'server.sqlite'}"
-        for engine, url in wanted.items():
-            os.environ["TUPLI_MCAP_ADMIN_PASSWORD"] = "correct horse battery staple"
-            begun = time.perf_counter()
-            fill(url, folder / engine, options.episodes)
-            print(f"{engine}: {options.episodes} episodes, listed in {time.perf_counter() - begun:.0f} s")
-            workers = ("--workers", str(options.workers)) if options.workers > 1 else ()
-            with served(folder / engine, "--database", url, *workers) as server:
-                with httpx.Client(base_url=server.url, timeout=60) as client:
-                    token = sign_in(client)
-                    declared = client.post(
-                        "/v1/episodes/keys", json={"key": "metadata.score"}, headers=token, timeout=600
-                    )
-                    declared.raise_for_status()
-                    client.post(
-                        "/v1/episodes/keys", json={"key": "metadata.task"}, headers=token, timeout=600
-                    )
-                for pause in (0.0, 1.0):
-                    slowest = asked(server, token, options, pause)
-                    good &= pause == 0 or slowest <= P95_MS[engine]
-            print(f"must reach: {P95_MS[engine]:.0f} ms")
-    return good
-
-
-def asked(server: Process, token: dict[str, str], options: argparse.Namespace, pause: float) -> float:
-    """Prints what questions take; returns the 95th percentile of all of them."""
-    head = (
-        f"POST /v1/episodes/list HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
-        f"Authorization: {token['Authorization']}\r\n"
-    ).encode()
-    taken: dict[str, list[float]] = {}
-
-    async def all_of_them() -> None:
-        end = time.perf_counter() + options.seconds
-        await asyncio.gather(
-            *(asking(server.port, head, seed, end, pause, taken) for seed in range(options.clients))
-        )
-
-    before = worked(server)
-    asyncio.run(all_of_them())
-    worked_ms = (worked(server) - before) * 1e3
-    every = [each for times in taken.values() for each in times]
-    how = f"each once in {pause:.0f} s" if pause else "without a pause"
-    print(
-        f"  {options.clients} clients, {how}: {len(every) / options.seconds:.0f} answers a second; ms, median and p95"
-    )
-    print(
-        f"    the server works {worked_ms / len(every):.1f} ms for an answer, its database not counted in PostgreSQL"
-    )
-    for kind, times in (*sorted(taken.items()), ("all", every)):
-        print(f"    {kind:24}{statistics.median(times):8.1f}{percentile(times, 95):8.1f}")
-    return percentile(every, 95)
-
-
-def worked(server: Process) -> float:
-    """Seconds of a core that the processes of a server have taken."""
-    process = psutil.Process(server.pid)
-    times = [each.cpu_times() for each in (process, *process.children(recursive=True))]
-    return float(sum(each.user + each.system for each in times))
-
-
-def percentile(values: Sequence[float], of: float) -> float:
-    return float(np.percentile(values, of))
-
-
 # --- memory ---
 
 
@@ -402,15 +231,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    kinds = {kind.__name__: kind for kind in (transfers, questions, memory)}
+    kinds = {kind.__name__: kind for kind in (transfers, memory)}
     parser.add_argument("kind", choices=kinds)
     parser.add_argument("--mib", type=int, default=1024, help="of a recording")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--episodes", type=int, default=1_000_000)
     parser.add_argument("--clients", type=int, default=32)
-    parser.add_argument("--workers", type=int, default=2, help="processes of the server")
-    parser.add_argument("--seconds", type=float, default=20, help="of asking")
-    parser.add_argument("--database", choices=("sqlite", "postgresql"), default="")
     options = parser.parse_args()
     print(f"load of this machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     with tempfile.TemporaryDirectory(prefix="bench") as folder:
