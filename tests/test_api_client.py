@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.server
+import json
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,8 +17,10 @@ import pytest
 from postgres import Cluster
 from serving import PASSWORD, serving
 from test_storage import StorageContract
+from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes
+from tupli_mcap.cli.app import app
 from tupli_mcap.errors import TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
@@ -110,6 +113,33 @@ def test_what_is_no_server_of_this_version_is_one_error(
                 ask()
         with pytest.raises(TupliError, match="is it a tupli-mcap server"):
             client.push(tmp_path / "run.mcap")
+
+
+def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap", name="ppo") as env:
+        for seed in range(5):
+            env.reset(seed=seed)
+            while not env.step(0)[2]:
+                pass
+    admin.push(tmp_path / "run.mcap")
+
+    def told(*words: str) -> Any:
+        done = CliRunner().invoke(app, [words[0], url, *words[1:], "--json"])
+        assert done.exit_code == 0, done.output
+        return json.loads(done.output)["data"]
+
+    made = str(tmp_path / "made.mcap")
+    assert [episode["seed"] for episode in told("episodes", "--filter", 'run.name ~ "PPO" and seed < 2')] == [
+        0,
+        1,
+    ]
+    assert told("info", "--episodes", "0,3-4")["episodes"] == 3
+    assert told("info", "--filter", "seed = 1")["episodes"] == 1
+    assert told("filter", "seed > 2", "-o", made)["episodes"] == 2
+    assert told("trim", "--steps", "1:", "--episodes", "best", "-o", made, "--force")["left_out"] == 1
+    assert told("doctor")["episodes"] == 5
+    failed = CliRunner().invoke(app, ["info", url, "--episodes", "9"])
+    assert f"{url} has no episode '9'; see tupli-mcap episodes {url}" in failed.output
 
 
 def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+import web_server
 from environments import same
 from test_golden import NAMES, place
 from typer.testing import CliRunner
@@ -115,6 +116,37 @@ def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 
 
+def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
+    first, second = (record(tmp_path / "runs" / name) for name in ("a.mcap", "b.mcap"))
+    target = tmp_path / "n.mcap"
+    n_steps = [Recording(path).num_steps for path in (first, second)]
+    with web_server.serving() as server:
+        server.files["/b.mcap"] = second.read_bytes()
+        for sources in ([first.parent], [first, second], [first, server.url("/b.mcap")]):
+            words = [
+                "trim",
+                *map(str, sources),
+                "--steps",
+                "2:",
+                "--filter",
+                'recording ~ "A.MCAP"',
+                "-o",
+                str(target),
+            ]
+            dry = CliRunner().invoke(app, [*words, "--force", "--dry-run", "--json"])
+            done = CliRunner().invoke(app, [*words, "--force", "--json"])
+            assert done.exit_code == 0, done.output
+            told = json.loads(done.output)["data"]
+            assert {**told, "dry_run": True, "size": 0} == json.loads(dry.output)["data"]
+            assert (told["episodes"], told["steps"], told["left_out"]) == (8, sum(n_steps) - 8, 8)
+            assert Recording(target).num_steps == sum(n_steps) - 8
+            earlier = made_of(Recording(target))["earlier"]
+            assert [one["sources"][0]["name"] for one in earlier] == ["a.mcap", "b.mcap"]
+            words = ["filter", *map(str, sources), "seed == 1", "-o", str(target), "--force"]
+            assert CliRunner().invoke(app, words).exit_code == 0
+            assert [episode.seed for episode in Recording(target)] == [1, 1]
+
+
 def test_command(tmp_path: Path) -> None:
     source, target = record(tmp_path / "r.mcap"), tmp_path / "n.mcap"
     words = ["trim", str(source), "--steps", "2:-1", "--episodes", "0,2", "-o", str(target)]
@@ -126,5 +158,9 @@ def test_command(tmp_path: Path) -> None:
     assert Recording(target).num_steps == steps
     assert "exists" in CliRunner().invoke(app, words).output
     assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
+    assert (
+        "steps of episode 0 that stay"
+        in CliRunner().invoke(app, [*words[:3], "900:", *words[4:], "--force"]).output
+    )
     for wrong in ("2", "a:b", "1:2:3"):
         assert CliRunner().invoke(app, [*words[:3], wrong, *words[4:]]).exit_code == 2

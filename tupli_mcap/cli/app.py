@@ -329,7 +329,11 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "render": ("render run.mcap -o best.mp4", "render run.mcap -o first.gif --episodes first --rerun"),
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning", "doctor run.mcap --episodes best,worst"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
-    "filter": ("filter run.mcap 'return > 100 and metadata.success' -o good.mcap",),
+    "filter": (
+        "filter run.mcap 'return > 100 and metadata.success' -o good.mcap",
+        "filter runs/ 'run.name ~ \"ppo\"' -o ppo.mcap",
+        "filter https://example.org/run.mcap 'return > 100' -o good.mcap",
+    ),
     "delete": ("delete run.mcap --episodes 3,7", "delete lab/ --filter 'return < 10' --dry-run"),
     "restore": ("restore run.mcap", "restore run.mcap --episodes 3"),
     "trim": (

@@ -38,7 +38,7 @@ class _FailOn(StrEnum):
 _Paths = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="PATH", help="Recordings, directories, storages, URLs; by default, this directory."
+        metavar="PATH|URL", help="Recordings, directories, storages, URLs; by default, this directory."
     ),
 ]
 _Checks = Annotated[

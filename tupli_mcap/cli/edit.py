@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, File, FilterText, Json, filter_of, local_path, pair_of
+from tupli_mcap.cli.options import (
+    Episodes,
+    File,
+    FilterText,
+    Json,
+    Sources,
+    dataset_of,
+    filter_of,
+    local_path,
+    pair_of,
+)
 from tupli_mcap.cli.output import (
     Column,
     bytes_of,
@@ -22,7 +32,6 @@ from tupli_mcap.cli.terminal import say
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset import FilterReport
     from tupli_mcap.recording import RecoveryReport
 
 __all__ = ["edit", "filter_", "merge", "recover", "split", "tag", "trim"]
@@ -205,12 +214,7 @@ def edit(
 
 
 def filter_(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE|DIRECTORY", help="A recording, or a directory of recordings.", parser=local_path
-        ),
-    ],
+    sources: Sources,
     filter_text: Annotated[
         str,
         typer.Argument(metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."),
@@ -225,10 +229,9 @@ def filter_(
     Episodes of one recording keep their ids; those of several get new ones. A signature is
     dropped.
     """
-    from tupli_mcap.dataset import filter_recording
+    from tupli_mcap.dataset.curate import filter_dataset
 
-    make = _filter_directory if source.is_dir() else filter_recording
-    report = make(source, output, filter_text, overwrite=force, dry_run=dry_run)
+    report = filter_dataset(dataset_of(sources), output, filter_text, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, **report._asdict()})
         return
@@ -236,7 +239,7 @@ def filter_(
 
 
 def trim(
-    file: File,
+    sources: Sources,
     steps: Annotated[
         str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a Python slice.")
     ],
@@ -254,8 +257,8 @@ def trim(
     interrupted, and the state after its last step becomes its final state. An episode that
     loses its beginning loses its seed. The new recording has a new id, and no signature.
     """
-    from tupli_mcap.dataset.which import choose_episodes
-    from tupli_mcap.recording import Recording, trim_recording
+    from tupli_mcap.dataset.curate import trim_dataset
+    from tupli_mcap.dataset.which import chosen_ids
 
     begin, colon, stop = steps.partition(":")
     try:
@@ -264,28 +267,16 @@ def trim(
         colon = ""
     if not colon:
         raise typer.BadParameter(f"--steps: expected a slice such as 10:-5, 10: or :200, found {steps!r:.80}")
-    with Recording(file) as recording:
-        chosen = choose_episodes(recording, episodes or "all", filter_of(filter_text))
-        wanted = {episode.number: kept for episode in chosen}
-        report = trim_recording(recording, output, wanted, overwrite=force, dry_run=dry_run)
+    dataset, wanted = dataset_of(sources), filter_of(filter_text)
+    if episodes is not None:
+        ids = chosen_ids(sources, episodes, wanted)
+    else:
+        ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
+    report = trim_dataset(dataset, kept, ids, output, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, **report._asdict()})
         return
     _print_made(report, dry_run)
-
-
-def _filter_directory(
-    source: Path, output: Path, filter: str, *, overwrite: bool, dry_run: bool
-) -> FilterReport:
-    from tupli_mcap import open as open_dataset
-    from tupli_mcap.dataset import FilterReport
-
-    found = open_dataset(source)
-    kept = found.filter(filter)
-    report = FilterReport(output, len(kept), kept.n_steps, len(found) - len(kept))
-    if dry_run:
-        return report
-    return report._replace(size=kept.save(output, overwrite=overwrite).stat().st_size)
 
 
 def _print_made(report: Any, dry_run: bool) -> None:

@@ -25,7 +25,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_server, is_url, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,20 +45,19 @@ _OTHERS = 44  # columns of a line that are not blocks
 _LONGEST_NAME = 24
 
 
-def _print_directory(path: Path, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
-    """Prints facts about the recordings of a directory, or about the chosen episodes of them."""
+def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
+    """Prints facts about the recordings of a directory or a server, or about the chosen episodes of them."""
     from tupli_mcap import open as open_dataset
-    from tupli_mcap.dataset.which import chosen_from
+    from tupli_mcap.dataset.which import chosen_ids
     from tupli_mcap.recording.about.success import success_of
     from tupli_mcap.recording.description import spread_of
     from tupli_mcap.storage.listing import find_recordings
 
-    if not find_recordings(path):
-        raise RecordingError(f"{path} is a directory; expected a recording (.mcap) in it, found none")
-    dataset = open_dataset(path)
+    if not is_url(source) and not find_recordings(Path(source)):
+        raise RecordingError(f"{source} is a directory; expected a recording (.mcap) in it, found none")
+    dataset = open_dataset(source)
     if episodes is not None:
-        with chosen_from(path, episodes, wanted) as chosen:
-            ids = {found.recording.episodes[at].id for found in chosen for at in found.positions}
+        ids = chosen_ids(source, episodes, wanted)
         dataset = dataset[[header.id in ids for header in dataset.headers]]
     elif wanted is not None:
         dataset = dataset.filter(wanted)
@@ -79,19 +78,19 @@ def _print_directory(path: Path, episodes: str | None, wanted: BaseFilter | None
     if as_json:
         print_json(
             {
-                "path": path, "recordings": recordings, "runs": runs, "environments": environments,
+                "path": shown(source), "recordings": recordings, "runs": runs, "environments": environments,
                 "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
                 "returns": returns, "success": rate, "seeds": len(seeds), "metadata_keys": keys,
             }
         )  # fmt: skip
         return
-    shown = ", ".join(f"{count:,} {name}" for name, count in ends.items())
+    ended = ", ".join(f"{count:,} {name}" for name, count in ends.items())
     lines = {
-        "directory": str(path),
+        "server" if is_url(source) else "directory": shown(source),
         "recordings": number(recordings),
         "runs": _some(runs),
         "environments": _some(environments),
-        "episodes": number(len(headers)) + (f" ({shown})" if shown else ""),
+        "episodes": number(len(headers)) + (f" ({ended})" if ended else ""),
         "steps": number(dataset.n_steps) + _spread_text(lengths, len(headers), " an episode"),
         "return": _spread_text(returns, len(headers)).removeprefix(", "),
         "success": "" if rate is None else f"{rate:.0%} of the {counted(len(said), 'episode')} that say it",
@@ -106,14 +105,14 @@ def _some(names: Sequence[str]) -> str:
 
 
 def info(
-    file: Annotated[
-        str, typer.Argument(metavar="FILE|DIR", help="A recording (a path or a URL), or a directory of them.")
+    source: Annotated[
+        str, typer.Argument(metavar="PATH|URL", help="A recording, a directory, a storage or a server.")
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
-    """Show what is in a recording, or in a directory of them.
+    """Show what is in a recording, or in the recordings of a directory or a server.
 
     For a recording: its run, spaces, benchmark, returns and lengths of episodes,
     distributions of rewards, actions and states, channels and attachments. Distributions of
@@ -128,10 +127,10 @@ def info(
     from tupli_mcap.recording.description import describe
 
     wanted = filter_of(filter_text)
-    if not is_url(file) and Path(file).is_dir():
-        _print_directory(Path(file), episodes, wanted, as_json=as_json)
+    if is_server(source) or (not is_url(source) and Path(source).is_dir()):
+        _print_many(source, episodes, wanted, as_json=as_json)
         return
-    with Recording(file) as recording:
+    with Recording(source) as recording:
         positions = candidates(recording, wanted)  # without deleted episodes
         if episodes is not None or wanted is not None:
             positions = np.array(sorted(named_positions(recording, positions, episodes or "all", wanted)))

@@ -16,9 +16,11 @@ from tupli_mcap.cli.options import (
     Json,
     Limit,
     Sort,
+    Sources,
+    any_storage,
+    dataset_of,
     filter_of,
     local_path,
-    open_storage,
 )
 from tupli_mcap.cli.output import (
     Column,
@@ -34,6 +36,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import fail, terminal_width
 from tupli_mcap.errors import did_you_mean
+from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -228,16 +231,14 @@ def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> 
 
 
 def episodes(
-    paths: Annotated[
-        list[str], typer.Argument(metavar="PATH|URL", help="Files, directories, storages, URLs of files.")
-    ],
+    paths: Sources,
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
-    """List episodes of recordings, directories and storages.
+    """List episodes of recordings, directories, storages and servers.
 
     A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
     run.<name>, ...) with = != > >= < <= in, or ~ for a part of a text (run.name ~ "ppo"),
@@ -245,14 +246,13 @@ def episodes(
     "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
     week stands for all of it. --sort and --columns take the same keys.
     """
-    from tupli_mcap import open as open_dataset
-
-    if len(paths) == 1 and Path(paths[0]).is_dir():
-        with open_storage(Path(paths[0])) as storage:
+    if len(paths) == 1 and (is_server(paths[0]) or Path(paths[0]).is_dir()):
+        with any_storage(paths[0]) as storage:
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
-    found = open_dataset(paths[0] if len(paths) == 1 else paths)
-    _print_headers(_headers_of(found, filter_of(filter_text), sort)[:limit], columns, as_json=as_json)
+    _print_headers(
+        _headers_of(dataset_of(paths), filter_of(filter_text), sort)[:limit], columns, as_json=as_json
+    )
 
 
 def list_stored(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,12 +13,13 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
+    from tupli_mcap.dataset import Dataset
     from tupli_mcap.schema import BaseFilter
     from tupli_mcap.storage import FileStorage, TupliStorage
 
 __all__ = [
-    "AnyStorage", "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "StoragePath",
-    "any_storage", "filter_of", "full_id", "local_path", "open_storage", "pair_of"
+    "AnyStorage", "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "Sources", "StoragePath",
+    "any_storage", "dataset_of", "filter_of", "full_id", "local_path", "open_storage", "pair_of"
 ]  # fmt: skip
 
 
@@ -32,6 +34,9 @@ def local_path(text: str | Path) -> Path:
 
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", parser=local_path)]
+Sources = Annotated[
+    list[str], typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
 Episodes = Annotated[
     str | None,
@@ -74,6 +79,13 @@ AnyStorage = Annotated[
     ),
 ]
 _SHORTEST_ID = 4
+
+
+def dataset_of(sources: Sequence[str]) -> Dataset:
+    """The episodes of paths and URLs; also of one storage or server."""
+    from tupli_mcap import open as open_dataset
+
+    return open_dataset(sources[0] if len(sources) == 1 else sources)
 
 
 def filter_of(text: str | None) -> BaseFilter | None:

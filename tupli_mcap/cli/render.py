@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, Sources, filter_of
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
@@ -41,7 +41,7 @@ class _X(StrEnum):
 _Source = Annotated[
     str,
     typer.Argument(
-        metavar="FILE|STORAGE", help="A recording (a path or a URL), or a directory that holds it."
+        metavar="PATH|URL", help="A recording (a path or a URL), or a directory that holds it."
     ),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
@@ -188,9 +188,6 @@ def _print(report: RenderReport) -> None:
         fail(f"{report.divergence}; no frames from there on, {kept}{hint}")
 
 
-_Plotted = Annotated[
-    list[str], typer.Argument(metavar="FILE|STORAGE", help="Recordings, directories, storages, URLs.")
-]
 _Drawing = Annotated[
     Path | None,
     typer.Option(
@@ -218,7 +215,7 @@ _Axis = Annotated[
 
 
 def plot(
-    paths: _Plotted,
+    paths: Sources,
     output: _Drawing = None,
     episode: _Shown = "best",
     x: _Axis = None,

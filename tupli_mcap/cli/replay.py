@@ -7,15 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Sources, filter_of
 from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
 
 __all__ = ["replay"]
 
-_Sources = Annotated[
-    list[str], typer.Argument(metavar="PATH", help="Recordings, URLs, directories, storages.")
-]
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Split = Annotated[
     bool,
@@ -44,7 +41,7 @@ _Layout = Annotated[
 
 
 def replay(
-    sources: _Sources,
+    sources: Sources,
     episode: Episodes = None,
     filter_text: FilterText = None,
     compare: _Compare = False,

@@ -30,7 +30,7 @@ _DIVERGING = 5  # how many diverging episodes after the first are shown; --json 
 def verify(
     paths: Annotated[
         list[str],
-        typer.Argument(metavar="PATH", help="Recordings (paths or URLs), directories, storages."),
+        typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs of recordings."),
     ],
     replay: Annotated[
         bool,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.dataset.sources import DatasetError
+from tupli_mcap.dataset.sources import DatasetError, FilesSource
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
@@ -25,12 +25,22 @@ from tupli_mcap.recording import (
 )
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.trim import TrimReport
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["FilterReport", "file_path", "filter_recording", "relabel", "save", "trim"]
+__all__ = [
+    "FilterReport",
+    "file_path",
+    "filter_dataset",
+    "filter_recording",
+    "relabel",
+    "save",
+    "trim",
+    "trim_dataset",
+]
 
 
 class FilterReport(NamedTuple):
@@ -85,6 +95,81 @@ def filter_recording(
     return report._replace(size=target.stat().st_size)
 
 
+def filter_dataset(
+    dataset: Dataset,
+    target: str | os.PathLike[str],
+    filter: BaseFilter | str,
+    *,
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> FilterReport:
+    """Writes the episodes of a dataset that a filter is true of to `target`, as `Dataset.save` does.
+
+    Raises:
+        FilterError: the filter names what episodes do not have.
+        RecordingError: it is true of no episode, or as `Dataset.save`.
+        DatasetError: as `Dataset.save`.
+    """
+    target = file_path(target)
+    count = len(dataset)
+    kept = dataset.filter(filter)
+    if not len(kept):
+        raise RecordingError(f"expected an episode that matches {filter}, found none among {count:,}")
+    _check_new(kept, target, overwrite=overwrite)
+    report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
+    if dry_run:
+        return report
+    query = str(parse_filter(filter) if isinstance(filter, str) else filter)
+    return report._replace(size=save(kept, target, overwrite=overwrite, query=query).stat().st_size)
+
+
+def trim_dataset(
+    dataset: Dataset,
+    steps: slice,
+    chosen: Collection[str],
+    target: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> TrimReport:
+    """Writes the episodes of a dataset to `target`, those whose ids are chosen with only some consecutive steps.
+
+    Raises as `Dataset.trim`.
+    """
+    target = file_path(target)
+    _check_new(dataset, target, overwrite=overwrite)
+    headers = dataset.headers
+    lengths = [
+        len(range(*steps.indices(header.n_tuples))) if header.id in chosen else header.n_tuples
+        for header in headers
+    ]
+    report = TrimReport(target, len(headers), sum(lengths), dataset.n_steps - sum(lengths))
+    if short := next((header for header, length in zip(headers, lengths, strict=True) if not length), None):
+        raise RecordingError(
+            f"{short.recording}: expected steps of episode {short.episode} that stay, found {short.n_tuples} in all; "
+            "choose other steps, or other episodes"
+        )
+    if dry_run:
+        return report
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
+        parts: list[Path] = []
+        for name in dataset._chosen:
+            part = dataset[[header.recording == name for header in headers]]
+            numbers = {header.episode for header in part.headers if header.id in chosen}
+            parts.append(Path(folder) / str(len(parts)) / PurePath(name).name)
+            part.trim(partial(_kept_of, steps=steps, numbers=numbers), parts[-1])
+        if len(parts) == 1:
+            parts[0].replace(target)
+        else:
+            save(type(dataset)(FilesSource(parts)), target, overwrite=overwrite)
+    return report._replace(size=target.stat().st_size)
+
+
+def _kept_of(episode: Episode, *, steps: slice, numbers: Collection[int]) -> slice:
+    return steps if episode.number in numbers else slice(None)
+
+
 def file_path(place: str | os.PathLike[str]) -> Path:
     """The path of a new file; DatasetError if it is that of a directory."""
     if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
@@ -92,22 +177,30 @@ def file_path(place: str | os.PathLike[str]) -> Path:
     return Path(place)
 
 
-def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
-    """See `Dataset.save`."""
-    target = file_path(place)
-    chosen = dataset._chosen
-    if not chosen:
+def _check_new(dataset: Dataset, target: Path, *, overwrite: bool) -> None:
+    """Raises DatasetError if there is no episode, or the target exists: one of the sources, or not to be replaced."""
+    if not dataset._chosen:
         raise DatasetError("expected episodes to save, found none")
-    if target.exists() and not overwrite:
-        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
-    sources = [dataset._open(name).path for name in chosen]
-    if target.exists() and any(source is not None and target.samefile(source) for source in sources):
+    if not target.exists():
+        return
+    sources = [dataset._open(name).path for name in dataset._chosen]
+    if any(source is not None and target.samefile(source) for source in sources):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
+    if not overwrite:
+        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
+
+
+def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:
+    """See `Dataset.save`. `query`: the filter that chose the episodes, where the dataset does not know it."""
+    target = file_path(place)
+    _check_new(dataset, target, overwrite=overwrite)
+    chosen = dataset._chosen
     target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()
         source = dataset._open(name)
-        said = say_made_of([source], "filter", **_query_of(dataset))
+        known = query or ("" if dataset._filter is None else str(dataset._filter))
+        said = say_made_of([source], "filter", **({"query": known} if known else {}))
         rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
     excerpts = []
@@ -158,7 +251,3 @@ def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, ove
             sources = [dataset._open(name) for name in dataset._chosen]
             make(recording, target, sources=sources)
     return target
-
-
-def _query_of(dataset: Dataset) -> dict[str, str]:
-    return {} if dataset._filter is None else {"query": str(dataset._filter)}

@@ -6,7 +6,6 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeAlias
-from urllib.parse import urlsplit
 
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import (
@@ -16,7 +15,7 @@ from tupli_mcap.dataset.sources import (
     place_of,
 )
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_url, is_web
+from tupli_mcap.remote import is_server, is_url
 from tupli_mcap.storage import FileStorage, TupliStorage, storage_at
 from tupli_mcap.storage.listing import find_recordings, is_storage
 
@@ -51,7 +50,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
         folder = Path(name).expanduser()
-        if _is_server(name):
+        if is_server(name):
             return Dataset(StorageSource(storage_at(name)))
         if is_url(name) or not folder.is_dir():
             return Dataset(FilesSource(source))
@@ -64,11 +63,6 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
             f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"
         )
     return Dataset(FilesSource([name for item in source for name in _files_in(item)]))
-
-
-def _is_server(name: str) -> bool:
-    """Whether it is the address of a web server, and not of a file on it."""
-    return is_web(name) and not urlsplit(name).path.strip("/")
 
 
 def _files_in(source: Openable) -> Sequence[str]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError, TupliError
 from tupli_mcap.recording import Episode, Recording
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_server, is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
@@ -37,6 +37,7 @@ __all__ = [
     "check_choice",
     "choose_episodes",
     "chosen_from",
+    "chosen_ids",
     "extremes",
     "named_positions",
     "subjects_of",
@@ -216,7 +217,11 @@ def subjects_of(
     from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.storage import TupliStorage
 
-    if isinstance(source, str | os.PathLike):
+    if isinstance(source, str) and is_server(source):
+        from tupli_mcap.dataset.dataset import open as open_dataset
+
+        yield from _of_headers(*open_dataset(source)._episodes(episode_filter))
+    elif isinstance(source, str | os.PathLike):
         yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
     elif isinstance(source, Recording):
         choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
@@ -294,8 +299,8 @@ def chosen_from(
 ) -> Iterator[list[Chosen]]:
     """The chosen episodes of recordings, open within the block.
 
-    Of a directory, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number is that of
-    each recording which has it; a file in it that cannot be read is left out with a warning.
+    Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number
+    is that of each recording which has it; a file in it that cannot be read is left out with a warning.
 
     Raises:
         RecordingError: a source cannot be opened, or has no such episode.
@@ -311,6 +316,9 @@ def chosen_from(
     with ExitStack() as stack:
         chosen: list[Chosen] = []
         for source in given:
+            if not isinstance(source, Recording) and is_server(os.fspath(source)):
+                chosen += _of_server(os.fspath(source), text, wanted)
+                continue
             if not isinstance(source, Recording) and _is_directory(source):
                 chosen += _of_directory(Path(source), text, wanted, stack)
                 continue
@@ -321,6 +329,14 @@ def chosen_from(
         if not chosen:
             raise RecordingError("expected a recording to show, found none; give its path")
         yield chosen
+
+
+def chosen_ids(
+    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+) -> set[str]:
+    """The ids of the episodes that `chosen_from` gives, with the same errors."""
+    with chosen_from(sources, episodes, filter) as chosen:
+        return {item.recording.episodes[at].id for item in chosen for at in item.positions}
 
 
 def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
@@ -352,6 +368,41 @@ def _is_directory(source: str | os.PathLike[str]) -> bool:
     return not is_url(os.fspath(source)) and Path(source).is_dir()
 
 
+def _of_server(address: str, text: str, filter: BaseFilter | None) -> list[Chosen]:
+    from tupli_mcap.dataset.dataset import open as open_dataset
+
+    dataset = open_dataset(address)
+    dataset = dataset if filter is None else dataset.filter(filter)
+    numbers = np.array([header.episode for header in dataset.headers])
+    named: dict[int, None] = {}
+    for item in (item.strip().lower() for item in text.split(",")):
+        if item not in WORDS:
+            first, last = bounds_of(item, text)
+            named.update(dict.fromkeys(np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()))
+        elif len(numbers):
+            everywhere = {"all": range(len(numbers)), "first": [0], "last": [len(numbers) - 1]}
+            named.update(dict.fromkeys(everywhere.get(item) or [_extreme(item, dataset.returns)]))
+    if not named:
+        why = "" if filter is None else f" that matches {filter}"
+        raise RecordingError(
+            f"{shown(address)} has no episode {text!r}{why}; see tupli-mcap episodes {shown(address)}"
+        )
+    found = dataset[list(named)]
+    _check_few(len(found._chosen), shown(address))
+    opened = {name: found._open(name) for name in found._chosen}
+    return [
+        Chosen(recording, np.flatnonzero(np.isin(recording.index["episode"], found._chosen[name])).tolist())
+        for name, recording in opened.items()
+    ]
+
+
+def _check_few(recordings: int, where: str) -> None:
+    if recordings > _MOST_OPEN:
+        raise RecordingError(
+            f"expected episodes of at most {_MOST_OPEN} recordings, found {recordings} in {where}; choose fewer"
+        )
+
+
 def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
     from tupli_mcap.storage.listing import find_recordings
 
@@ -381,10 +432,7 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
         raise RecordingError(
             f"{folder} has no episode {text!r}{why} in any recording; see tupli-mcap ls {folder}"
         )
-    if len(chosen) > _MOST_OPEN:
-        raise RecordingError(
-            f"expected episodes of at most {_MOST_OPEN} recordings, found {len(chosen)} in {folder}; choose fewer"
-        )
+    _check_few(len(chosen), str(folder))
     return [
         Chosen(stack.enter_context(Recording(file, cache_bytes=_CACHE_BYTES)), list(positions))
         for file, positions in chosen.items()

@@ -7,7 +7,7 @@ patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
 names:    recognises URLs, and removes secrets from them.
 """
 
-from tupli_mcap.remote.names import is_url, is_web, shown
+from tupli_mcap.remote.names import is_server, is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import matching
 from tupli_mcap.remote.plan import is_cut_cheaper
@@ -17,6 +17,7 @@ __all__ = [
     "RemoteSource",
     "copied",
     "is_cut_cheaper",
+    "is_server",
     "is_url",
     "is_web",
     "matching",

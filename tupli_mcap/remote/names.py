@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from urllib.parse import urlsplit
 
-__all__ = ["is_url", "is_web", "shown"]
+__all__ = ["is_server", "is_url", "is_web", "shown"]
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
@@ -18,6 +19,11 @@ def is_url(name: str) -> bool:
 def is_web(url: str) -> bool:
     """Whether a URL is the address of a web server."""
     return url.lower().startswith(("http://", "https://"))
+
+
+def is_server(name: str) -> bool:
+    """True for the address of a server (`tupli-mcap serve`): of a web server, and not of a file on it."""
+    return is_web(name) and not urlsplit(name).path.strip("/")
 
 
 def shown(text: str) -> str:
