@@ -126,7 +126,7 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     def told(*words: str) -> Any:
         done = CliRunner().invoke(app, [words[0], url, *words[1:], "--json"])
         assert done.exit_code == 0, done.output
-        return json.loads(done.output)["data"]
+        return json.loads(done.output)["result"]
 
     made = str(tmp_path / "made.mcap")
     assert [episode["seed"] for episode in told("episodes", "--filter", 'run.name ~ "PPO" and seed < 2')] == [

@@ -589,3 +589,25 @@ def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "would write" in run("filter", "all.mcap", "n_tuples > 3", "-o", "none.mcap", "--dry-run")
     assert not Path("none.mcap").exists()
     run("filter", "all.mcap", "colour = 1", "-o", "none.mcap", code=2)
+
+
+def test_vectorised_copies_of_an_environment_are_no_other_one(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    """CartPole steps its copies by a class of its own, of which no EnvSpec tells."""
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "one.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+    with vector.RecordEpisodes(gym.make_vec("CartPole-v1", num_envs=2), tmp_path / "two.mcap") as envs:
+        envs.reset(seed=0)
+        envs.step(np.zeros(2, np.int64))
+    with RecordEpisodes(gym.make("CartPole-v1", max_episode_steps=9), tmp_path / "other.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+    for first, second in (("one", "two"), ("two", "one")):
+        merge_recordings(
+            [tmp_path / f"{first}.mcap", tmp_path / f"{second}.mcap"], tmp_path / f"{first}_m.mcap"
+        )
+    assert not [warning for warning in recwarn if "another environment" in str(warning.message)]
+    with pytest.warns(UserWarning, match=r"other.mcap carries another environment than .*one.mcap"):
+        merge_recordings([tmp_path / "one.mcap", tmp_path / "other.mcap"], tmp_path / "m.mcap")

@@ -136,8 +136,8 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
             dry = CliRunner().invoke(app, [*words, "--force", "--dry-run", "--json"])
             done = CliRunner().invoke(app, [*words, "--force", "--json"])
             assert done.exit_code == 0, done.output
-            told = json.loads(done.output)["data"]
-            assert {**told, "dry_run": True, "size": 0} == json.loads(dry.output)["data"]
+            told = json.loads(done.output)["result"]
+            assert {**told, "dry_run": True, "size": 0} == json.loads(dry.output)["result"]
             assert (told["episodes"], told["steps"], told["left_out"]) == (8, sum(n_steps) - 8, 8)
             assert Recording(target).num_steps == sum(n_steps) - 8
             earlier = made_of(Recording(target))["earlier"]

@@ -299,8 +299,8 @@ def chosen_from(
 ) -> Iterator[list[Chosen]]:
     """The chosen episodes of recordings, open within the block.
 
-    Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number
-    is that of each recording which has it; a file in it that cannot be read is left out with a warning.
+    Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a
+    number is that of each recording which has it; a file in it that cannot be read is left out with a warning.
 
     Raises:
         RecordingError: a source cannot be opened, or has no such episode.

@@ -23,6 +23,7 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
         how: "merge", "filter", "map", "trim".
         facts: what else was decided: the query, the function's name, the steps.
     """
+    sources = list(sources)
     document = {
         "how": how,
         **facts,

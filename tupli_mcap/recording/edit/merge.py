@@ -7,7 +7,7 @@ import heapq
 import os
 import time
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
@@ -317,15 +318,16 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     """The attachments of all recordings, without statements that no longer hold."""
     attachments: dict[str, tuple[str, bytes]] = {}
-    digests = {name: digest for recording in sources for name, digest in _digest(recording)}
-    if len(set(digests.values())) > 1:
-        first, other = list(digests)[:2]
+    carried = [recording for recording in sources if _ENVIRONMENT[0] in recording.attachments]
+    other = next((r for r in carried if not _is_same(carried[0].benchmark.record, r.benchmark.record)), None)
+    if other is not None:
         warnings.warn(
-            f"{other} carries another environment than {first}, or another version of it; the first one is kept",
+            f"{other.name} carries another environment than {carried[0].name}, or another version of it; the first one "
+            "is kept",
             UserWarning,
             stacklevel=3,
         )
-    with_environment = next((r for r in sources if _ENVIRONMENT[0] in r.attachments), None)
+    with_environment = carried[0] if carried else None
     for recording in sources:
         for name, info in recording.attachments.items():
             if name in (*STATEMENTS, RUN_NAME, ANNOTATIONS_NAME, MADE_OF_NAME) or (
@@ -341,6 +343,8 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     return attachments
 
 
-def _digest(recording: Recording) -> Iterator[tuple[str, str]]:
-    if _ENVIRONMENT[0] in recording.attachments:
-        yield recording.name, recording.benchmark.record.digest
+def _is_same(one: EnvironmentRecord, other: EnvironmentRecord) -> bool:
+    """Whether they are one environment, as far as they tell: one that says nothing to rebuild it, as those that step
+    many copies by themselves do, may be any of its name."""
+    says = [record.spec is not None or record.pickle is not None for record in (one, other)]
+    return one.digest == other.digest or (one.name == other.name and says[0] != says[1])
