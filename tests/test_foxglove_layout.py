@@ -130,12 +130,14 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     before = source.read_bytes()
     target = tmp_path / "layout.json"
     target.write_bytes(b"here")
-    with pytest.raises(RecordingError, match="exists; choose another name, or replace it with --force"):
+    with pytest.raises(
+        RecordingError, match=r"exists; choose another path, or pass overwrite=True \(--force\)"
+    ):
         write_layout(source, target)
-    write_layout(source, target, force=True)
+    write_layout(source, target, overwrite=True)
     assert json.loads(target.read_text(encoding="utf-8"))["layout"]["direction"] == "row"
     with pytest.raises(RecordingError, match="is the recording itself, which is never overwritten"):
-        write_layout(source, source, force=True)
+        write_layout(source, source, overwrite=True)
     with pytest.raises(RecordingError, match="there is no directory"):
         write_layout(source, tmp_path / "no" / "layout.json")
     with pytest.raises(RecordingError, match="expected one recording to make a layout for, found 2"):

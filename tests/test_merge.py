@@ -598,7 +598,7 @@ def test_vectorised_copies_of_an_environment_are_no_other_one(
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "one.mcap") as env:
         env.reset(seed=0)
         env.step(0)
-    with vector.RecordEpisodes(gym.make_vec("CartPole-v1", num_envs=2), tmp_path / "two.mcap") as envs:
+    with RecordVector(gym.make_vec("CartPole-v1", num_envs=2), tmp_path / "two.mcap") as envs:
         envs.reset(seed=0)
         envs.step(np.zeros(2, np.int64))
     with RecordEpisodes(gym.make("CartPole-v1", max_episode_steps=9), tmp_path / "other.mcap") as env:

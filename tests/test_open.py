@@ -189,7 +189,7 @@ def test_a_wrong_key_says_what_is_meant(dataset: Dataset, wrong: str) -> None:
 def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> None:
     episode = dataset[0]
     for thing, wrong, meant in (
-        (dataset, "retruns", "returns"), (episode, "sates", "states"), (episode, "observation", "observations"),
+        (dataset, "retruns", "returns"), (episode, "sates", "states"), (episode, "observation", "states"),
         (episode.recording, "episods", "episodes"), (episode.run, "nme", "name"), (dataset.read(), "action", "actions"),
         (dataset.windows(2)[0], "reward", "rewards"), (TupliDataset(FileStorage(runs)), "laod", "load"),
     ):  # fmt: skip
@@ -639,3 +639,32 @@ def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:
         env.step(0)
     (info,) = tupli_mcap.open(tmp_path)[0].infos or []
     assert info is not None and np.array_equal(info["logp"], value.detach().numpy())
+
+
+@pytest.mark.parametrize(
+    ("name", "episode", "step", "window"),
+    [
+        ("obs", "states", "state", "states"),
+        ("observation", "states", "state", "states"),
+        ("acts", "actions", "action", "actions"),
+        ("rews", "rewards", "reward", "rewards"),
+        ("dones", "terminals", "terminal", "terminals"),
+    ],
+)
+def test_names_of_other_libraries_are_understood_well_enough_to_name_ours(
+    runs: Path, name: str, episode: str, step: str, window: str
+) -> None:
+    dataset = tupli_mcap.open(runs)
+    first = dataset[0]
+    for item, meant in ((first, episode), (next(iter(first)), step), (dataset.windows(2)[0], window)):
+        with pytest.raises(AttributeError, match=rf"no attribute '{name}' \(did you mean '{meant}'\?\)"):
+            getattr(item, name)
+    with pytest.raises(
+        AttributeError, match=rf"no attribute '{name}' \(read\(\) gives .*: read\(\).{episode}\)"
+    ):
+        getattr(dataset, name)
+    for read in (dataset.read, dataset.transitions):
+        with pytest.raises(TupliError, match=rf"found '{name}' \(did you mean '{episode}'\?\)"):
+            read(fields=[name])
+    with pytest.raises(TupliError, match=rf"found '{name}' \(did you mean '{step}'\?\)"):
+        dataset.delta_windows({name: [0]})

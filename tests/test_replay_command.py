@@ -179,7 +179,7 @@ def test_without_a_display_it_names_the_other_ways(
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert replay(folder / "runs" / "one.mcap") == 1
     told = capfd.readouterr().err
-    assert "there is no display" in told and "--save FILE.rrd (in Python: save=)" in told and "--web" in told
+    assert "there is no display here; look in a browser with --web" in told and "--save FILE.rrd" in told
 
 
 def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -55,7 +55,7 @@ def replayed(tmp_path: Path, env: gym.Env[Any, Any], steps: int = 20, **options:
             *_, terminated, _, _ = recorder.step(recorder.action_space.sample())
             if terminated:
                 recorder.reset()
-    return Rrd(viewer.save(path, tmp_path / "sampled.rrd", force=True))
+    return Rrd(viewer.save(path, tmp_path / "sampled.rrd", overwrite=True))
 
 
 def card(found: Rrd) -> str:

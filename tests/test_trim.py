@@ -140,7 +140,9 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
             assert {**told, "dry_run": True, "size": 0} == json.loads(dry.output)["result"]
             assert (told["episodes"], told["steps"], told["left_out"]) == (8, sum(n_steps) - 8, 8)
             assert Recording(target).num_steps == sum(n_steps) - 8
-            earlier = made_of(Recording(target))["earlier"]
+            said = tupli_mcap.open(target).made_of[str(target)]
+            assert said == Recording(target).made_of
+            earlier = said["earlier"]
             assert [one["sources"][0]["name"] for one in earlier] == ["a.mcap", "b.mcap"]
             words = ["filter", *map(str, sources), "seed == 1", "-o", str(target), "--force"]
             assert CliRunner().invoke(app, words).exit_code == 0

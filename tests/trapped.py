@@ -202,10 +202,10 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
         lambda: tupli_mcap.filter_recording(path, work / f"some_{name}", "n_tuples > 0", overwrite=True),
     )
     yield "import", lambda: _import(path, work / "lab")
-    yield "view", lambda: viewer.save(path, work / f"{name}.rrd", force=True)
+    yield "view", lambda: viewer.save(path, work / f"{name}.rrd", overwrite=True)
     yield "plot", lambda: plots.report(path)
     yield "render", lambda: render(path, work / f"rendered_{name}", overwrite=True)
-    yield "layout", lambda: write_layout(path, work / f"{name}.json", force=True)
+    yield "layout", lambda: write_layout(path, work / f"{name}.json", overwrite=True)
     for command in ("info", "ls", "episodes", "verify", "doctor"):
         yield f"tupli-mcap {command}", _cli(command, str(path))
     yield "tupli-mcap info --json", _cli("info", str(path), "--json")

@@ -118,7 +118,7 @@ def replay(lab: Path, *, window: bool) -> None:
             print(f"The viewer shows the best episode; again: {command}")
             return
         except viewer.ViewerError as err:
-            print(f"No window: {err}.")
+            print(f"No window: {str(err).partition(';')[0]}.")
     replay = viewer.save(lab, ROOT / "best.rrd", "best")
     print("A replay of the best episode is in demo/best.rrd; open it with: .venv/bin/rerun demo/best.rrd")
     print(f"  in a window: {command}\n  in a browser: {command} --web")

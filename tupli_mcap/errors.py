@@ -52,6 +52,21 @@ _ADVICE: Final = {
 }
 
 
+_STATE = ("states", "observations", "state")
+_NEXT_STATE = ("next_states", "next_observations", "next_state")
+_ACTION, _REWARD = ("actions", "action"), ("rewards", "reward")
+_TERMINAL, _TIMEOUT = ("terminals", "terminal"), ("timeouts", "timeout")
+_OTHERWISE: Final = {
+    **dict.fromkeys(("obs", "observation", "observations", "states", "state"), _STATE),
+    **dict.fromkeys(("next_obs", "next_observation", "next_observations", "next_states"), _NEXT_STATE),
+    **dict.fromkeys(("act", "acts", "action", "actions"), _ACTION),
+    **dict.fromkeys(("rew", "rews", "reward", "rewards"), _REWARD),
+    **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
+    **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
+}
+"""What other libraries call the columns of steps, and what we do; the first that there is is meant."""
+
+
 class TupliError(Exception):
     """Root of every error this package raises on purpose."""
 
@@ -118,7 +133,9 @@ def brief(err: BaseException | None) -> str:
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """` (did you mean 'return'?)` where one of the known names is like this one, else nothing."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.6)
+    names = list(known)
+    close = [meant for meant in _OTHERWISE.get(str(name), ()) if meant in names]
+    close = close or difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
@@ -132,6 +149,8 @@ class SaysWhatIsMeant:
             if name in known:  # a property whose own code went wrong
                 return object.__getattribute__(self, name)
             meant = "" if name.startswith("_") else did_you_mean(name, [n for n in known if n[0] != "_"])
+            if name in _OTHERWISE and "read" in known:  # what has columns only once they are read
+                meant = f" (read() gives its columns: read().{_OTHERWISE[name][0]})"
             # with the object, too, Python would add a hint of its own
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}{meant}", name=name

@@ -81,6 +81,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
                 "path": shown(source), "recordings": recordings, "runs": runs, "environments": environments,
                 "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
                 "returns": returns, "success": rate, "seeds": len(seeds), "metadata_keys": keys,
+                "made_of": None if is_url(source) else dataset.made_of,
             }
         )  # fmt: skip
         return

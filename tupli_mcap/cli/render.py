@@ -40,9 +40,7 @@ class _X(StrEnum):
 
 _Source = Annotated[
     str,
-    typer.Argument(
-        metavar="PATH|URL", help="A recording (a path or a URL), or a directory that holds it."
-    ),
+    typer.Argument(metavar="PATH|URL", help="A recording (a path or a URL), or a directory that holds it."),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]

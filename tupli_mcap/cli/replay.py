@@ -83,7 +83,7 @@ def replay(
     shown: dict[str, Any] = {"filter": filter_of(filter_text), "form": form, "note": notes.append}
     if save is not None:
         commands: list[str] = []
-        path = viewer.save(sources, save, episode, force=force, tell=commands.append, **shown)
+        path = viewer.save(sources, save, episode, overwrite=force, tell=commands.append, **shown)
         say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}", *notes)
     elif web:
         viewer.serve(sources, episode, tell=lambda url: _tell(url, *notes), **shown)
@@ -100,5 +100,5 @@ def _tell(url: str, *notes: str) -> None:
 def _write_layout(sources: list[str], target: Path, *, force: bool) -> None:
     from tupli_mcap.viewer.foxglove_layout import write_layout
 
-    path = write_layout(sources, target, force=force)
+    path = write_layout(sources, target, overwrite=force)
     say(f"{path}: open the recording in Foxglove, then import this file as a layout")

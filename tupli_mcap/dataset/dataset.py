@@ -157,6 +157,16 @@ class Dataset(RandomAccess):
         left_out = self._source.episodes(None, None)
         return self._source.open(left_out[0].recording, [left_out[0].episode]) if left_out else None
 
+    @property
+    def made_of(self) -> dict[str, dict[str, Any]]:
+        """`Recording.made_of` of those of the recordings that were made of others, by their names.
+
+        Raises:
+            FormatError: one says something else.
+        """
+        said = {name: self._open(name).made_of for name in self._chosen}
+        return {name: document for name, document in said.items() if document is not None}
+
     @cached_property
     def _chosen(self) -> Mapping[str, Sequence[int]]:
         """The numbers of the episodes, by recording."""

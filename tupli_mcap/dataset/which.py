@@ -218,9 +218,8 @@ def subjects_of(
     from tupli_mcap.storage import TupliStorage
 
     if isinstance(source, str) and is_server(source):
-        from tupli_mcap.dataset.dataset import open as open_dataset
-
-        yield from _of_headers(*open_dataset(source)._episodes(episode_filter))
+        server = _server(source)
+        yield from _of_headers(server, server.episodes(None, episode_filter))
     elif isinstance(source, str | os.PathLike):
         yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
     elif isinstance(source, Recording):
@@ -317,7 +316,7 @@ def chosen_from(
         chosen: list[Chosen] = []
         for source in given:
             if not isinstance(source, Recording) and is_server(os.fspath(source)):
-                chosen += _of_server(os.fspath(source), text, wanted)
+                chosen += _of_server(os.fspath(source), text, wanted, stack)
                 continue
             if not isinstance(source, Recording) and _is_directory(source):
                 chosen += _of_directory(Path(source), text, wanted, stack)
@@ -368,32 +367,39 @@ def _is_directory(source: str | os.PathLike[str]) -> bool:
     return not is_url(os.fspath(source)) and Path(source).is_dir()
 
 
-def _of_server(address: str, text: str, filter: BaseFilter | None) -> list[Chosen]:
-    from tupli_mcap.dataset.dataset import open as open_dataset
+def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
+    from tupli_mcap.dataset.sources import numbers_by_recording
 
-    dataset = open_dataset(address)
-    dataset = dataset if filter is None else dataset.filter(filter)
-    numbers = np.array([header.episode for header in dataset.headers])
+    server = _server(address)
+    headers = server.episodes(None, filter)
+    numbers = np.array([header.episode for header in headers])
+    returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
     named: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
         if item not in WORDS:
             first, last = bounds_of(item, text)
             named.update(dict.fromkeys(np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()))
-        elif len(numbers):
+        elif headers:
             everywhere = {"all": range(len(numbers)), "first": [0], "last": [len(numbers) - 1]}
-            named.update(dict.fromkeys(everywhere.get(item) or [_extreme(item, dataset.returns)]))
+            named.update(dict.fromkeys(everywhere.get(item) or [_extreme(item, returns)]))
     if not named:
         why = "" if filter is None else f" that matches {filter}"
-        raise RecordingError(
-            f"{shown(address)} has no episode {text!r}{why}; see tupli-mcap episodes {shown(address)}"
-        )
-    found = dataset[list(named)]
-    _check_few(len(found._chosen), shown(address))
-    opened = {name: found._open(name) for name in found._chosen}
+        where = shown(address)
+        raise RecordingError(f"{where} has no episode {text!r}{why}; see tupli-mcap episodes {where}")
+    chosen = numbers_by_recording([headers[i] for i in named])
+    _check_few(len(chosen), shown(address))
+    opened = {name: stack.enter_context(server.open(name, wanted)) for name, wanted in chosen.items()}
     return [
-        Chosen(recording, np.flatnonzero(np.isin(recording.index["episode"], found._chosen[name])).tolist())
+        Chosen(recording, np.flatnonzero(np.isin(recording.index["episode"], chosen[name])).tolist())
         for name, recording in opened.items()
     ]
+
+
+def _server(address: str) -> EpisodeSource:
+    from tupli_mcap.dataset.sources import StorageSource
+    from tupli_mcap.storage import storage_at
+
+    return StorageSource(storage_at(address))
 
 
 def _check_few(recordings: int, where: str) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.schema import RLTuple
@@ -33,7 +33,7 @@ class _Step(NamedTuple):
     info: dict[str, Any] | None = None
 
 
-class Step(_Step):
+class Step(_Step, SaysWhatIsMeant):
     """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded.
 
     Attributes:

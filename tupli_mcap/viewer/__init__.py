@@ -39,7 +39,7 @@ def save(
     *,
     filter: Any = None,
     form: Form = "joined",
-    force: bool = False,
+    overwrite: bool = False,
     tell: Callable[[str], None] | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Path:
@@ -55,7 +55,7 @@ def save(
             ten, the last, the best and the worst (of each recording; of more than three recordings, of all together).
         filter: only episodes that match it.
         form: "joined" on one timeline, "split" into a Rerun recording each, or "compare" in the same plots.
-        force: replace a file that exists.
+        overwrite: replace a file that exists.
         tell: called with the command that opens the file.
         note: called with a sentence on which episodes are shown, if the default has left some out.
 
@@ -65,7 +65,7 @@ def save(
         FormatError: a recording is damaged; no file is left.
     """
     with _planned(sources, episodes, filter, form, note) as plans:
-        return to_file(plans, target, force=force, tell=tell)
+        return to_file(plans, target, overwrite=overwrite, tell=tell)
 
 
 def show(

@@ -39,13 +39,13 @@ _PLOT = {
 
 
 def write_layout(
-    sources: Source | Sequence[Source], target: str | os.PathLike[str], *, force: bool = False
+    sources: Source | Sequence[Source], target: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Path:
     """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts).
 
     Args:
         sources: as for `tupli_mcap.viewer.save`, but one recording.
-        force: replace a file that exists.
+        overwrite: replace a file that exists.
 
     Raises:
         RecordingError: `sources` is not one recording; the recording has no steps; the target exists, is the recording
@@ -53,7 +53,7 @@ def write_layout(
         FormatError: the recording is damaged.
     """
     path = Path(target)
-    check_new(path, force=force)
+    check_new(path, overwrite=overwrite)
     with chosen_from(sources, None, None) as chosen:
         if len(chosen) != 1:
             raise RecordingError(

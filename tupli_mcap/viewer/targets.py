@@ -38,20 +38,20 @@ def to_file(
     plans: Iterable[Plan],
     target: str | os.PathLike[str],
     *,
-    force: bool = False,
+    overwrite: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Path:
     """Writes a `.rrd` with its blueprint, as a whole or not at all. `tell` is called with the command that opens it.
 
     Raises:
-        RecordingError: its name does not end in .rrd, it exists and `force` is False, or it cannot be written.
+        RecordingError: its name does not end in .rrd, it exists and `overwrite` is False, or it cannot be written.
     """
     goal = Path(target)
     if goal.suffix != ".rrd":
         raise RecordingError(
             f"expected a name that ends in .rrd, by which the viewer recognises its files, found {str(goal)!r}"
         )
-    check_new(goal, force=force)
+    check_new(goal, overwrite=overwrite)
     with replacing(goal) as (_, temporary):
         several = list(plans)
         if len(several) == 1:
@@ -64,16 +64,14 @@ def to_file(
     return goal
 
 
-def check_new(goal: Path, *, force: bool) -> None:
+def check_new(goal: Path, *, overwrite: bool) -> None:
     """Checks that a file can be made.
 
     Raises:
-        RecordingError: it exists and `force` is False, or there is no directory for it.
+        RecordingError: it exists and not `overwrite`, or there is no directory for it.
     """
-    if goal.exists() and not force:
-        raise RecordingError(
-            f"{goal} exists; choose another name, or replace it with --force (in Python: force=True)"
-        )
+    if goal.exists() and not overwrite:
+        raise RecordingError(f"{goal} exists; choose another path, or pass overwrite=True (--force)")
     if not goal.parent.is_dir():
         raise RecordingError(
             f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
@@ -161,8 +159,8 @@ def to_window(plans: Iterable[Plan]) -> int:
     program = viewer_program()
     if not has_display():
         raise ViewerError(
-            "there is no display to open the viewer on; write a file with --save FILE.rrd (in Python: save=), or look "
-            "in a browser with --web (tupli_mcap.viewer.serve)"
+            "there is no display here; look in a browser with --web (in Python: viewer.serve), or write a file with "
+            "--save FILE.rrd (viewer.save)"
         )
     port = free_port()
     with scratch() as folder, (folder / "log").open("wb") as log:

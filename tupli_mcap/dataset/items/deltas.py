@@ -12,6 +12,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Parts, StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps
 from tupli_mcap.dataset.items.windows import shaped_rows
+from tupli_mcap.errors import did_you_mean
 
 __all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
 
@@ -144,7 +145,8 @@ def _checked_keys(deltas: Mapping[str, Iterable[float]]) -> Mapping[str, Iterabl
         raise SamplingError(f"expected deltas such as {{'state': [-1, 0]}}, found {deltas!r:.80}")
     unknown = [key for key in deltas if key not in KEYS]
     if unknown:
-        raise SamplingError(f"expected deltas of {', '.join(KEYS)}, found {', '.join(map(repr, unknown))}")
+        found = f"{', '.join(map(repr, unknown))}{did_you_mean(unknown[0], KEYS)}"
+        raise SamplingError(f"expected deltas of {', '.join(KEYS)}, found {found}")
     return deltas
 
 

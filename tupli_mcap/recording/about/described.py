@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import warnings
 from functools import cached_property
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from tupli_mcap.errors import FormatError, TupliError
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
 from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.opened import OpenedRecording
+
+MADE_OF_NAME: Final = "made_of.json"
+MAX_MADE_OF: Final = 1 << 22  # bytes of it
 
 
 class DescribedRecording(OpenedRecording):
@@ -63,6 +67,28 @@ class DescribedRecording(OpenedRecording):
         with contextlib.suppress(TupliError):  # damaged, which opening it says
             return self.benchmark.record.name
         return ""
+
+    @cached_property
+    def made_of(self) -> dict[str, Any] | None:
+        """Of which recordings this one was made, and how ("merge", "filter", "map", "trim"): `how`, `sources`, and
+        others, as `schemas/made_of.schema.json` has it; None if it says nothing.
+
+        Raises:
+            FormatError: it says something else.
+        """
+        info = self.attachments.get(MADE_OF_NAME)
+        if info is None:
+            return None
+        where = f"{self.name}: {MADE_OF_NAME}"
+        if info.size > MAX_MADE_OF:
+            raise FormatError(f"{where}: expected at most {MAX_MADE_OF} bytes, found {info.size}")
+        try:
+            document = json.loads(self.read_attachment(MADE_OF_NAME))
+        except (ValueError, RecursionError) as err:
+            raise FormatError(f"{where}: expected JSON, found something else: {err}") from err
+        if not isinstance(document, dict) or not isinstance(document.get("sources"), list):
+            raise FormatError(f"{where}: expected the sources of a recording, found {document!r:.80}")
+        return document
 
     @cached_property
     def annotations(self) -> Annotations:
