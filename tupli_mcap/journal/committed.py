@@ -1,4 +1,4 @@
-"""What a journal still holds: committed rows and records beyond those in the file, and the running states."""
+"""Reads a journal: its committed rows and records, and the running states."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from tupli_mcap.messages.step import StepLayout
 
 Taken = TypeVar("Taken")
 Taken_co = TypeVar("Taken_co", covariant=True)
-SEQUENCE_END = 15  # of `sequence` in a Message record
-EPISODE_END = BODY + 4  # of `episode` in a step's
+SEQUENCE_END = 15  # offset after `sequence` in a Message record
+EPISODE_END = BODY + 4  # offset after `episode` in a step's record
 
 
 class FinalHole(NamedTuple):
-    """The place after an episode's last step: what it ended with, the time (ns) of the next reset, the row after."""
+    """The hole after an episode's last step: final state, time (ns) of the next reset, number of the row after it."""
 
     episode: int
     state: bytes
@@ -35,24 +35,26 @@ class FinalHole(NamedTuple):
 
 
 class Committed(Protocol[Taken_co]):
-    """The committed rows of one channel that a journal holds: their `numbers` (int64), ascending, each once.
+    """The committed rows of one channel in a journal.
 
-    `whole` says which of them count: all, but those of a torn journal that do not prove to be whole.
+    Attributes:
+        numbers: of the rows, int64, ascending, each once.
+        whole: which of them count, bool. In a torn journal these are the rows that are known to be whole, else all.
     """
 
     numbers: Array
     whole: Array
 
     def take(self, places: Array) -> Taken_co:
-        """Copies of consecutive rows: those at `places` in `numbers`."""
+        """Copies of consecutive rows, given by their places in `numbers`."""
         ...
 
 
 def rows_of(committed: Committed[Taken], in_file: int, stop: int | None = None) -> Taken | None:
-    """The reader's rule: of a channel with `in_file` rows in the file, those of the journal that go on with them.
+    """Applies the reader's rule to a channel that has `in_file` rows in the file.
 
-    Rows `in_file`, `in_file + 1`, … up to the first that is missing, or to `stop`; None if there are none. All others
-    are stale.
+    Returns rows `in_file`, `in_file + 1`, … up to the first that is missing, or to `stop`; None if there are none. All
+    others are stale.
     """
     start = int(np.searchsorted(committed.numbers, in_file))
     count = _run(committed.numbers[start:], in_file, committed.whole[start:])
@@ -61,20 +63,20 @@ def rows_of(committed: Committed[Taken], in_file: int, stop: int | None = None) 
 
 
 def torn_rows(committed: Committed[Any], in_file: int) -> int:
-    """How many rows more `rows_of` would give if none were torn."""
+    """How many more rows `rows_of` would return if none were torn."""
     start = int(np.searchsorted(committed.numbers, in_file))
     numbers, whole = committed.numbers[start:], committed.whole[start:]
     return _run(numbers, in_file, np.ones_like(whole)) - _run(numbers, in_file, whole)
 
 
 def _run(numbers: Array, first: int, whole: Array) -> int:
-    """How many of the numbers are `first`, `first + 1`, …, and of whole rows."""
+    """How many numbers at the start are `first`, `first + 1`, … and belong to whole rows."""
     good = whole & (numbers == first + np.arange(len(numbers)))
     return int(np.argmin(np.append(good, False)))
 
 
 def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
-    """The whole rows that the mask `wanted` names, in runs of consecutive ones."""
+    """The whole rows that the mask `wanted` selects, in runs of consecutive ones."""
     places = np.flatnonzero(wanted & committed.whole)
     edges = np.flatnonzero(np.diff(committed.numbers[places]) != 1) + 1
     return [committed.take(part) for part in np.split(places, edges) if len(part)]
@@ -83,8 +85,11 @@ def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
 class CommittedRows:
     """The committed rows of one channel in an area of rows, in both halves.
 
-    Of a journal that may be torn, those are whole that checksums show to be, or that lie in sectors which were written
-    after them; the latter shows nothing where committed rows may be `rewritten`.
+    In a torn journal, a row is whole if its checksum is right. Without checksums it is whole if the disk has something
+    in its last sector that was written after it; this does not hold if committed rows may be `rewritten`.
+
+    Raises:
+        FormatError: the area has rows of another size, or no block of this number.
     """
 
     def __init__(
@@ -101,11 +106,11 @@ class CommittedRows:
         shape = (2, area.channels, area.rows + 1, area.row_size)
         if area.row_size != dtype.itemsize or journal.data[name].size != np.prod(shape):
             raise FormatError(
-                f"the journal's area {name!r} has rows of {area.row_size} bytes, not {dtype.itemsize}"
+                f"the journal's area {name!r}: expected rows of {dtype.itemsize} bytes, found {area.row_size}"
             )
         if block >= area.channels:
             raise FormatError(
-                f"the journal's area {name!r} has rows of {area.channels} channels, none of number {block}"
+                f"the journal's area {name!r}: expected more than {block} blocks of rows, found {area.channels}"
             )
         self._bytes = np.ascontiguousarray(journal.data[name].reshape(shape)[:, block])
         self._area = area
@@ -124,7 +129,7 @@ class CommittedRows:
             self.whole = np.fromiter(map(self._is_whole, range(len(order))), np.bool_)
 
     def take(self, places: Array) -> Array:
-        """Copies of the rows at `places`, as bytes: of rows with fields NumPy may leave out what lies between these."""
+        """Copies of the rows at `places`. They are copied as bytes: NumPy may not copy the padding between fields."""
         copies: Array = self._bytes[self._halves[places], self._places[places]].view(self.rows.dtype)[:, 0]
         return copies
 
@@ -134,7 +139,7 @@ class CommittedRows:
         return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
 
     def row(self, sequence: int) -> Array | None:
-        """The committed row with `sequence`; None if it is not here."""
+        """The committed row with `sequence`; None if it is missing or torn."""
         found = self._find(sequence)
         if found is None or not self.whole[found]:
             return None
@@ -142,8 +147,8 @@ class CommittedRows:
         return row
 
     def following(self, sequence: int, state_end: int) -> bytes | None:
-        """The state in the row that was running when the one with `sequence` was committed; None if it is not here, or
-        was not known yet."""
+        """The state in the slot after the row with `sequence`; None if the row is missing, or the state was not known
+        when the row was committed."""
         found = self._find(sequence)
         if found is None:
             return None
@@ -158,7 +163,7 @@ class CommittedRows:
         return state
 
     def finals(self, state_end: int) -> list[FinalHole]:
-        """What follows the last steps of episodes, of all committed rows here; nothing of a torn journal."""
+        """The final holes after all committed rows that end an episode; none of a torn journal."""
         rows = self.rows
         flags = (rows[name][self._halves, self._places].view(np.uint8) for name in ("terminal", "timeout"))
         ended = np.logical_or(*flags)
@@ -166,7 +171,9 @@ class CommittedRows:
             return []
         halves, places = self._halves[ended], self._places[ended]
         last = rows[halves, places]
-        beyond = places + 1 == self._area.rows  # the spare row, which is the other half's first one
+        beyond = (
+            places + 1 == self._area.rows
+        )  # the spare row: its state was copied to the other half's first row
         halves, places = np.where(beyond, 1 - halves, halves), np.where(beyond, 0, places + 1)
         after = rows[halves, places]
         valid = (after["#sequence"] == HOLE) & (after["episode"] == last["episode"])
@@ -186,7 +193,7 @@ class CommittedRows:
         return found if found < len(self.numbers) and self.numbers[found] == sequence else None
 
     def _is_whole(self, i: int) -> bool:
-        """Whether the i-th committed row was on the disk as it had been committed."""
+        """Whether the disk has the i-th committed row as it was committed."""
         half, place, size = int(self._halves[i]), int(self._places[i]), self._area.row_size
         if self._sealed:
             return (
@@ -198,8 +205,8 @@ class CommittedRows:
         start = half * self._area.half + self._block * self._area.block + place * size
         if start // SECTOR == (start + size - 1) // SECTOR:
             return True
-        # A row of less than a sector lies in two at most. The second one also holds the commitment of the next row,
-        # which came later: where that is on the disk, so is the end of this row.
+        # A row of less than a sector lies in two at most. The second one also holds the next row's `sequence`, which
+        # was stored later: if the disk has that, it has the end of this row.
         follows = i + 1 < len(self.numbers) and self.numbers[i + 1] == self.numbers[i] + 1
         beside = follows and (int(self._halves[i + 1]), int(self._places[i + 1])) == (half, place + 1)
         if beside:
@@ -207,7 +214,7 @@ class CommittedRows:
         return size <= SECTOR - EPISODE_END and place + 1 < self._area.rows and self._has_hole(half, place)
 
     def _has_hole(self, half: int, place: int) -> bool:
-        """Whether a final hole that is later than a row is the next one of its block."""
+        """Whether a final hole that was made later follows a row in its block."""
         row, hole = self.rows[half, place], self.rows[half, place + 1]
         later = hole["#sequence"] == HOLE and hole["#log_time"] > row["#log_time"]
         return bool(later and hole["episode"] == row["episode"] and (row["terminal"] or row["timeout"]))
@@ -238,9 +245,9 @@ class CommittedRecords:
 def committed_records(
     journal: JournalContents, name: str, in_file: Mapping[int, int] | None = None
 ) -> dict[int, CommittedRecords]:
-    """The committed records of a log, by channel, but for as many of each as are known to be `in_file`.
+    """The committed records of a log, by channel, without the first `in_file` records of each.
 
-    A record whose checksum differs ends its half.
+    A half is read up to a record whose checksum is wrong.
     """
     found: dict[int, dict[int, bytes]] = {}
     area = journal.log_area(name)
@@ -254,7 +261,7 @@ def committed_records(
 def _whole_records(
     contents: JournalContents, data: memoryview, in_file: Mapping[int, int]
 ) -> Iterator[tuple[int, int, int, int, int]]:
-    """As `iter_records`, without those that are in the file, up to one whose checksum differs."""
+    """As `iter_records`, without records that are in the file, up to one whose checksum is wrong."""
     sealed = contents.sealed_records
     try:
         for start, end, channel, sequence, log_time in iter_records(data):
@@ -268,7 +275,7 @@ def _whole_records(
 
 
 def size_behind(journal: JournalContents) -> int:
-    """Bytes the file had when it took up the events that the journal held before; 0 where it does not say."""
+    """Size of the file (bytes) after the log of events last went into it; 0 if the journal does not say."""
     return int(journal.data[journal.log_area("events").name][8:16].view("<u8")[0])
 
 
@@ -304,7 +311,7 @@ def running_record(contents: JournalContents, name: str, sequence: int, layout: 
 
 
 def _running_seal(contents: JournalContents, area: LogArea, sequence: int) -> int | None:
-    """The checksum of the state of the running record, which will have `sequence`, from the record before it."""
+    """The checksum of the running state before row `sequence`, taken from the record before that row."""
     for half in range(area.halves):
         data = _half(contents, area, half)
         for start, _, _, found, _ in _whole_records(contents, data, {}):

@@ -1,10 +1,8 @@
-"""What is derived from committed rows when they go to the file: what `step()` left out, and episodes.
+"""Completes committed rows when they go to the file, and derives episode records from them, many at a time.
 
-`/episode_start`, `/episode_end` and `/final_state` are derived from step rows, many episodes at a time.
-
-A plain episode (a reset without seed, options and info; an end by a flag) writes nothing of its own while it is
-recorded: its rows carry its number and its flags, and the hole after its last row the final state and the time of the
-next reset.
+A plain episode (reset without seed, options and info; ended by a flag) writes only rows while it is recorded: they hold
+its number and flags, and the hole after its last row holds the final state and the time of the next reset. Its records
+in `/episode_start`, `/episode_end` and `/final_state` are derived from these.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 
-LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and the last value marks a hole
+LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and its largest value marks a hole
 
 STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
 ENDS = np.dtype(
@@ -37,9 +35,9 @@ def rows_per_half(row_size: int, chunk_size: int) -> int:
 
 
 class RowDeriver:
-    """Fills what `step()` left out: `step`, a `log_time` that never decreases, `publish_time`.
+    """Fills the fields that `step()` leaves out: `step`, a `log_time` that never decreases, `publish_time`.
 
-    It carries the running episode from one batch of rows of a channel to the next.
+    It remembers the running episode from one batch of a channel's rows to the next.
     """
 
     def __init__(self, episode: int = -1, step: int = -1, time_ns: int = 0) -> None:
@@ -88,8 +86,9 @@ class StartedEpisode(NamedTuple):
 
 
 class EpisodeBatch(NamedTuple):
-    """What was derived: `starts` (episode, env, first_row, time), `ends` (those, length, return, end) and their final
-    states, as they follow `episode` and `env` in `/final_state` (uint8, a row an end); each in the order of time.
+    """Derived records in the order of time: `starts` (STARTS), `ends` (ENDS), and the final state of each end.
+
+    `states` is uint8 (ends, bytes): what follows `episode` and `env` in `/final_state`.
     """
 
     starts: Array
@@ -101,7 +100,7 @@ class EpisodeDeriver:
     """Derives the episodes of `num_envs` sub-environments from their rows, batch after batch.
 
     Attributes:
-        running: the numbers of the running episodes, -1 where there is none: int64 (num_envs,).
+        running: numbers of the running episodes, -1 if there is none: int64 (num_envs,).
         totals: their returns so far: float64 (num_envs,).
     """
 
@@ -112,7 +111,7 @@ class EpisodeDeriver:
         self.begin([None] * num_envs)
 
     def begin(self, started: Sequence[StartedEpisode | None]) -> None:
-        """The next rows are the first ones of these episodes, whose starts are written; None: no start is."""
+        """Says whose first rows come next: episodes whose starts are written; None if a start has to be derived."""
         self.running = np.array([-1 if one is None else one.number for one in started])
         self._first_rows = np.array([0 if one is None else one.first_row for one in started])
         self._lengths = np.zeros(self._n, np.int64)
@@ -122,16 +121,16 @@ class EpisodeDeriver:
         self._waits = np.zeros(self._n, np.bool_)
 
     def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
-        """The next row is a hole with the final state of an episode whose end was not derived."""
+        """Says that the next row is a hole with the final state of the episode of `end`, which was not derived."""
         facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
         self._waiting[end.env], self._waits[end.env] = facts, True
 
     def derive(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
-        """The starts, ends and final states that new rows bring.
+        """Derives the starts, ends and final states of new rows.
 
         Args:
             rows: (num_envs, rows), in their order, with holes.
-            pending: final states of episodes that the last rows have ended, by sub-environment.
+            pending: by sub-environment, the final state of an episode that the last one of `rows` ended.
         """
         found = _Segments(rows["#sequence"], rows["terminal"] | rows["timeout"])
         going_on = found.is_first & (self.running[found.env] >= 0)
@@ -161,7 +160,7 @@ class EpisodeDeriver:
         return self._batch(rows, starts[~going_on], ends[found.ended], found.last[found.ended], pending or {})
 
     def _reset_times(self, rows: Array, found: _Segments) -> Array:
-        """The times of the holes before each segment."""
+        """The time of the hole before each segment."""
         times, at_once = rows["#log_time"], found.begin == 0
         before: Array = times[found.env, found.begin - 1]
         before[at_once] = self._began[found.env[at_once]]
@@ -179,7 +178,7 @@ class EpisodeDeriver:
         if not width:
             before = before[np.isin(before, list(pending))]
         column = last + 1
-        if len(before):  # seldom, and NumPy takes its time to join structured arrays
+        if len(before):  # rare: joining structured arrays is slow
             ends = np.concatenate([self._waiting[before], ends])
             column = np.concatenate([np.zeros(len(before), np.int64), column])
             self._waits[before] = False
@@ -197,22 +196,21 @@ class EpisodeDeriver:
                 else:
                     self._waiting[env], self._waits[env] = ends[i], True
             ends, states = ends[inside], states[inside]
-        if self._n == 1:  # in their order, also where the clock was set back
+        if self._n == 1:  # the order of the rows, even if the clock was set back
             return EpisodeBatch(starts, ends, states)
         order = np.argsort(ends["time"], kind="stable")
         return EpisodeBatch(starts[np.argsort(starts["episode"], kind="stable")], ends[order], states[order])
 
 
 class _Segments:
-    """The parts of rows (a line a sub-environment) between holes, flags, and the ends of the lines.
+    """The runs of rows of one episode in (num_envs, rows): between holes, flags, and the ends of each line.
 
     Attributes:
-        hole: which rows are holes.
-        env, begin, last, lengths: each part's sub-environment, the places of its first and last row there, and its
-            rows.
-        first: the place of each part's first row in the flattened rows.
-        ended: its last row has a flag set.
-        is_first, is_final: it is the first, the last one of its sub-environment.
+        hole: which rows are holes, bool (num_envs, rows).
+        env, begin, last, lengths: each run's sub-environment, the columns of its first and last row, its rows.
+        first: index of each run's first row in the flattened rows.
+        ended: whether its last row has a flag set.
+        is_first, is_final: whether it is the first, the last run of its sub-environment.
     """
 
     def __init__(self, sequences: Array, flags: Array) -> None:
@@ -233,7 +231,7 @@ class _Segments:
 
 
 def sums(values: Array, firsts: Array) -> Array:
-    """The sum of each part of `values`, added up one after the other, as a loop would."""
+    """The sum of each part of `values`; `firsts` are where parts begin. Bit for bit that of adding in order."""
     if not len(firsts):
         return np.zeros(0)
     with np.errstate(over="ignore", invalid="ignore"):  # of infinite values

@@ -34,39 +34,39 @@ from tupli_mcap.mcap.source import open_regular
 
 MAGIC = b"TMCAPJ1\0"
 EVENT_AREAS = "events", "info"
-FRAMES_AREA = "frames/"  # and the sub-environment: no leaf of a state has such a name
+FRAMES_AREA = "frames/"  # followed by the sub-environment; no leaf has such a name
 _HEAD = struct.Struct("<8sII")
 PAGE = 4096
 LOG_HEADER = 64  # bytes of a log's half before its records
 _MAX_HEADER = 64 << 20
 _PIECE = 1 << 20
-# Bytes from which a journal is written once as zeros, so that its pages are not faulted in one by one. Of a smaller one
-# a short recording touches a few pages only.
+# Bytes from which a new journal is written with zeros once, so that the system does not add its pages one by one. A
+# short recording touches only a few pages of a smaller one.
 _WORTH_ZEROS = 2 << 20
 _UUID = re.compile("[0-9a-f]{32}")
 
 
 def journal_path(path: str | os.PathLike[str]) -> Path:
-    """Where the journal of a recording lies, links followed, unless it was given a `journal_dir`."""
+    """The path of a recording's journal beside it, symbolic links followed."""
     path = Path(os.path.realpath(path))
     return path.parent / journal_name(path.name)
 
 
 def journal_name(name: str) -> str:
-    """The name of the journal of a recording of a name."""
+    """The file name of the journal of the recording with the file name `name`."""
     return f"{name}.journal"
 
 
 def journal_in(directory: str | os.PathLike[str], path: Path, uuid: str) -> Path:
-    """A place for the journal of a recording in a directory that recordings of the same name may share."""
+    """The path of a recording's journal in a directory that recordings of the same name may share."""
     return Path(directory) / f"{path.name}.{uuid}.journal"
 
 
 def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
-    """Where the journal of a recording with this metadata lies: beside it, or where it says.
+    """The path of a recording's journal: beside it, or where its metadata say.
 
     Raises:
-        FormatError: it names a place that no writer chooses: a recording from somebody else must not name any file.
+        FormatError: the metadata name a path that no writer chooses. A stranger's recording must not name any file.
     """
     if "journal" not in metadata:
         return journal_path(path)
@@ -80,7 +80,7 @@ def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
 
 
 class RowArea(NamedTuple):
-    """`channels` x `rows` rows of `row_size` bytes, plus a spare row a channel, in each of two halves."""
+    """Two halves, each with `rows` rows of `row_size` bytes and a spare row for every one of `channels` channels."""
 
     name: str
     row_size: int
@@ -131,7 +131,7 @@ def _aligned(n: int) -> int:
 
 
 class Journal:
-    """A journal being written; `publish` it once it says all that the one before it said."""
+    """A journal being written. It replaces an earlier one with `publish`, once it holds all that one held."""
 
     def __init__(self, path: Path, areas: list[Area], info: Mapping[str, Any]) -> None:
         self.path = path
@@ -150,11 +150,14 @@ class Journal:
             ) from err
 
     def publish(self, *, durable: bool = False, replaced: str = "") -> None:
-        """Puts the journal in its place, instead of one that may be there; until then it is not found.
+        """Renames the journal to its path, in place of this recording's earlier journal. Readers find it from then on.
 
-        With `durable` it is on the disk before its name is. The journal of another recording is kept, and a warning
-        says where: that recording may have been renamed without it. `replaced` is a recording that will be replaced,
-        and needs no warning.
+        With `durable` it is on the disk before its name is. The journal of another recording is renamed, since that
+        recording may have been renamed without it, and a warning says to what. `replaced` is the uuid of a recording
+        that this one replaces; its journal needs no warning.
+
+        Raises:
+            RecordingError: the system refused.
         """
         if durable:
             self.sync()
@@ -203,15 +206,15 @@ class Journal:
             ) from err
 
     def close(self) -> None:
-        """Lets go of the map, and so of its descriptor and of the space of a file that was removed.
+        """Unmaps the file, which frees its descriptor, and its space if it was removed.
 
-        Where somebody still has a view of it, that happens when the view goes.
+        If views of it exist, the last one unmaps it.
         """
         with contextlib.suppress(BufferError):
             self._map.close()
 
     def remove(self) -> None:
-        """Removes the file, if it is still this one. Warns if it cannot be removed: it is of no use any more."""
+        """Removes the file, if its path still names it. Warns if the system refuses: the file is useless by then."""
         for place in (self.path, journal_aside(self.path, str(self.info.get("uuid")))):
             try:
                 if os.path.samestat(place.stat(), self._status):
@@ -227,16 +230,16 @@ class Journal:
 
 
 def journal_aside(path: Path, uuid: str) -> Path:
-    """Where the journal of a recording goes if another one needs its name."""
+    """The path to which a recording's journal is renamed if another recording needs its name."""
     return journal_in(path.parent, path.with_name(path.name.removesuffix(".journal")), uuid)
 
 
 def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
-    """Renames the journal of another recording than that of `uuid`, or one that cannot be read: whose it is, is not
-    known. Warns, unless it is that of `replaced`."""
+    """Renames a journal that is not that of the recording `uuid`, or that cannot be read. Warns, unless it is that of
+    `replaced`."""
     try:
         found, whose = str(journal_info(path).get("uuid")), "was the journal of another recording"
-    except OSError:  # none
+    except OSError:  # there is none
         return
     except FormatError:
         found, whose = uuid4().hex, "could not be read: it may be the journal of another recording,"
@@ -261,7 +264,7 @@ def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, 
 
 
 def _place(areas: list[Area], header: int) -> tuple[dict[str, int], int]:
-    """Where each area starts after a header of that many bytes, and where the last one ends."""
+    """The offset of each area after a header of `header` bytes, and the offset where the last one ends."""
     offset, offsets = _aligned(header), {}
     for area in areas:
         offsets[area.name] = offset
@@ -280,7 +283,7 @@ def _create(path: Path, size: int) -> tuple[mmap.mmap, os.stat_result]:
 
 
 def _reserve(fd: int, size: int) -> None:
-    """Takes the space now: writing into a hole of a full disk would be a SIGBUS instead of an error."""
+    """Reserves the space: a write into a hole of a file on a full disk would be a SIGBUS instead of an error."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(fd, 0, size)
         if size < _WORTH_ZEROS:
@@ -291,29 +294,29 @@ def _reserve(fd: int, size: int) -> None:
 
 
 class JournalContents(NamedTuple):
-    """A journal as found on disk: its description and a private copy of its areas' bytes."""
+    """A journal as it is on the disk: its description, and copies of its areas' bytes (uint8)."""
 
     info: dict[str, Any]
     areas: dict[str, Area]
     data: dict[str, np.ndarray[Any, np.dtype[np.uint8]]]
 
     def row_area(self, name: str) -> RowArea:
-        """The area `name`; FormatError if there is none, or one of records."""
+        """The area `name`; raises FormatError if there is none, or if it holds records."""
         area = self.areas.get(name)
         if not isinstance(area, RowArea):
-            raise FormatError(f"the journal has no rows {name!r}")
+            raise FormatError(f"expected an area of rows {name!r} in the journal, found none")
         return area
 
     def log_area(self, name: str) -> LogArea:
-        """The area `name`; FormatError if there is none, or one of rows."""
+        """The area `name`; raises FormatError if there is none, or if it holds rows."""
         area = self.areas.get(name)
         if not isinstance(area, LogArea):
-            raise FormatError(f"the journal has no records {name!r}")
+            raise FormatError(f"expected an area of records {name!r} in the journal, found none")
         return area
 
     @property
     def torn(self) -> bool:
-        """True if rows in it may be torn: the machine has started anew since, or it is not the one that recorded."""
+        """True if rows in it may be torn: it was made in another boot of this machine, or on another machine."""
         boot, now = self.info.get("boot"), boot_id()
         return bool(boot and now and boot != now)
 
@@ -329,7 +332,7 @@ class JournalContents(NamedTuple):
 
 
 def read_journal(path: Path, only: Collection[str] | None = None) -> JournalContents:
-    """Reads a journal, changing nothing; of the areas `only` those of these names, if given.
+    """Reads a journal and changes nothing. If `only` is given, it reads the areas of these names alone.
 
     Raises:
         FormatError: the file is no journal, or describes areas it does not have.
@@ -346,7 +349,7 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
 
 
 def _read_area(fd: int, start: int, size: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """The bytes of an area. Its size is a claim, and a file may have holes: zeros take no memory."""
+    """The bytes of an area. Its size is a claim, and a file may have holes, so zeros must take no memory."""
     area = np.zeros(size, np.uint8)
     for at in range(0, size, _PIECE):
         length = min(_PIECE, size - at)
@@ -359,13 +362,13 @@ def _read_area(fd: int, start: int, size: int) -> np.ndarray[Any, np.dtype[np.ui
 
 
 def journal_info(path: Path) -> dict[str, Any]:
-    """What a journal says of itself; nothing else of it is read. Raises as `read_journal` does."""
+    """The description in a journal's header; nothing else is read. Raises as `read_journal` does."""
     with _open(path) as file:
         return _read_header(path, file)[0]
 
 
 def owner_among(path: Path, uuids: Collection[str]) -> str:
-    """Which of these recordings the journal at a path belongs to; empty if to none, or if it cannot be read."""
+    """Which of the recordings `uuids` the journal at a path belongs to; empty if none, or if it cannot be read."""
     try:
         found = str(journal_info(path).get("uuid"))
     except (OSError, FormatError):

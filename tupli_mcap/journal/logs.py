@@ -1,7 +1,7 @@
-"""Message records of variable size in the journal: the events of all channels, and how a log is put into chunks.
+"""Logs: Message records of variable size in the journal, and how they go into chunks.
 
-A log half is a u64 end offset and the records before it. The end is stored after the bytes, in one machine word: it
-commits them. A log of events says, too, how long the file was when it took up what the log held before.
+Each half of a log is a u64 end offset and the records up to it. The end is stored after the records, as one machine
+word, and commits them. A log of events also holds the size of the file after its earlier records went there.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
 Sink = Callable[[Rows], None]
-FRONT = struct.Struct("<BQHIQ")  # up to publish_time, where a journal keeps a checksum
+FRONT = struct.Struct("<BQHIQ")  # a record up to publish_time, where a journal has a checksum
 _LOG_TIME = FRONT.size - 8
 
 
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
-    """The records in `data` by channel, in their order; of a journal (`sealed`), with their `publish_time`."""
+    """The records in `data` by channel, in their order; with `sealed`, `publish_time` replaces their checksums."""
     whole = bytes(data)
     groups: dict[int, tuple[int, list[bytes]]] = {}
     for start, end, channel, sequence, _ in iter_records(data):
@@ -50,7 +50,7 @@ def _count(records: bytes) -> int:
 
 
 def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) -> Rows:
-    """Whole records of one channel, of which the first has sequence `first`."""
+    """Whole records of one channel; the first has sequence `first`."""
     sizes = np.repeat(
         [one.size if isinstance(one, EvenRecords) else len(one) for one in records],
         [_count(one) for one in records],
@@ -59,22 +59,23 @@ def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) ->
 
 
 def as_rows(channel: int, first: int, joined: bytearray, sizes: Any, *, sealed: bool) -> Rows:
-    """Whole records of one channel, of `sizes` bytes each, that lie in `joined` one after the other."""
+    """Whole records of one channel that lie in `joined` one after the other, each of its number of bytes in `sizes`."""
     offsets = np.zeros(len(sizes), dtype=np.uint64)
     np.cumsum(sizes[:-1], out=offsets[1:])
     log_times = offsets[:, None] + np.arange(_LOG_TIME, _LOG_TIME + 8, dtype=np.uint64)
     content = np.frombuffer(joined, np.uint8)
     times = content[log_times]
-    if sealed:  # a journal keeps checksums there
+    if sealed:  # the journal's checksums are there
         content[log_times + np.uint64(8)] = times
     return Rows(channel, first, joined, offsets, times.reshape(-1).view("<u8"))
 
 
 class EventLog:
-    """Records of several channels in one half; when it is full they go to the file, a chunk a channel.
+    """A log of one half with records of several channels. When it is full, they go to the file, one chunk for each.
 
-    `sequences` counts the messages of each channel, those of earlier sessions included; `latest_ns` is the log_time of
-    the last message, and that of the next one is not less.
+    Attributes:
+        sequences: messages of each channel so far, with those of earlier sessions.
+        latest_ns: log_time (ns) of the last message; later ones are not less.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class EventLog:
         self._sink = sink
         self._file_size = file_size
         self.latest_ns = time_ns
-        # what the journal holds by channel, so that a flush need not take it apart
+        # the records in the journal by channel, so that a flush need not parse it
         self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
         self._last = 0  # where the last message began
         self._last_channel = 0
@@ -98,7 +99,7 @@ class EventLog:
         self.move(journal, name)
 
     def move(self, journal: Journal, name: str) -> None:
-        """Goes on in the area `name` of another journal; everything must have been flushed."""
+        """Goes on in the area `name` of another journal. All records must be in the file."""
         area, buffer = journal.log_area(name), journal.buffer(name)
         self._records = buffer[LOG_HEADER : LOG_HEADER + area.capacity]
         self._commit, self._behind = buffer[:8].cast("Q"), buffer[8:16].cast("Q")
@@ -108,7 +109,7 @@ class EventLog:
         self._commit[0] = 0
 
     def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
-        """Adds messages (channel, CDR body), all or none of them after a crash; returns their log_time."""
+        """Commits messages (channel, CDR body) together; returns their log_time (ns)."""
         if time_ns > self.latest_ns:
             self.latest_ns = time_ns
         else:
@@ -139,7 +140,7 @@ class EventLog:
         return time_ns
 
     def drop_last(self, channel: int) -> None:
-        """Takes back the message of the last `append`, which was one of `channel`, unless it is in the file already."""
+        """Removes the message of the last `append`, one of `channel`, unless it is in the file already."""
         if not self._can_drop:
             return
         self._whole[channel].pop()
@@ -148,7 +149,7 @@ class EventLog:
         self.sequences[channel] -= 1
 
     def flush(self, *, keep_last: bool = False) -> None:
-        """Writes the records to the file; with `keep_last` the last one stays, so that it can still be dropped."""
+        """Writes the records to the file; with `keep_last` the last one stays here, so that it can still be dropped."""
         keep_last = keep_last and self._can_drop
         kept = self._whole[self._last_channel].pop() if keep_last else b""
         self._write(1 if keep_last else 0)
@@ -160,7 +161,7 @@ class EventLog:
         self._commit[0] = len(kept)
 
     def _write(self, kept: int = 0) -> None:
-        """Writes the records to the file, but the last `kept` of the last channel, which are taken out."""
+        """Writes the records to the file; `kept` records were taken out at the end of the last channel's."""
         whole, self._whole = self._whole, defaultdict(list)
         for channel, records in whole.items():
             if records:

@@ -1,8 +1,8 @@
-"""What survives a power loss: when file and journal are synced, and how a torn journal row is told from a whole one.
+"""Power losses: syncs file and journal, and tells torn rows of a journal from whole ones.
 
-A killed process loses nothing of a journal: its pages are the kernel's. A kernel that goes down loses the pages it had
-not written, in any order and in parts. Whether that may have happened is known from the boot the journal was made in;
-if it was another one, only rows count that prove to be whole.
+If a process is killed, the kernel still has all pages of its journal. If the kernel goes down, pages it has not written
+are lost, in any order and in parts. The journal names the boot it was made in: after another boot, only rows count that
+are known to be whole.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from tupli_mcap.mcap.records import BODY
 Durability = Literal["os", "chunk", "step"]
 SECTOR = 512  # bytes a disk writes as one
 _SEAL = struct.Struct("<II")
-_SEAL_START, _SEAL_END = 23, 31  # of `publish_time`, which is derived when a row goes to a chunk
-STATE = BODY + 8  # where the state starts in a step's record
+_SEAL_START, _SEAL_END = 23, 31  # the place of `publish_time`, which is derived when a row goes to a chunk
+STATE = BODY + 8  # offset of the state in a step's record
 
 
 def check_durability(value: Any) -> None:
@@ -32,7 +32,7 @@ def check_durability(value: Any) -> None:
 
 
 def boot_id() -> str:
-    """What tells this boot of this machine from any other; empty where the system does not say."""
+    """A text that differs for each boot of each machine; empty if the system has none."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -40,7 +40,7 @@ def boot_id() -> str:
 
 
 def checksum(record: bytes | bytearray | memoryview) -> int:
-    """CRC-32 of a Message record, its `publish_time` left out."""
+    """CRC-32 of a Message record without its `publish_time`."""
     view = memoryview(record)
     return zlib.crc32(view[_SEAL_END:], zlib.crc32(view[:_SEAL_START]))
 
@@ -58,10 +58,10 @@ def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
 
 
 def sync_file(fd: int, name: str) -> None:
-    """Waits until the file's data, and its size, are on the disk.
+    """Waits until the file's data and size are on the disk.
 
     Raises:
-        RecordingError: the disk refused; what it took before is unknown.
+        RecordingError: the disk refused; how much it has is unknown.
     """
     try:
         if hasattr(fcntl, "F_FULLFSYNC"):  # macOS: its fsync stops at the drive's cache

@@ -1,11 +1,11 @@
-"""The bytes of MCAP files; knows nothing of reinforcement learning.
+"""The bytes of MCAP files. Nothing here knows of reinforcement learning.
 
-source                      where bytes come from: a path, an open file, a URL
-lock                        whether the process that writes a file is alive
-container                   writes: header, metadata, attachments, chunks, summary
-records                     the records, how they lie in bytes: parsed, and checked; their checksums
-walk                        over the records of a file, behind damage too
+source                      reads bytes of a path, an open file, a URL
+lock                        tells whether the process that writes a file is alive
+container                   writes header, metadata, attachments, chunks, summary
+records                     parses and checks records; their checksums
+walk                        goes over the records of a file, beyond damage too
 chunk_records               the messages of a chunk, as arrays
 summary                     reads the footer and the summary
-compression                 bytes made small
+compression                 decompresses within bounds
 """

@@ -1,4 +1,4 @@
-"""The Message records of a chunk as arrays: where each stands, and what its header says."""
+"""The Message records of a chunk as arrays: their offsets and headers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD
 from tupli_mcap.mcap.walk import Chunk
 
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
-_BLOCK = 1 << 16  # records whose headers are looked at together
+_BLOCK = 1 << 16  # headers that are copied at once
 HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
 
 
@@ -37,7 +37,7 @@ class ChunkRecords(NamedTuple):
         return int(self.headers["#channel"][0])
 
     def index_entries(self) -> Array:
-        """What the MessageIndex of the chunk has to say: (log_time, offset) of each message."""
+        """The entries that the chunk's MessageIndex must have: log_time and offset, uint64 (messages, 2)."""
         entries = np.empty((len(self.headers), 2), "<u8")
         entries[:, 0] = self.headers["#log_time"]
         entries[:, 1] = self.headers["#offset"] + np.uint64(self.skip)
@@ -49,17 +49,17 @@ class ChunkRecords(NamedTuple):
         return int(self.headers["#sequence"][0])
 
     def row(self, offset: int, length: int, chunk: Chunk) -> tuple[int, ...]:
-        """What the episode index says of the chunk at `offset`, `length` bytes long, as CHUNK_ROWS."""
+        """The chunk's row in the episode index, as CHUNK_ROWS: its record is `length` bytes long, at `offset`."""
         compression = COMPRESSIONS.index(chunk.compression or "none")
         counts = self.first, len(self.headers), self.skip
         return offset, length, len(chunk.data), *counts, chunk.crc, self.channel, compression, 0
 
 
 def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
-    """The records of a chunk of ours, which had `packed` bytes.
+    """The records of a recording's chunk, whose compressed data has `packed` bytes.
 
     Raises:
-        FormatError: it does not hold definitions, and then messages of one channel in the order of their rows.
+        FormatError: the chunk is not definitions followed by messages of one channel in the order of their rows.
     """
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -83,7 +83,11 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
 
 
 def message_headers(data: memoryview, most: int | None = None) -> Array:
-    """The headers of consecutive Message records; FormatError for bytes that are none, or for more than `most`."""
+    """The headers of consecutive Message records, as HEADERS.
+
+    Raises:
+        FormatError: `data` is something else, or holds more than `most` messages.
+    """
     even = _even(data, most)
     if even is not None:
         return even
@@ -99,7 +103,7 @@ def message_headers(data: memoryview, most: int | None = None) -> Array:
 
 
 def message_places(data: Any, most: int | None) -> Array:
-    """Where consecutive Message records begin and end: int64 (records, 2). FormatError as `message_headers`."""
+    """Where consecutive Message records begin and end: int64 (records, 2). Raises as `message_headers` does."""
     starts, at, size, length_at = [], 0, len(data), _LENGTH.unpack_from
     for _ in itertools.count() if most is None else range(most):
         if at + BODY > size:
@@ -114,11 +118,17 @@ def message_places(data: Any, most: int | None) -> Array:
         opcodes = np.frombuffer(data, np.uint8)[places[:, 0]]
         if (opcodes == Opcode.MESSAGE).all() and (places[:, 1] - places[:, 0] >= BODY).all():
             return places
-    return np.array([place[:2] for place in iter_records(data)], np.int64)  # says which one is none
+    return np.array(
+        [place[:2] for place in iter_records(data)], np.int64
+    )  # raises, and names the wrong record
 
 
 def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(log_time, CDR body) of consecutive Message records; FormatError before the first one for bytes that are none."""
+    """(log_time, CDR body) of consecutive Message records.
+
+    Raises:
+        FormatError: `data` is something else. It is raised before the first message.
+    """
     headers = message_headers(data)
     for begin in range(0, len(headers), _BLOCK):
         part = headers[begin : begin + _BLOCK]
@@ -132,7 +142,7 @@ def _too_many(most: int | None) -> FormatError:
 
 
 def _packed(size: int) -> np.dtype[Any]:
-    """A record of `size` bytes, as its header."""
+    """The dtype of records of `size` bytes each, whose fields are those of the header."""
     spec: Any = {
         "names": [name for name, _, _ in HEADER_FIELDS],
         "formats": [kind for _, kind, _ in HEADER_FIELDS],
@@ -144,7 +154,7 @@ def _packed(size: int) -> np.dtype[Any]:
 
 
 def _even(data: memoryview, most: int | None) -> Array | None:
-    """The headers where all records have the same size, else None."""
+    """The headers if all records have the same size, else None."""
     if len(data) < BODY:
         return None
     size = 9 + int.from_bytes(data[1:9], "little")

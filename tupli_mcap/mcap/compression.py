@@ -11,8 +11,8 @@ import zstandard
 from tupli_mcap.errors import FormatError
 
 MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
-"""How many bytes a compressed one may stand for at most: LZ4 counts a match in bytes of 255, and a block of zstd takes
-4 bytes at least and holds 128 KiB at most. Zeros come close to both."""
+"""Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
+least 4 bytes and holds at most 128 KiB. Zeros come close to both."""
 
 _local = threading.local()
 
@@ -25,9 +25,10 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
-    """`size` bytes of one frame, or FormatError: neither more is produced nor allocated than `size`.
+    """Decompresses one frame to `size` bytes; no more is produced or allocated.
 
-    Nothing may follow the frame: other readers would read on in it.
+    Raises:
+        FormatError: the frame is damaged, has another size, or bytes follow it, which other readers would read.
     """
     if size > len(data) * MAX_RATIO.get(name, size):
         raise FormatError(

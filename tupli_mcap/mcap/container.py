@@ -1,7 +1,6 @@
-"""The MCAP container around the block of step messages: header, chunks, attachments, summary.
+"""Writes MCAP files: header, metadata, attachments, chunks, summary.
 
-Records are written by the `mcap` package; the rows of a chunk and their message index are ours, because they come as
-whole arrays.
+The `mcap` package writes all records but those of chunks: their rows and message indexes come as whole arrays.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, crc32, with_crc
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "tupli_mcap"
 REPEATED = ".repeated"
-"""What the name of metadata at the end of a file ends in: viewers warn of two records of one name."""
+"""End of the name of metadata that are repeated at the end of a file: viewers warn of two records of one name."""
 Compression = str  # "zstd", "lz4" or "none"
 
 CHUNK_ROWS = np.dtype(
@@ -56,10 +55,9 @@ CHUNK_ROWS = np.dtype(
 COMPRESSIONS = ["none", "zstd", "lz4"]
 _ROW = struct.Struct("<QQQQIIIHBB")  # of CHUNK_ROWS
 _TOGETHER = 64  # chunks compressed and written at once
-_PIECES = 1024  # that a call of the system takes
-# Steps are recorded once and read many times: this level is faster than level 1, at either, and takes little more room.
-_LEVEL = -1
-_CONTEXT = 4 << 20  # bytes: more than a compressor needs beside what it makes
+_PIECES = 1024  # buffers that one call of the system takes
+_LEVEL = -1  # of zstd: faster than level 1 to write and to read, for a little more room
+_CONTEXT = 4 << 20  # bytes: more than a compressor needs besides its output
 
 
 def _built(builder: RecordBuilder) -> bytes:
@@ -68,7 +66,7 @@ def _built(builder: RecordBuilder) -> bytes:
 
 
 def _write(fd: int, parts: Sequence[memoryview], position: int | None) -> int:
-    """Writes some bytes at a position (None: to a pipe), at least one; returns how many."""
+    """Writes at least one byte of `parts` at a position (None: to a pipe); returns how many it wrote."""
     if position is None:
         return os.writev(fd, parts)
     if hasattr(os, "pwritev"):
@@ -77,7 +75,8 @@ def _write(fd: int, parts: Sequence[memoryview], position: int | None) -> int:
 
 
 class Rows(NamedTuple):
-    """Message records of one channel, ready to be a chunk: `offsets` of each from the first, `times` their log_time."""
+    """Message records of one channel for a chunk: `first` is the first row, `offsets` are from the first record on,
+    `times` are log_times (ns)."""
 
     channel: int
     first: int
@@ -87,10 +86,10 @@ class Rows(NamedTuple):
 
 
 class Encoder(Protocol):
-    """What rows of constant size go through on their way to a chunk."""
+    """Turns rows of constant size, as the journal holds them, into the messages that a channel's chunks hold."""
 
     def encode(self, rows: Rows) -> Rows:
-        """The same messages, as the channel has them."""
+        """The same messages as the chunks hold them."""
         ...
 
 
@@ -103,19 +102,19 @@ class Prepared(NamedTuple):
     crc: int
 
 
-Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and what was made of their data
+Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and their compressed data
 
 
-@functools.cache  # it is read from the disk
+@functools.cache  # the version is read from the disk
 def library() -> str:
-    """The name and the version of this program, as recordings give them."""
+    """The name and the version of this package, as recordings name their writer."""
     return f"tupli-mcap {version('tupli-mcap')}"
 
 
 class Container:
-    """Writes records to the descriptor of a file or a pipe, and remembers what the summary needs.
+    """Writes records to the descriptor of a file or a pipe, and collects what the summary needs.
 
-    What `start_chunks` returns first may be called from another thread; nothing else.
+    Not thread-safe, but the function that `start_chunks` returns may be called from another thread.
     """
 
     def __init__(self, fd: int, name: str, compression: Compression) -> None:
@@ -127,7 +126,7 @@ class Container:
         self._compression = compression
         method = b"" if compression == "none" else compression.encode()
         self._method = method, COMPRESSIONS.index(compression)
-        self._local = threading.local()  # a compressor is not to be shared
+        self._local = threading.local()  # a compressor for each thread
         self.position = 0
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -139,22 +138,26 @@ class Container:
         self.start_time: int | None = None
         self.end_time = 0
         self.chunk_rows = bytearray()
-        self.codecs: Mapping[int, Encoder] = {}  # by channel, what encodes its rows; others stay as they are
+        self.codecs: Mapping[int, Encoder] = {}  # by channel; rows of other channels are written as they are
         self._announced: set[int] = set()
         self._definitions: dict[int, tuple[Channel, bytes]] = {}
         self._entries: np.ndarray[Any, Any] = np.empty((0, 2), "<u8")  # of message indexes; used again
 
     @property
     def compression(self) -> Compression:
-        """Of the chunks that are added."""
+        """How chunks are compressed."""
         return self._compression
 
     def close(self) -> None:
-        """Nothing more is written: the number of the descriptor may be that of another file soon."""
+        """Forgets the descriptor, whose number may soon be another file's; the caller closes it."""
         self._fd = -1
 
     def write(self, *parts: Any) -> None:
-        """Appends bytes, in one call of the system; on failure the file keeps only whole records."""
+        """Appends bytes, in one call of the system if it takes them all.
+
+        Raises:
+            RecordingError: the system refused. The file keeps its whole records.
+        """
         start = position = self.position
         left = [memoryview(part) for part in parts]
         try:
@@ -166,7 +169,7 @@ class Container:
                 if written:
                     left[0] = left[0][written:]
         except OSError as err:
-            with contextlib.suppress(OSError):  # what stays behind is no whole record, and is not read
+            with contextlib.suppress(OSError):  # bytes that stay are no whole record, and readers ignore them
                 os.ftruncate(self._fd, start)
             raise RecordingError(
                 f"{self._name}: could not write {sum(map(len, parts))} bytes at offset {start}: {os_reason(err)}; "
@@ -211,9 +214,9 @@ class Container:
         return channel.id
 
     def define_channels(self) -> None:
-        """Writes the definitions of channels that have no chunk yet, so that a file without its journal knows them.
+        """Writes the definitions of channels that have no chunk yet, so that a file without its journal has them.
 
-        Readers that take chunks one by one find them again at the start of a channel's first chunk.
+        A channel's first chunk starts with them again, for readers that go from chunk to chunk.
         """
         for channel in self.channels:
             if channel not in self._announced:
@@ -241,7 +244,7 @@ class Container:
             self.place(chunk, self.pack(chunk.data))
 
     def prepare(self, rows: Rows) -> Prepared:
-        """The records of a chunk and their CRC. The channel's chunk before it must be in the file."""
+        """The records of a chunk and their CRC. The channel's earlier chunks must be in the file."""
         head = b"" if rows.channel in self._announced else self.definitions(rows.channel)
         data = rows.data if not head else head + bytes(rows.data)
         return Prepared(rows, len(head), data, crc32(data))
@@ -273,7 +276,7 @@ class Container:
 
     @property
     def packs_together(self) -> bool:
-        """True if `pack_all` lets go of the interpreter lock once for all chunks, so that a thread is worth it."""
+        """True if `pack_all` releases the interpreter lock once for all chunks, so that a thread pays."""
         return self._compression == "zstd" and hasattr(self._zstd(), "multi_compress_to_buffer")
 
     def pack_all(self, data: Sequence[Any]) -> list[Any]:
@@ -281,7 +284,7 @@ class Container:
         if len(data) > 1 and self.packs_together:  # each call makes compressors for its threads
             size = sum(map(len, data))
             with self._memory_for(size):
-                # zstandard ends the process (it frees a buffer twice) where it finds too little on its way
+                # raise MemoryError here: zstandard frees a buffer twice, and ends the process, if it finds too little
                 np.empty(size + _CONTEXT, np.uint8)
                 parts = self._zstd().multi_compress_to_buffer(list(data))
             return [parts[i] for i in range(len(parts))]
@@ -298,10 +301,10 @@ class Container:
         self._place([prepared], [packed])
 
     def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], Packed]:
-        """What compresses chunks of different channels, in any thread; `finish_chunks` takes what it returns.
+        """A function that compresses chunks of different channels, in any thread; `finish_chunks` takes its result.
 
-        Everything that needs the interpreter lock is done here, or in `finish_chunks`: the compressing thread takes it
-        only once.
+        This method and `finish_chunks` do everything that needs the interpreter lock: the compressing thread takes
+        it only once.
         """
         codecs = [self.codecs.get(rows.channel) for rows in chunks] if self.codecs else ()
         if any(codecs):
@@ -318,7 +321,7 @@ class Container:
         return [(part, self.pack_all([chunk.data for chunk in part])) for part in parts]
 
     def finish_chunks(self, packed: Packed) -> None:
-        """Writes chunks that have been compressed."""
+        """Writes compressed chunks."""
         for chunks, data in packed:
             self._place(chunks, data)
 
@@ -359,7 +362,7 @@ class Container:
         return found
 
     def note_chunk(self, row: tuple[int, ...], start: int, end: int) -> None:
-        """Remembers a chunk that is in the file (as CHUNK_ROWS, and its times in ns), for the summary and the index."""
+        """Notes a chunk that is in the file, for the summary and the index: a row of CHUNK_ROWS, its times (ns)."""
         offset, length, size, _, rows, _, _, channel, method, _ = row
         name = COMPRESSIONS[method].replace("none", "").encode()
         place = (start, end, offset, length, channel, offset + length, MESSAGE_INDEX.size + 16 * rows)
@@ -377,7 +380,7 @@ class Container:
         self.end_time = max(self.end_time, end)
 
     def finish(self) -> None:
-        """The metadata once more; then DataEnd, summary, footer, magic, in one write."""
+        """Repeats the metadata; then writes DataEnd, summary, footer and magic in one write."""
         for name, values in list(self.metadata.items()):
             self.add_metadata(name + REPEATED, values)
         builder = RecordBuilder()
@@ -422,11 +425,10 @@ class Container:
         )
 
 
-# The three records a chunk takes are packed here: for small chunks of many channels, the package's builder would take
-# longer than the compressor.
+# The records of a chunk are packed here: for small chunks, the package's builder takes longer than the compressor.
 
-# RECORD, first and last time, place and length of the chunk; the map of one message index; its length; length of the
-# compression's name
+# RECORD; first and last time, offset and length of the chunk; length of the map of message indexes, its one channel and
+# offset; length of the message index; length of the compression's name
 _CHUNK_INDEX = struct.Struct("<BQQQQQIHQQI")
 _SIZES = struct.Struct("<QQ")  # compressed, uncompressed
 

@@ -1,8 +1,8 @@
 """The lock that tells a live writer from a dead one: an advisory lock on the recording's own descriptor.
 
-A lock belongs to what a descriptor has opened, and a forked child has a copy of every descriptor: a child that outlives
-a killed writer would go on holding its lock. So the descriptors of locks are noted here, and a child closes its copies
-before it does anything else.
+A forked child has a copy of every descriptor, and a copy holds the lock as well: a child that outlives a killed writer
+would go on holding it. So this module notes the descriptors of locks, and a child closes its copies before it does
+anything else.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, os_reason
 
 _BUSY = (errno.EAGAIN, errno.EACCES)
-_PATIENCE = 2.0  # seconds to wait for those who only ask whether the writer lives
-_guard = threading.RLock()  # no fork between opening a descriptor and noting it
+_PATIENCE = 2.0  # seconds to wait for readers that ask whether the writer lives
+_guard = threading.RLock()  # held while a descriptor is opened and noted, so that no fork comes between
 _private: set[int] = set()
 _files: weakref.WeakSet[io.FileIO] = weakref.WeakSet()
 
 
 def open_private(path: str | os.PathLike[str], flags: int) -> int:
-    """A descriptor that children do not get, neither those that go on as a copy nor those that start a program."""
+    """Opens a descriptor that no child process keeps, whether it was forked or started as another program."""
     with _guard:
         fd = os.open(path, flags | os.O_CLOEXEC, 0o666)
         _private.add(fd)
@@ -38,26 +38,26 @@ def open_private(path: str | os.PathLike[str], flags: int) -> int:
 
 
 def _close_private(fd: int) -> None:
-    """Unlocks and closes such a descriptor; in a child, where it is closed already, nothing happens."""
+    """Unlocks and closes a descriptor of `open_private`; does nothing in a child, where it is closed already."""
     with _guard:
         if fd not in _private:
             return
         _private.discard(fd)
         try:
-            # a child that was forked by other means than Python's may have a copy
+            # a child that C code forked may have a copy
             fcntl.flock(fd, fcntl.LOCK_UN)
         finally:
             os.close(fd)
 
 
 def drop_private(fd: int) -> None:
-    """Closes a descriptor that nothing was written to: what the system says then is of no use."""
+    """Closes a descriptor that nothing was written to, and ignores errors."""
     with contextlib.suppress(OSError):
         _close_private(fd)
 
 
 def _open_file(path: Path, mode: str) -> io.FileIO:
-    """As `open_private`; a file that is interrupted on its way to its owner is closed with its last reference."""
+    """As `open_private`. If an interrupt keeps the file from its owner, its last reference closes it."""
     with _guard:
         file = io.FileIO(path, mode)
         _files.add(file)
@@ -65,11 +65,11 @@ def _open_file(path: Path, mode: str) -> io.FileIO:
 
 
 def _close_file(file: io.FileIO) -> None:
-    """Unlocks and closes; in a child, where it is closed already, nothing happens."""
+    """As `_close_private`."""
     with _guard:
         if not file.closed:
             try:
-                fcntl.flock(file, fcntl.LOCK_UN)  # see `_close_private`
+                fcntl.flock(file, fcntl.LOCK_UN)
             finally:
                 file.close()
 
@@ -108,9 +108,9 @@ class LockedError(RecordingError):
 class FileLock:
     """A recording opened for writing and locked; `fd` is the descriptor to write with.
 
-    A new file is made under another name, and is at its path, locked, from `publish` on: nobody finds a file without
-    its first records. Until then a file that it will replace stays, locked too. Readers of a file that is replaced keep
-    the old one.
+    A new file is made under another name; `publish` puts it at its path, locked, so that nobody finds a file without
+    its first records. Until then the file that it will replace stays, locked too. Readers that have the replaced file
+    open keep it.
 
     Raises:
         RecordingError: the file exists (mode "x"), is missing (mode "a"), is being written, or cannot be opened.
@@ -182,24 +182,23 @@ class FileLock:
 
     @property
     def is_deleted(self) -> bool:
-        """True if somebody has taken the file's last name since it was published."""
+        """True if somebody deleted the file after it was published."""
         with contextlib.suppress(OSError):
             return self._temporary is None and os.fstat(self.fd).st_nlink == 0
         return False
 
     def unlink(self) -> None:
-        """Removes the file from its path, if it was published and is there still."""
+        """Removes the file from its path, if it was published and is still there."""
         if self._temporary is None and self.fd >= 0:
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(self.fd), self._path.stat()):
                     self._path.unlink()
 
     def release(self) -> None:
-        """Unlocks and closes, and removes a file that was not published; in a forked child, where the descriptors are
-        closed already, nothing happens.
+        """Unlocks and closes the file, and removes it if it was not published. Does nothing in a forked child.
 
         Raises:
-            RecordingError: a file system that writes late (NFS) has lost something.
+            RecordingError: a file system that writes late (NFS) lost something.
         """
         if self._process != os.getpid():
             return
@@ -226,10 +225,10 @@ def _exists(path: Path) -> RecordingError:
 
 @contextlib.contextmanager
 def writers_kept_out(path: Path) -> Iterator[None]:
-    """Nobody writes to a recording while it is read, replaced or deleted.
+    """Holds the lock of a recording, so that nobody writes to it while it is read, replaced or deleted.
 
     Raises:
-        RecordingError: somebody does, or it is gone.
+        RecordingError: somebody is writing to it, or it is gone.
     """
     file = _open_locked(path, mode="r", hint="it was deleted")
     try:
@@ -257,12 +256,12 @@ def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
             if isinstance(err, OSError):
                 raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
             raise
-        # it was deleted or replaced between opening and locking: what is written to it would be lost
+        # it was deleted or replaced between opening and locking: whatever is written to it would be lost
         _drop_file(file)
 
 
 def _lock(fd: int, path: Path) -> None:
-    """Takes the writer's lock. Those who ask for it hold a shared one for a moment: they are waited for."""
+    """Takes the writer's lock. Waits for readers, which take a shared lock for a moment to ask for a writer."""
     deadline = time.monotonic() + _PATIENCE
     while True:
         try:
@@ -303,10 +302,10 @@ def is_locked(path: Path) -> bool:
     """True if a live writer holds the recording.
 
     Raises:
-        RecordingError: the system does not say (too many open files, say): there may be one.
+        RecordingError: the system does not say (too many open files, for example): there may be a writer.
     """
     try:
-        fd = open_private(path, os.O_RDONLY | os.O_NONBLOCK)  # no pipe is waited for
+        fd = open_private(path, os.O_RDONLY | os.O_NONBLOCK)  # does not wait for the other end of a pipe
         try:
             return not _try_shared(fd)
         finally:

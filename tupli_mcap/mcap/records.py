@@ -1,4 +1,4 @@
-"""The records of MCAP files, parsed and checked: what a file says is a claim, and each defect a FormatError."""
+"""Parses and checks the records of MCAP files: every size in a file is a claim, every defect a FormatError."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ try:
 except ImportError:
     from zlib import crc32 as _crc32
 
-RECORD = struct.Struct("<BQ")  # what every record begins with: opcode, and the length of what follows
+RECORD = struct.Struct("<BQ")  # start of every record: opcode, and the length of what follows
 # RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
 # name, and the length of the compressed bytes (u64)
 CHUNK_HEAD = struct.Struct("<BQQQQII")
@@ -52,8 +52,8 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
 ]
 MAX_CHUNK = 1 << 31  # bytes, uncompressed
 MAX_ROWS_A_BYTE = 16
-"""Messages that a byte of a compressed chunk may stand for at most: each has a number of its own (`sequence`), so that
-no compressor gets far below a byte a message."""
+"""Messages for each compressed byte of a chunk, at most: each message has another `sequence`, so no compressor gets far
+below a byte for each."""
 
 _PIECE = 1 << 20
 _MOST_TEXT = 1 << 17  # bytes of name and media type of an attachment
@@ -123,7 +123,7 @@ def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
 
 
 def _map_fits(opcode: int, body: memoryview) -> bool:
-    """Whether the map that ends a record has the length it says: the package reads pairs beyond it."""
+    """Whether the map that ends a record has the length it claims; the `mcap` package would read pairs beyond it."""
     at, strings = _STRINGS_BEFORE_MAP[opcode]
     for _ in range(strings):
         at += 4 + int.from_bytes(body[at : at + 4], "little")
@@ -131,7 +131,7 @@ def _map_fits(opcode: int, body: memoryview) -> bool:
 
 
 class _Exact(io.BytesIO):
-    """Bytes that are not read beyond their end: the package would take what is left for a longer text."""
+    """Refuses to read beyond the end, where the `mcap` package would take the remaining bytes for a longer text."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
@@ -141,7 +141,7 @@ class _Exact(io.BytesIO):
 
 
 def read_metadata(source: Source, index: MetadataIndex) -> dict[str, str]:
-    """The values of a Metadata record."""
+    """The pairs of a Metadata record, with `crc`, which is not checked."""
     record = source.read(index.offset, index.length)
     if len(record) < 9 or record[0] != Opcode.METADATA:
         raise FormatError(f"{source.name}: expected the metadata {index.name!r} at offset {index.offset}")
@@ -159,12 +159,12 @@ def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> 
     """The pairs without `crc`.
 
     Raises:
-        FormatError: `crc` differs, or is missing where there are others than the `known` keys: recordings may
-            have none, but a damaged key must not pass for a missing one.
+        FormatError: `crc` differs; or it is missing, and there are other keys than the `known` ones: old recordings
+            have no `crc`, but a damaged key must not pass for a missing one.
     """
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
-        # A damaged length may have made the key part of a value: the bytes of a length in it are seen by their zeros.
+        # A damaged length may have put the key into a value. Such a value holds the zeros of the key's length.
         other = sorted(pairs.keys() - set(known)) or [key for key, value in pairs.items() if "\0" in value]
         if other:
             raise FormatError(
@@ -176,7 +176,7 @@ def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> 
 
 
 def _crc(pairs: Mapping[str, str]) -> str:
-    """In the order of the keys, each text as MCAP stores it: its length (u32) and its bytes."""
+    """CRC-32 of the pairs in the order of their keys, each text as MCAP stores it: its length (u32), its bytes."""
     texts = [text.encode() for pair in sorted(pairs.items()) for text in pair]
     return f"{zlib.crc32(b''.join(len(text).to_bytes(4, 'little') + text for text in texts)):08x}"
 
@@ -194,9 +194,12 @@ def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.ui
 
 
 def attachment_index(source: Source, offset: int, length: int) -> AttachmentIndex:
-    """What an attachment's header says; FormatError if it does not add up to its length.
+    """The header of an attachment whose body has `length` bytes.
 
-    The sizes are read before the texts: where many places look like an attachment, each takes a few bytes.
+    Sizes are read before texts: a search after damage then leaves most false starts after a few bytes.
+
+    Raises:
+        FormatError: the sizes in the header do not add up to `length`.
     """
     left = 9 + length - ATTACHMENT_HEAD.size - 4 - 8 - 4  # for the texts and the data
     if left < 0:
@@ -221,7 +224,7 @@ def attachment_index(source: Source, offset: int, length: int) -> AttachmentInde
 
 
 def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
-    """The facts of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
+    """The header of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
 
     Raises:
         FormatError: it is damaged.
@@ -273,13 +276,13 @@ def iter_records(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
         start = end
 
 
-# End every use of ISA-L with a loop of NumPy. ISA-L leaves the upper halves of the vector registers dirty, which slows
-# down everything that follows in the thread on Intel processors, the environment included; NumPy's loops clear them.
-_ZEROS = np.zeros(256)  # long enough for a loop of vectors
+# Every use of ISA-L must end with a loop of NumPy. ISA-L leaves the upper halves of vector registers dirty, which slows
+# down whatever the thread does next on Intel processors, the environment included. NumPy's loops clear them.
+_ZEROS = np.zeros(256)  # long enough for NumPy to use vector registers
 
 
 def crc32(data: Any, value: int = 0, /) -> int:
-    """The CRC-32 of `data`, behind bytes whose CRC-32 is `value`."""
+    """The CRC-32 of `data` that follows bytes whose CRC-32 is `value`."""
     found: int = _crc32(data, value)
     np.add(_ZEROS, _ZEROS, out=_ZEROS)
     return found

@@ -1,4 +1,4 @@
-"""Where a recording's bytes come from: a local path, an open binary file, or a URL read by ranges."""
+"""Reads a recording's bytes: of a local path, an open binary file, or a URL (by ranges)."""
 
 from __future__ import annotations
 
@@ -36,25 +36,29 @@ class Source(Protocol):
         ...
 
     def lend(self, offset: int, length: int) -> memoryview:
-        """The same bytes, until this thread asks for others: a local file needs no new memory for them."""
+        """The same bytes in a buffer that this thread's next call may write over; a local file needs no new memory."""
         ...
 
     def view(self, offset: int, length: int) -> memoryview:
-        """The same bytes for as long as anybody holds them; of a local file not copied, but mapped into memory.
+        """The same bytes, valid as long as the view is held; a local file is mapped into memory, not copied.
 
-        Who cuts the file short meanwhile kills this process.
+        If somebody cuts the file short, the system kills a process that touches the view (SIGBUS).
         """
         ...
 
     def refresh(self) -> None:
-        """Takes note of what was written since."""
+        """Reads `size` anew, for a file that is being written."""
         ...
 
     def close(self) -> None: ...
 
 
 def open_regular(path: Path) -> int:
-    """A descriptor to read a regular file; OSError for anything else, a pipe without a writer is not waited for."""
+    """Opens a regular file for reading, and never waits, not even for a pipe's writer.
+
+    Raises:
+        OSError: the path cannot be opened, or is no regular file.
+    """
     waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
     fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
     try:
@@ -71,7 +75,7 @@ def open_regular(path: Path) -> int:
 
 
 def _lent_buffer(length: int) -> memoryview:
-    """This thread's buffer: memory that is there already is much cheaper than new pages for each chunk."""
+    """This thread's buffer: used again, so that chunks need no new pages."""
     buffer: memoryview | None = getattr(_lent, "buffer", None)
     if buffer is None or len(buffer) < length:
         buffer = _lent.buffer = memoryview(bytearray(max(length, 1 << 18)))
@@ -119,15 +123,15 @@ class PathSource:
             found = os.preadv(self._fd, [buffer], offset)
         except OSError:
             found = -1
-        return buffer if found == length else memoryview(self.read(offset, length))  # which raises the error
+        return buffer if found == length else memoryview(self.read(offset, length))  # `read` raises
 
     def view(self, offset: int, length: int) -> memoryview:
         self._check(offset, length)
         mapped = self._mapped
-        if offset + length > len(mapped):  # not yet, or the file has grown since
+        if offset + length > len(mapped):  # not mapped yet, or the file has grown
             try:
                 mapped = self._mapped = mmap.mmap(self._fd, self.size, access=mmap.ACCESS_READ)
-            except (OSError, ValueError):  # a file system that maps nothing; a file cut short
+            except (OSError, ValueError):  # the file system cannot map files, or the file was cut short
                 return memoryview(self.read(offset, length))
         return memoryview(mapped)[offset : offset + length]
 
@@ -165,7 +169,7 @@ class PathSource:
     def close(self) -> None:
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
-            self._mapped = b""  # whoever holds a view of it keeps it
+            self._mapped = b""  # views keep the mapping alive
             with contextlib.suppress(OSError):  # nothing was written
                 os.close(fd)
 
@@ -175,9 +179,9 @@ class PathSource:
 
 
 class TemporarySource(PathSource):
-    """A file that is deleted when nobody reads it any more; errors call it `name`.
+    """A file that is deleted with the last reference to this object; errors call it `name`.
 
-    A copy in another process reads it for as long as it is there.
+    An unpickled copy reads the same file while it exists, and does not delete it.
     """
 
     def __init__(self, place: Path, name: str, *, owned: bool = True) -> None:
@@ -191,13 +195,13 @@ class TemporarySource(PathSource):
 
 
 def _delete(place: Path, process: int) -> None:
-    if os.getpid() == process:  # and no fork of it
+    if os.getpid() == process:  # not in a fork
         with contextlib.suppress(OSError):
             place.unlink()
 
 
 class FileSource:
-    """An open, seekable binary file; it is not closed unless it is ours."""
+    """An open, seekable binary file; `close` closes it only if it is `owned`."""
 
     def __init__(self, file: BinaryIO, name: str, *, owned: bool) -> None:
         self.path: Path | None = None
@@ -206,7 +210,7 @@ class FileSource:
         self._owned = owned
         self._lock = threading.Lock()
         self._process = os.getpid()
-        # a system file is read at a place, not at its cursor, which forked children share
+        # a system file is read at offsets, not at its cursor, which forked children share
         self._fd = file.fileno() if _is_system_file(file) else -1
         try:
             self.size = file.seek(0, os.SEEK_END)
@@ -255,7 +259,7 @@ def _is_system_file(file: BinaryIO) -> bool:
 
 
 def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]) -> _T:
-    """What `read` gives; a disk or a connection that fails is no defect of the file."""
+    """Calls `read`; an OSError becomes a RecordingError: a failing disk or connection is no defect of the file."""
     try:
         return read()
     except OSError as err:

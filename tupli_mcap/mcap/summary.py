@@ -1,4 +1,4 @@
-"""What is read first of a finished file: its footer and its summary."""
+"""Reads the footer and the summary of a finished file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MAX_SUMMARY = 1 << 31
 
 
 class Summary(NamedTuple):
-    """The parsed summary, which begins at the offset `start`; `chunks` is how many it lists."""
+    """The parsed summary: it begins at offset `start` and lists `chunks` chunks."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]
@@ -98,7 +98,7 @@ def read_summary(source: Source) -> Summary:
 
 
 def _once(found: dict[int, Any], number: int, value: Any, what: str, name: str) -> None:
-    """Keeps a definition; FormatError where there is another one of that number."""
+    """Keeps a definition; raises FormatError if there is another one of that number."""
     if found.setdefault(number, value) != value:
         raise FormatError(f"{name}: expected {what} once in the summary, found another one")
 

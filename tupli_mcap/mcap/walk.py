@@ -1,8 +1,8 @@
-"""Walks over the records of a file, good or bad: what is whole, what is damaged, and where it goes on.
+"""Walks over the records of a file and finds those that are whole, beyond damage too.
 
-Nothing is believed: a chunk counts if its CRC is right, an attachment too, any other record if it parses to its last
-byte. After a damaged record the walk goes on at the next place where a record stands; a chunk whose header is damaged
-is read by what the episode index says of it. One record is in memory at a time, attachments in pieces.
+A chunk or an attachment is whole if its CRC is right, any other record if it parses to its last byte. After a damaged
+record the walk goes on at the next offset where a record begins. A chunk with a damaged header is read with the sizes
+and the CRC in the episode index. One record is in memory at a time, attachments in pieces.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tupli_mcap.mcap.source import Source
 
 _PIECE = 1 << 20
 _FIRST_PIECE = 1 << 12
-_PARSING = 16  # times as long as a checksum of as many bytes takes
+_PARSING = 16  # cost of parsing a byte, in CRC checks of a byte
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 _END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
 _PARSED = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, *_SUMMARY)
@@ -40,18 +40,18 @@ _SIZES: dict[int, int] = {
     Opcode.DATA_END: 4,
     Opcode.FOOTER: 20,
     Opcode.SUMMARY_OFFSET: 17,
-}  # of bodies that have one
+}  # of bodies of constant size
 _LEAST: dict[int, int] = {
     Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: 22, Opcode.CHUNK: 40,
     Opcode.MESSAGE_INDEX: 6, Opcode.CHUNK_INDEX: 64, Opcode.ATTACHMENT: 36, Opcode.STATISTICS: 46,
     Opcode.ATTACHMENT_INDEX: 48, Opcode.METADATA: 8, Opcode.METADATA_INDEX: 20, **_SIZES,
 }  # fmt: skip
-# Where a record may stand: its opcode, and a length below 2^40 (looked ahead, so that matches may overlap).
+# Start of a record: its opcode, and a length below 2^40. It is a lookahead, so that matches may overlap.
 _CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
 
 
 class ChunkClaim(NamedTuple):
-    """What an index, or its header, says of a chunk: `length` bytes in the file hold `size` bytes of records."""
+    """What an index, or the chunk's header, claims: `length` bytes in the file hold `size` bytes of records."""
 
     length: int
     size: int
@@ -60,12 +60,12 @@ class ChunkClaim(NamedTuple):
 
     @property
     def packed(self) -> int:
-        """The length of what is compressed."""
+        """Bytes of compressed data."""
         return self.length - CHUNK_HEAD.size - len(self.compression) - 8
 
 
 class Chunk(NamedTuple):
-    """A chunk's header, and its records: `data` is decompressed, its CRC right, or 0 (`crc`)."""
+    """A chunk's header and its decompressed records, `data`, whose CRC was checked."""
 
     start_time: int
     end_time: int
@@ -76,9 +76,9 @@ class Chunk(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A whole record: `length` with its 9 first bytes; `body` is empty for a chunk and an attachment.
+    """A whole record: `length` counts its first 9 bytes too; `body` is empty for a chunk and an attachment.
 
-    `repaired` says what in a chunk's header is wrong where its records are good all the same.
+    `repaired` says what is wrong in the header of a chunk whose records are good.
     """
 
     opcode: int
@@ -91,7 +91,7 @@ class Found(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Bytes `offset:end` that are no whole record; `opcode` is that of the record that seems to have been there."""
+    """Bytes `offset:end` that are no whole record; `opcode` is their first byte."""
 
     offset: int
     end: int
@@ -103,8 +103,8 @@ class Walk:
     """Iterating gives every record of the data section, DataEnd included, and every damage, in the file's order.
 
     Args:
-        known: what an index says of the chunks, by offset.
-        end: where the data section ends, where that is known.
+        known: the chunks in an index, by offset.
+        end: the offset where the data section ends; None if it is not known.
     """
 
     def __init__(
@@ -140,8 +140,7 @@ class Walk:
             position = following
 
     def places(self, position: int = len(MAGIC)) -> Iterator[tuple[int, int, int]]:
-        """(opcode, offset, length) of the records from one at an offset up to the first that is cut off; what is in
-        them is not looked at."""
+        """(opcode, offset, length) of records, unchecked: from an offset up to the first that is cut off."""
         while position + RECORD.size <= self._end:
             opcode, length = RECORD.unpack(self._source.read(position, RECORD.size))
             if length > self._end - position - RECORD.size:
@@ -152,7 +151,7 @@ class Walk:
     # ---- one record
 
     def at(self, position: int, *, searching: bool = False) -> Found | str:
-        """The record at an offset, or why there is none; `searching` asks for more evidence."""
+        """The record at an offset, or why there is none; with `searching` another record must follow it."""
         left = self._end - position - RECORD.size
         if left < 0:
             return f"expected a record, found {left + RECORD.size} bytes"
@@ -170,7 +169,7 @@ class Walk:
                 return checked
             else:
                 why = checked
-        hidden = self._chunk(position)  # its opcode or its length may be what is damaged
+        hidden = self._chunk(position)  # it may be a chunk whose opcode or length is damaged
         return hidden if isinstance(hidden, Found) else why
 
     def _other(self, opcode: int, position: int, length: int) -> Found | str:
@@ -203,7 +202,7 @@ class Walk:
         return Found(Opcode.ATTACHMENT, position, 9 + length, memoryview(b""), attachment=index)
 
     def _chunk(self, position: int) -> Found | str:
-        """By what the index says of it, then by its own header."""
+        """The chunk at an offset, read as the index describes it, else as its own header does."""
         if position + CHUNK_HEAD.size + 8 > self._end:
             return "a chunk is cut off"
         head = self._source.read(position, CHUNK_HEAD.size)
@@ -218,7 +217,7 @@ class Walk:
         return why
 
     def _claims(self, position: int, head: bytes) -> Iterator[tuple[ChunkClaim, str]]:
-        """What a chunk may be, and what is wrong with its header if it is that."""
+        """Descriptions of a chunk to try, each with what is wrong in its header if the description is right."""
         opcode, claimed, _, _, size, crc, name_size = CHUNK_HEAD.unpack(head)
         known = self._known.get(position)
         if known is not None:
@@ -286,7 +285,7 @@ class Walk:
     # ---- going on after damage
 
     def _stands_at(self, position: int) -> bool:
-        """Whether a record may begin at an offset, as its first bytes tell."""
+        """Whether the bytes at an offset may be the start of a record."""
         if position >= self._end:
             return position == self._end
         if position + 9 > self._end:
@@ -299,7 +298,7 @@ class Walk:
         return fits and length == _SIZES.get(opcode, length)
 
     def _following(self, position: int) -> int:
-        """Where the walk goes on after a damaged record."""
+        """The offset where the walk goes on after a damaged record."""
         if position + 9 <= self._end:
             claimed = position + 9 + int.from_bytes(self._source.read(position + 1, 8), "little")
             if position in self._known:
@@ -309,7 +308,7 @@ class Walk:
         return self._search(position + 1)
 
     def _search(self, position: int) -> int:
-        """The next offset where a record stands that can be checked."""
+        """The next offset with a record that can be checked."""
         at = bisect.bisect_left(self._known_offsets, position)
         limit = self._known_offsets[at] if at < len(self._known_offsets) else self._end
         piece = _FIRST_PIECE
@@ -322,16 +321,16 @@ class Walk:
                 if self._stands_at(candidate) and self._certain(candidate):
                     return candidate
             position += piece
-            piece = min(2 * piece, _PIECE)  # what is found near costs no more than the way to it
+            piece = min(2 * piece, _PIECE)  # small at first: the next record is often near
         return limit
 
     def _certain(self, position: int) -> bool:
-        # what adds up is a chunk or an attachment, whether good or damaged
+        # if the sizes add up it is a chunk or an attachment, whether good or damaged
         return self._adds_up(position) or isinstance(self.at(position, searching=True), Found)
 
 
 def attachment_name(source: Source, damage: Damage) -> str | None:
-    """The name of a damaged attachment, where its header can still be read."""
+    """The name of a damaged attachment; None if its header cannot be read."""
     if damage.opcode != Opcode.ATTACHMENT:
         return None
     try:

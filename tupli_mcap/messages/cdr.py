@@ -1,12 +1,12 @@
-"""Plain CDR, little-endian: the primitives, appended to a bytearray and read from a memoryview.
+"""The primitives of plain CDR, little-endian, appended to a bytearray and read from a memoryview.
 
 A primitive is aligned to its size, counted from an origin (the byte after the encapsulation header).
 A sequence is its length (uint32) and its elements; an empty one has no padding after the length. A string is
 its length with the terminating NUL, UTF-8, NUL.
 
 CDR strings hold no NUL and UTF-8 no lone surrogates, but a Python string may. These, and the escape character
-itself, are written as U+001A (SUBSTITUTE) and four hexadecimal digits, so that every string comes back,
-and every reader can read it.
+itself, are written as U+001A (SUBSTITUTE) and four hexadecimal digits, so that every string comes back exactly
+and every reader can show it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def read_length(data: memoryview, offset: int, origin: int) -> tuple[int, int]:
 
 
 def write_array(out: bytearray, origin: int, data: bytes, itemsize: int) -> None:
-    """Append the little-endian bytes of elements of `itemsize`, aligned; nothing where there are none."""
+    """Append the little-endian bytes of elements of `itemsize` bytes, aligned; no padding if `data` is empty."""
     if data:
         out += _PADDING[(origin - len(out)) & (itemsize - 1)]
         out += data
@@ -49,7 +49,7 @@ def write_array(out: bytearray, origin: int, data: bytes, itemsize: int) -> None
 def read_array(
     data: memoryview, offset: int, origin: int, dtype: np.dtype[Any], count: int
 ) -> tuple[np.ndarray[Any, Any], int]:
-    """Return `count` elements of a little-endian `dtype` as one's own array, and the offset after them."""
+    """Return a new array of `count` elements of a little-endian `dtype`, and the offset after them."""
     if count == 0:
         return np.empty(0, dtype), offset
     size = dtype.itemsize
@@ -68,7 +68,7 @@ def read_array(
 
 
 def write_string(out: bytearray, origin: int, text: str) -> None:
-    """Append a string of any characters."""
+    """Append a string; it may hold any characters."""
     if _TO_ESCAPE.search(text) is not None:
         text = _TO_ESCAPE.sub(lambda match: f"\x1a{ord(match[0]):04x}", text)
     data = text.encode()
@@ -78,7 +78,7 @@ def write_string(out: bytearray, origin: int, text: str) -> None:
 
 
 def read_string(data: memoryview, offset: int, origin: int) -> tuple[str, int]:
-    """Return a string and the offset after it; some writers give an empty one no NUL."""
+    """Return a string and the offset after it. Some writers store an empty string without its NUL."""
     length, offset = read_length(data, offset, origin)
     end = offset + length
     if end > len(data):
@@ -89,7 +89,7 @@ def read_string(data: memoryview, offset: int, origin: int) -> tuple[str, int]:
 
 
 def decode_string(stored: bytes | memoryview, offset: int) -> str:
-    """Return the string that is stored, with its NUL, at `offset`."""
+    """Return the string whose bytes, with their NUL, were stored at `offset`."""
     if not stored:
         return ""
     try:

@@ -1,6 +1,6 @@
-"""Messages of a layout without a constant size, back to values: one, or many at once.
+"""Decodes messages of variable layout: one, or many at once.
 
-Of many, numbers are taken by array operations, and texts one by one.
+Of many messages, numbers are read by array operations, texts one by one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tupli_mcap.spaces.leaves import Leaf
 
 
 class MessageDecoder:
-    """Decodes the CDR bodies of `/step` and `/final_state`. Every defect is a FormatError."""
+    """Decodes the CDR bodies of `/step` and `/final_state`. All methods raise FormatError for a defect."""
 
     def __init__(self, layout: StepLayout) -> None:
         self._layout = layout
@@ -39,7 +39,7 @@ class MessageDecoder:
         return values
 
     def state(self, body: memoryview) -> int:
-        """Where the state ends in the body of a step that is not complete."""
+        """The offset where the state ends in the body of an unfinished step."""
         leaves = [leaf for leaf in self._layout.state if not leaf.apart and leaf in self._step]
         return self._leaves(body, leaves)[1]
 
@@ -65,7 +65,7 @@ class MessageDecoder:
             if position + size > len(body):
                 raise FormatError(f"{leaf.path}: expected {size} bytes at byte {position} of {len(body)}")
             value = np.frombuffer(body[position : position + size], dtype).reshape(leaf.shape).copy()
-            if dtype == np.bool_ and value.view(np.uint8).max(initial=0) > 1:  # is no bool that NumPy knows
+            if dtype == np.bool_ and value.view(np.uint8).max(initial=0) > 1:  # NumPy has no such bool
                 raise FormatError(f"{leaf.path}: expected bools of 0 or 1, found another byte")
             values[leaf.name] = value[()] if leaf.is_scalar else value
             position += size
@@ -77,16 +77,16 @@ def _pair(body: memoryview) -> tuple[int, int]:
 
 
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
-LOG_TIME = "#log_time"  # the name of the times (ns), as in the rows of constant size
-_LOG_TIME_AT = 15  # in a record
+LOG_TIME = "#log_time"  # the column of times (ns), named as in rows of constant size
+_LOG_TIME_AT = 15  # offset in a record
 _BOOL, _U4 = np.dtype(np.bool_), np.dtype("<u4")
 
 
 class BatchDecoder:
-    """Decodes Message records of `/step` and `/final_state` that lie in one buffer. Safe from several threads.
+    """Decodes Message records of `/step` and `/final_state` that lie in one buffer. Thread-safe.
 
-    Every defect is a FormatError, the one that `MessageDecoder` has for the first message that is defective. A text
-    that nobody asks for is skipped, whatever it holds.
+    For a defect, all methods raise the FormatError that `MessageDecoder` raises for the first defective message. Texts
+    that the caller does not ask for are skipped without a check.
     """
 
     def __init__(self, layout: StepLayout) -> None:
@@ -94,13 +94,14 @@ class BatchDecoder:
         self._single = MessageDecoder(layout)
 
     def steps(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
-        """Columns of steps: an array of a leaf of constant size, a list of one of variable size.
+        """Columns of steps: an array for a leaf of constant size, a list for one of variable size.
 
         Args:
+            data: the buffer.
             records: where each record begins and ends in `data`, int64 (messages, 2).
-            names: of the leaves (those without elements are left out), `terminal`, `timeout` and `LOG_TIME`.
+            names: the columns to return: of leaves that have elements, `terminal`, `timeout` and `LOG_TIME`.
         """
-        if set(names) == {LOG_TIME}:  # it is no part of the messages
+        if set(names) == {LOG_TIME}:  # it is not in the message bodies
             return {LOG_TIME: _log_times(data, records)}
         try:
             fields = _Fields(data, records)
@@ -114,7 +115,7 @@ class BatchDecoder:
         return columns | ({LOG_TIME: _log_times(data, records)} if LOG_TIME in names else {})
 
     def finals(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
-        """Columns of final states, as those of steps, and `episode` (uint32)."""
+        """Columns of final states, like those of steps, and `episode` (uint32)."""
         try:
             fields = _Fields(data, records)
             columns = self._leaves(fields, self._layout.final_leaves, names)
@@ -144,7 +145,7 @@ class BatchDecoder:
         return columns
 
     def _explain(self, data: Any, records: Array, decode: Callable[[memoryview], object]) -> None:
-        """Raises the error that decoding one message after the other has."""
+        """Decodes one message after the other, to raise the error of the first defective one."""
         view = memoryview(data)
         for start, end in records.tolist():
             decode(view[start + BODY : end])
@@ -159,10 +160,9 @@ def _log_times(data: Any, records: Array) -> Array:
 
 
 class _Fields:
-    """The fields of messages, one after the other.
+    """Reads the fields of many messages, one field of all messages at a time.
 
-    Whether the messages are long enough is looked at in the end, of all fields together: an error before says no more
-    than that something is wrong.
+    `end` checks the lengths of all messages at once. The texts of errors do not matter: `_explain` raises a better one.
     """
 
     def __init__(self, data: Any, records: Array) -> None:
@@ -170,12 +170,12 @@ class _Fields:
         self._bodies = records[:, 0] + BODY
         self._ends = records[:, 1]
         self._at = self._bodies.copy()
-        self._aligned = 8  # all the offsets from the bodies are multiples of it
+        self._aligned = 8  # all offsets from the bodies' starts are multiples of this
         self.episodes = self.take(_U4, 1)
         self.take(_U4, 1, wanted=False)
 
     def take(self, dtype: np.dtype[Any], count: int, wanted: bool = True) -> Array:
-        """`count` elements of each message, one after the other; none where they are not wanted."""
+        """`count` elements of each message, flat, in the order of messages; empty unless `wanted`."""
         if dtype.itemsize > self._aligned:
             self._at += (self._bodies - self._at) & (dtype.itemsize - 1)
             self._aligned = dtype.itemsize
@@ -204,11 +204,11 @@ class _Fields:
             return []
         whole = bytes(self._data)
         stored = [whole[a:b] for a, b in zip(begin, self._at.tolist(), strict=True)]
-        decoded = {text: cdr.decode_string(text, 0) for text in set(stored)}  # many are alike
+        decoded = {text: cdr.decode_string(text, 0) for text in set(stored)}  # most occur often
         return [decoded[text] for text in stored]
 
     def each(self, decode: Callable[[memoryview, int, int], tuple[Any, int]]) -> list[Any]:
-        """A value of each message, and where it ends, by a function of a body and an offset in it."""
+        """A value of each message; `decode` takes a body, an offset and 0, and returns the value and where it ends."""
         view, values, places = memoryview(self._data), [], []
         for body, at, end in zip(self._bodies.tolist(), self._at.tolist(), self._ends.tolist(), strict=True):
             value, offset = decode(view[body:end], at - body, 0)
@@ -219,6 +219,6 @@ class _Fields:
         return values
 
     def end(self) -> None:
-        """FormatError if a message is shorter or longer than its fields."""
+        """Raises FormatError if a message is shorter or longer than its fields."""
         if not np.array_equal(self._at, self._ends):
             raise FormatError("expected messages of another length")

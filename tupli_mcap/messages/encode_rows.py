@@ -1,14 +1,14 @@
-"""Generated encoders: one Python function per recording that writes a step into a row of constant layout.
+"""Generates the functions that write steps of constant layout into rows.
 
-The source is generated from validated spaces: the live environment's, or those of a file whose episodes are written
-anew. Keys come into it as `repr` of a `str` or `int` or are bound as objects, names and dtypes are of fixed alphabets,
-and leaves are counted before anything is compiled. Readers generate nothing. The source takes the fast way when a value
-has the recorded type, and otherwise calls an exact (slow) cast that refuses what it cannot store.
+Their source is generated from validated spaces: the live environment's, or those of a file whose steps are written
+anew. It holds keys as `repr` of a `str` or `int`, or bound as objects; names and dtypes have fixed alphabets; there
+is a limit of leaves. Readers generate no code. A value of the recorded type is stored directly; any other goes through
+an exact cast, which refuses what it cannot store.
 
 A row is a complete MCAP Message record. One `struct` call writes the end of row j (action, reward, flags) and the start
-of row j+1 (record header and the new observation); one more writes sequence and log_time of row j, which commits it.
-Where the observation after a step comes with the next step only (`put_whole`), row j+1 gets a header of zeros, and
-row j its own after its state: whoever reads the journal takes no state of a row without a header.
+of row j+1 (record header and new observation); another writes sequence and log_time of row j, which commits it.
+`put_whole` does not know the observation after a step: it writes zeros as the header of row j+1, and the header of row
+j only after its state. Readers of the journal take no state from a row without a header.
 """
 
 from __future__ import annotations
@@ -37,49 +37,50 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-SEQUENCE_OFFSET = 11  # of `sequence` in a Message record; log_time follows it
+SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
 COMMIT = Struct("<IQ")
 EPISODE_AND_STEP = Struct("<II")
 _TIME = Struct("<Q")
 HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
-_MAX_LEAVES = 4096  # compiling takes time and memory for each
+_MAX_LEAVES = 4096  # each takes time and memory to compile
 
 
 class ImageSink(Protocol):
-    """Takes images: `check` first, so that a refused step writes none of its images."""
+    """Stores images. `check` comes first, so that a refused step writes none of its images."""
 
     def check(self, value: Any) -> np.ndarray[Any, Any]:
-        """The image as it will be stored; StepError if it cannot be."""
+        """The image as it will be stored; raises StepError if it cannot be stored."""
         ...
 
     def put(self, image: np.ndarray[Any, Any]) -> None:
-        """The image of the next state; called before the step is committed."""
+        """Stores the image of the next state, before the step is committed."""
         ...
 
     def put_first(self, image: np.ndarray[Any, Any]) -> None:
-        """The image of a reset: replaces the running row's."""
+        """Stores the image of a reset, in place of the running row's."""
         ...
 
     def advance(self) -> None:
-        """The running row's step is committed: the next row runs, and nobody knows its image yet."""
+        """Goes on to the next row, whose image is not known yet, after the running row's step was committed."""
         ...
 
 
 @dataclass
 class RowEncoder:
-    """Writes rows into a buffer, and knows where the next one goes.
+    """Writes rows into a buffer.
 
-    `put(action, state, reward, terminal, timeout)` writes and commits a step; `put_state(state)` starts a row.
-    `put_whole(state, action, reward, terminal, timeout)` does both, and leaves the state after the step unknown.
-    `put_next(episode, state)` leaves the running row, which holds the final state, as a hole, and starts the row after
-    it, the first one of `episode`; the hole's time is now, but not before the last step's. All of them raise StepError
-    for what cannot be stored exactly, and nothing has changed then.
+    These raise StepError for a value that cannot be stored exactly, and change nothing then:
+    `put(action, state, reward, terminal, timeout)` writes and commits a step; `state` is the state after it.
+    `put_state(state)` starts a row.
+    `put_whole(state, action, reward, terminal, timeout)` does both; the state after the step stays unknown.
+    `put_next(episode, state)` turns the running row, which holds the final state, into a hole and starts the row after
+    it as the first one of `episode`. The hole's time is the current one, but not before the last step's.
 
-    `offset()` is where the running row is in the buffer, `count()` the sequence of the next step, `total()` the return
-    so far. `skip(rows, total)` goes on behind rows that somebody else has committed, with another return so far.
-    `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; when the one at `end`
-    has been started, `switch` is called. `begin(prefix)`: another episode; what its rows hold before their state.
+    `offset()` is the running row's offset in the buffer, `count()` the sequence of the next step, `total()` the return
+    so far. `skip(rows, total)` goes on behind rows that other code committed, with `total` as the return so far.
+    `move(start, last, end)` makes the row at `start` the running one, behind the row at `last`; `switch` is called when
+    the row at `end` has been started. `begin(prefix)` begins another episode, whose rows start with `prefix`.
     """
 
     put: Callable[[Any, Any, Any, Any, Any], None]
@@ -98,7 +99,7 @@ class RowEncoder:
 
 @dataclass
 class _Code:
-    """What the functions of one layout consist of, see `_ENCODER`; and the objects that their lines name."""
+    """The lines of one layout that go into `_ENCODER`, and the objects that they name."""
 
     put: list[str]
     put_state: list[str]
@@ -126,11 +127,18 @@ def make_row_encoder(
     switch: Callable[[], None],
     seal: Callable[..., None] | None = None,
 ) -> RowEncoder:
-    """Generates the encoder of a constant layout for the messages of `channel`, from sequence `first`, into `buffer`.
+    """Generates the encoder that writes messages of `channel` into `buffer`, from sequence `first` on.
 
-    `images` has a sink for each image leaf; `switch` is called when the row after the last one has been started;
-    `seal`, if given, with the offset of each committed row, and `alone=True` if no state follows it. `move` and `begin`
-    come before the first step.
+    The caller has to call `move` and `begin` before the first step.
+
+    Args:
+        layout: a constant one.
+        buffer: of the journal.
+        channel: id of the step channel.
+        first: sequence of the next step.
+        images: a sink for each image leaf.
+        switch: called when the row after the last one of a half has been started.
+        seal: if given, called with the offset of each committed row, and `alone=True` if no state follows it.
 
     Raises:
         SpaceError: the layout has more than 4,096 leaves.
@@ -150,19 +158,19 @@ def make_row_encoder(
         seal=seal,
         commit=COMMIT.pack_into,
         time_ns=time.time_ns,
-        refusals=(RecordingError, MemoryError),  # of the chunk of images that the step has filled
+        refusals=(RecordingError, MemoryError),  # raised by a flush of images, which is no fault of the step
         diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
         view=np.frombuffer(buffer, np.uint8),
     )
     exec(_compiled(text), namespace)
-    # a name in its own globals would keep the buffer until garbage is collected
+    # a function in its own globals is a cycle, which would keep the buffer until the garbage collector runs
     encoder = namespace.pop("encoder")
     return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
 
 
 @functools.lru_cache(maxsize=8)
 def _compiled(text: str) -> CodeType:
-    """The code of a source, which is the same for all streams of a recording."""
+    """The compiled source, which all streams of a recording share."""
     return compile(text, "<tupli_mcap row encoder>", "exec")
 
 
@@ -211,7 +219,7 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
 
 
 def _tail(source: Source, layout: StepLayout) -> Packed:
-    """The end of a row, behind its state, and the beginning of the next one up to its state."""
+    """The end of a row, behind its state, and the start of the next one up to its state."""
     message = layout.step_message
     after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
     begin = BODY + message.offset(after_state[0])
@@ -233,7 +241,7 @@ def _head(source: Source, layout: StepLayout) -> Packed:
     return packed
 
 
-# what changes from row to row is in cells of a closure: attributes take twice the bytecode
+# The state of the encoder is in closure variables: attributes take twice the bytecode.
 _ENCODER = """\
 def encoder():
     offset = start = last = end = 0
@@ -316,7 +324,7 @@ def encoder():
 
 
 def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
-    """The source."""
+    """The source of the encoder."""
 
     def block(lines: Sequence[str], indent: int = 12) -> str:
         return "".join(f"{' ' * indent}{line}\n" for line in lines)
@@ -338,7 +346,7 @@ def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
 
 
 def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exception) -> StepError:
-    """The StepError that names what the fast path stumbled over."""
+    """The StepError that says which value the generated code could not store."""
     if isinstance(err, StepError):
         return err
     groups: list[tuple[str, Any, Any, Sequence[Leaf]]] = [

@@ -18,7 +18,7 @@ from tupli_mcap.spaces.leaves import Leaf
 __all__ = ["Packed", "Source", "access_to", "add_fields", "add_structure_checks", "flag_check"]
 
 _BOOLS = b"\0\1"
-_LARGE = 2048  # bytes from which a leaf is copied as an array instead of through `bytes`
+_LARGE = 2048  # a leaf of this many bytes or more is copied as an array, not through `bytes`
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
 }  # fmt: skip
@@ -40,9 +40,9 @@ class Source:
 
 @dataclass
 class Packed:
-    """Format pieces and argument expressions of one `struct` call, at growing offsets.
+    """The format and the argument expressions of one `struct` call, at growing offsets.
 
-    `stores` are the lines that write the leaves which are too large for it.
+    `stores` are lines that write the leaves which are too large for the call.
     """
 
     start: int
@@ -124,11 +124,11 @@ def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, pac
         large, is_bool = nbytes >= _LARGE, dtype.kind == "b"
         exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
         fast = value if large else f"{value}.tobytes()"
-        # of exactly this class: a subclass may mean something else by its bytes, as a masked array does
+        # exactly this class: the bytes of a subclass may mean something else, as those of a masked array do
         plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
         if leaf.shape == ():
             plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
-        # a vector's length is told by its bytes, which spares it making a tuple
+        # a vector's length follows from the number of its bytes; `shape` would make a tuple for each value
         vector = len(leaf.shape) == 1 and not large
         shaped = f"{value}.ndim == 1" if vector else f"{value}.shape == {shape}"
         source.lines.append(
@@ -138,7 +138,7 @@ def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, pac
         )
         if vector:
             source.lines.append(f"if len({raw}) != {nbytes}: {raw} = {exact}({value})")
-        if is_bool and not large:  # made by a view, perhaps
+        if is_bool and not large:  # a view may have made bools of other bytes
             source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
         if large:
             packed.stores.append(

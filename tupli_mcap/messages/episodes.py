@@ -69,10 +69,15 @@ def read_strings(body: memoryview, offset: int, count: int) -> list[str]:
 
 
 class EpisodeStart(NamedTuple):
-    """`first_row` counts from 0 in the episode's step channel.
+    """A message of `/episode_start`.
 
-    `seed` is decimal text, empty if there is none: the one passed to `reset` (`seed_given`), or the one the
-    environment drew. `continued`: stepped on after an end, without a reset.
+    Attributes:
+        first_row: row of the first step in the step channel of `env`.
+        seed_given: `seed` was passed to `reset`; else the environment drew it.
+        continued: the environment was stepped on after an end, without a reset, or the episode goes on from another
+            file.
+        seed: decimal text, empty if there is none.
+        options, reset_info: exact JSON; `options` is empty if none were passed.
     """
 
     episode: int
@@ -113,7 +118,7 @@ def start_texts(seed: str, options: str, reset_info: str) -> bytes:
 
 
 class EpisodeEnd(NamedTuple):
-    """`end` indexes END_NAMES; `episode_return` is the sum of the rewards; `metadata` is JSON."""
+    """A message of `/episode_end`: `end` indexes END_NAMES, `metadata` is plain JSON."""
 
     episode: int
     env: int

@@ -1,4 +1,4 @@
-"""Rendered frames in a file: `/camera/<name>` holds the pictures, `/frame/<name>` says row by row what they show."""
+"""Rendered frames: a row of `/camera/<name>` holds a picture, the same row of `/frame/<name>` says what it shows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NAME = re.compile("[a-z](?:_?[a-z0-9]+)*")  # of a camera
 
 
 class CameraTopics(NamedTuple):
-    """Where the frames of a camera are; `frame` says which state of which episode the row of `camera` shows."""
+    """The two topics of a camera: pictures, and the episode and step that each shows."""
 
     camera: str
     frame: str
@@ -49,7 +49,7 @@ def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
 
 
 class EncodedFrame(NamedTuple):
-    """A picture as it is stored: `form` is "png" or "jpeg", `time_ns` when it was rendered."""
+    """A picture as it is stored: `form` is "png" or "jpeg", `time_ns` the time when it was rendered."""
 
     time_ns: int
     form: str

@@ -1,6 +1,6 @@
-"""Step infos: numeric entries asked for by name are typed fields of `/info`, everything else is JSON.
+"""Step infos: entries that the user named have typed fields in `/info`, all others are JSON.
 
-An entry that is missing, or that its typed field cannot hold exactly, is marked absent there and kept in the JSON.
+A typed field of an entry that is missing or no float64 is marked absent; the JSON then holds the entry.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class InfoCodec:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> InfoCodec:
-        """That of a channel; FormatError if its metadata are damaged."""
+        """The codec of a channel; raises FormatError if the channel's metadata are damaged."""
         names = jsonvalue.loads(metadata.get("fields", "[]"))
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise FormatError(f"/info: expected a list of names in its metadata, found {names!r:.100}")
@@ -47,7 +47,7 @@ class InfoCodec:
         return "".join([*lines, "string json\n"]), {"fields": jsonvalue.dumps(self.names)}
 
     def encode(self, episode: int, step: int, info: Mapping[str, Any]) -> bytes:
-        """The CDR body of a step's entries."""
+        """The CDR body of a step's info."""
         rest = dict(info)
         parts = [_HEAD.pack(episode, step)]
         for name in self.names:

@@ -1,4 +1,4 @@
-"""Byte layouts: from leaves to ros2msg text, CDR offsets, and the NumPy dtype of a whole Message record.
+"""Byte layouts: derives ros2msg text, CDR offsets and the NumPy dtype of a whole Message record from leaves.
 
 CDR aligns every primitive to its size, counted from the byte after the 4-byte encapsulation header. A message whose
 fields all have constant size therefore has constant offsets, and a chunk of such messages is one structured array.
@@ -31,7 +31,7 @@ IMAGE_SCHEMA = (
 
 
 class Field(NamedTuple):
-    """A field of constant size: `dtype` as users see it, `offset` from the start of the CDR body."""
+    """A field of constant size: its NumPy dtype, and its offset from the start of the CDR body."""
 
     name: str
     dtype: DType
@@ -70,7 +70,7 @@ class MessageLayout:
         return BODY + self.body_size
 
     def offset(self, name: str) -> int:
-        """Where a field starts, from the start of the CDR body."""
+        """The offset of a field from the start of the CDR body."""
         return next(f.offset for f in self.fields if f.name == name)
 
     def header(self, channel: int, sequence: int = 0, time: int = 0) -> bytes:
@@ -112,7 +112,7 @@ class ImageLayout(NamedTuple):
 def image_layout(leaf: Leaf) -> ImageLayout:
     """The layout of an image leaf's messages; field `data` has its stored shape, `sec`/`nanosec` its stamp."""
     shape = leaf.stored_shape
-    frames = shape[0] if leaf.kind == "stack" else 1  # one picture below the other
+    frames = shape[0] if leaf.kind == "stack" else 1  # newer frames are below older ones
     height, width, channels = (*shape[1:], 1)[:3] if leaf.kind == "stack" else shape
     height *= frames
     encoding = {1: b"mono8", 3: b"rgb8", 4: b"rgba8"}[channels]

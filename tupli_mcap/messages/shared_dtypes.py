@@ -1,4 +1,4 @@
-"""What the steps of several recordings have in common: whether one array can hold them, and of which dtype."""
+"""Checks whether one array can hold the steps of several recordings, and which dtype it needs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tupli_mcap.spaces.leaves import Leaf
 
 
 def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
-    """The leaves of a field; None where it is a plain column (flags, infos)."""
+    """The leaves of a field; None if it is a plain column (flags, infos)."""
     groups = {
         "states": layout.state,
         "next_states": layout.state,
@@ -24,10 +24,10 @@ def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
 
 
 def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:
-    """Whether the columns of two recordings can follow each other in one array.
+    """Checks that one array can hold the columns of two recordings.
 
     Raises:
-        SpaceError: they cannot; the message names the first leaf that differs, and both recordings.
+        SpaceError: it cannot; the message names the first leaf that differs, and both recordings.
     """
     for root, ours, theirs in (
         ("state", first.state, other.state),
@@ -64,7 +64,7 @@ def _differ(path: str, a: str, first: str, b: str, other: str) -> SpaceError:
 
 
 def common_dtype(a: np.dtype[Any], b: np.dtype[Any]) -> np.dtype[Any] | None:
-    """A dtype that holds all values of both exactly, without turning numbers of one kind into another."""
+    """A dtype that holds all values of both exactly; None if there is none of the same kind of numbers."""
     if a == b:
         return a
     if "b" in a.kind + b.kind or (a.kind == "f") != (b.kind == "f"):

@@ -1,7 +1,7 @@
-"""The messages of one recording, derived from its spaces and the dtypes decided at the first step.
+"""The layout of a recording's messages, derived from its spaces and the dtypes decided at the first step.
 
-`StepLayout` is the single source for writer and reader: both derive every schema, offset and dtype from the spaces, and
-a reader refuses a file whose schema text says something else.
+Writer and reader both derive every schema, offset and dtype with `StepLayout`; a reader refuses a file whose schema
+text differs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 STEP_SCHEMA = "tupli_mcap/msg/Step"
 FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
-MAX_FRAMES = 256  # of a stack: what a row takes in memory is at most so many times what it takes in the file
+MAX_FRAMES = 256  # of a stack: a row takes at most this many times as many bytes in memory as in the file
 Stack = str | list[str]  # `name`, or `[name, "last"]`
 _RESERVED = ("episode", "step", "terminal", "timeout", "env")
 _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
@@ -34,13 +34,16 @@ _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
 class StepLayout:
     """Leaves, stored dtypes and message layouts of `/step`, `/final_state` and the image channels.
 
-    `dtypes` maps a constant leaf's ROS name to its stored dtype; leaves not named keep the declared one. `inner_dtypes`
-    does the same inside leaves of variable size: ROS name -> path in the leaf -> dtype name. `stacks` names leaves
-    whose first axis are the frames of a sliding window, or as `[name, "last"]` the last one; one whose values are not
-    uint8 is an array like any other.
+    Args:
+        observation_space, action_space: of the environment.
+        reward_space: None for a float64.
+        dtypes: ROS name of a constant leaf -> stored dtype; other leaves keep the declared one.
+        inner_dtypes: ROS name of a variable leaf -> path in the leaf -> dtype name.
+        stacks: leaves that are stacks of frames: a name if the first axis holds the frames, `[name, "last"]` if the
+            last one does. A leaf whose values are not uint8 is stored as an array all the same.
 
     Raises:
-        SpaceError: a space that cannot be recorded, with the path of the leaf.
+        SpaceError: a space cannot be recorded; the message has the path of the leaf.
     """
 
     def __init__(
@@ -69,7 +72,7 @@ class StepLayout:
             raise SpaceError(
                 f"dtypes are given for {sorted(given)}, which are not leaves of constant size in these spaces"
             )
-        # an image whose values are not uint8 is no image that viewers know, but an array like any other
+        # viewers show no image whose values are not uint8: it is stored as an array
         self.state = [
             replace(leaf, kind="array")
             if leaf.kind == "image" and self.dtypes[leaf.name] != np.uint8
@@ -85,7 +88,7 @@ class StepLayout:
         self.nest_reward = structure(reward)
 
     def without(self, fields: Collection[str]) -> StepLayout:
-        """The same where "states" or "actions", or both, are nothing."""
+        """The same layout with an empty space for "states", for "actions", or for both."""
         nothing = gym.spaces.Dict({})
         left_out = [leaf.name for leaf in self.state if "states" in fields]
         left_out += [leaf.name for leaf in self.action if "actions" in fields]
@@ -169,7 +172,7 @@ class StepLayout:
         return {leaf.name: image_layout(leaf) for leaf in self.images}
 
     def reward_total(self, reward: Any) -> float:
-        """What a reward that can be stored adds to the return: the sum of its numbers."""
+        """The sum of a reward's numbers, which it adds to the return."""
         if self.reward_space is None:
             return float(reward)
         numbers = [leaf.get(reward) for leaf in self.reward if leaf.kind != "variable"]
@@ -198,7 +201,7 @@ class StepLayout:
         return message_text(lines + tail, definitions)
 
     def to_metadata(self) -> dict[str, str]:
-        """What a channel's metadata says of the layout; `from_metadata` rebuilds it."""
+        """The layout as channel metadata; `from_metadata` rebuilds it."""
         reward = "" if self.reward_space is None else jsonvalue.dumps(space_to_json(self.reward_space))
         return {
             "observation_space": jsonvalue.dumps(space_to_json(self.observation_space)),
@@ -214,7 +217,7 @@ class StepLayout:
         """Rebuilds a layout from a channel's metadata.
 
         Raises:
-            FormatError: the metadata is incomplete or describes no layout.
+            FormatError: the metadata are incomplete or describe no layout.
         """
         reward_text = _entry(metadata, "reward_space")
         reward = space_from_json(jsonvalue.loads(reward_text)) if reward_text else None
@@ -262,7 +265,7 @@ def can_stack(leaf: Leaf) -> bool:
 
 
 def stack_of(leaf: Leaf) -> Stack:
-    """What `stacks` say of a stack."""
+    """The entry of a stack in `stacks`."""
     return [leaf.name, "last"] if leaf.frames_last else leaf.name
 
 
@@ -273,7 +276,7 @@ def _is_stack(entry: Any) -> bool:
 
 
 def _as_stack(leaf: Leaf, stacks: Collection[Stack]) -> Leaf:
-    """The leaf as the stack that `stacks` say it is, if any."""
+    """The leaf as a stack if `stacks` has it, else as it is."""
     stack = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
     if stack_of(stack) not in stacks:
         return leaf

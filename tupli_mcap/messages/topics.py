@@ -1,7 +1,7 @@
-"""The topic scheme: builds the topics of a recording, and parses them.
+"""Builds and parses the topics of a recording.
 
-A recording of a single environment has `/step`, `/image/<leaf>`, `/camera/<name>` and `/frame/<name>`; one of several
-has those of each below `/env_<i>`. The topics of episodes and infos are those of all sub-environments.
+A single environment has `/step`, `/image/<leaf>`, `/camera/<name>` and `/frame/<name>`. Each sub-environment of a
+vector environment has its own below `/env_<i>`; all share the topics of episodes and infos.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _TOPIC = re.compile("((?:/env_(0|[1-9][0-9]*))?)/(?:(step)|(image|camera|frame)/
 
 
 class Topics(NamedTuple):
-    """The topics of one environment: `top` is what all of them begin with, empty in a recording of a single one."""
+    """The topics of one environment, which all begin with `top`: empty in a recording of a single environment."""
 
     top: str
 
@@ -29,12 +29,12 @@ class Topics(NamedTuple):
 
     @classmethod
     def of_step(cls, step: str) -> Topics:
-        """Those of the environment whose steps have the topic `step`."""
+        """The topics of the environment whose steps have the topic `step`."""
         return cls(step.removesuffix("/step"))
 
     @property
     def is_vector(self) -> bool:
-        """Whether they are those of a sub-environment."""
+        """Whether it is a sub-environment of a vector environment."""
         return bool(self.top)
 
     @property
@@ -42,20 +42,20 @@ class Topics(NamedTuple):
         return f"{self.top}/step"
 
     def image(self, leaf: str) -> str:
-        """Where the images of a leaf of the observations are."""
+        """The topic of the images of a leaf of the state."""
         return f"{self.top}/image/{leaf}"
 
     def camera(self, name: str) -> str:
-        """Where the frames of a camera are."""
+        """The topic of a camera's pictures."""
         return f"{self.top}/camera/{name}"
 
     def frame(self, name: str) -> str:
-        """Which state of which episode the row of the same number in `camera` shows."""
+        """The topic that says which state of which episode each picture of a camera shows."""
         return f"{self.top}/frame/{name}"
 
 
 class Topic(NamedTuple):
-    """What a topic says: `kind` is "step", "image", "camera" or "frame", `name` that of a leaf or a camera."""
+    """A parsed topic: `kind` is "step", "image", "camera" or "frame", `name` is that of a leaf or a camera."""
 
     topics: Topics
     env: int
@@ -64,7 +64,7 @@ class Topic(NamedTuple):
 
 
 def parse(topic: str) -> Topic | None:
-    """None for a topic that belongs to no single environment, or is not of a recording."""
+    """Parses a topic; None if it belongs to no single environment, or is no topic of recordings."""
     match = _TOPIC.fullmatch(topic)
     if match is None:
         return None

@@ -1,7 +1,7 @@
-"""Leaves that are images: frame stacks without repetition, PNG and JPEG.
+"""Image leaves: stacks of frames, PNG and JPEG.
 
-codecs     which way a leaf is stored, and back
-stack      frame stacks: each frame once
-png        lossless PNG
-pictures   PNG and JPEG by Pillow, for frames too
+codecs     chooses the codec of a channel
+stack      stacks of frames: each frame is stored once
+png        images as PNG
+pictures   encodes and decodes PNG and JPEG with Pillow, for rendered frames too
 """

@@ -1,7 +1,7 @@
-"""How the images of a leaf lie in the chunks of its channel; in journal and memory they are rows of constant size.
+"""Codecs of images in chunks; in the journal and in memory, images are rows of constant size.
 
-A codec takes whole chunks: the writer encodes one before it is compressed, `ChunkStore` decodes it when its rows are
-asked for. Which one a channel has stands in the metadata.
+A codec works on whole chunks: the writer encodes a chunk before it is compressed, `ChunkStore` decodes it before it
+returns rows. The channel's metadata name the codec.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ CODEC = "codec"  # key of the metadata of an image channel
 
 
 class ImageCodec(Protocol):
-    """Encodes and decodes the chunks of one image channel. Safe from several threads."""
+    """Encodes and decodes the chunks of one image channel. Thread-safe."""
 
     def encode(self, rows: Rows) -> Rows:
-        """A chunk as it is compressed; one that is encoded already (of a killed writer) stays as it is."""
+        """Encodes the rows of a chunk; rows that are encoded already (a killed writer's) stay as they are."""
         ...
 
     def decode(self, data: Any, count: int, where: str) -> Any:
-        """The `count` rows of constant size of a chunk. FormatError if it does not hold them."""
+        """The `count` rows of constant size of a chunk; raises FormatError if `data` does not hold them."""
         ...
 
 
@@ -57,14 +57,14 @@ def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[in
 
 
 def _codec(channel: Channel, leaf: Leaf, layout: ImageLayout) -> ImageCodec | None:
-    """The codec a channel names; one of video would be named and made here."""
+    """The codec that a channel names; None if its images are stored as they are."""
     name = channel.metadata.get(CODEC)
     if name is None:
         return StackCodec(leaf, layout) if leaf.kind == "stack" else None
     if name == "png":
         return PngCodec(leaf, layout)
     raise FormatError(
-        f"{channel.topic}: expected images as 'png' or none of the name, found {name!r:.40}; update tupli-mcap"
+        f"{channel.topic}: expected the codec 'png' or none, found {name!r:.40}; update tupli-mcap"
     )
 
 

@@ -1,4 +1,4 @@
-"""Pictures as bytes: PNG and JPEG, by Pillow, which is in the extra `frames`."""
+"""Encodes and decodes PNG and JPEG with Pillow, which is in the extra `frames`."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from tupli_mcap.errors import FormatError, RecordingError, missing_extra
 FrameFormat = Literal["png", "jpeg"]
 ImageFormat = Literal["raw", "png"]  # of image leaves of the state
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
-"""uint8, height x width x 3: red, green, blue."""
+"""uint8 (height, width, 3): red, green, blue."""
 
 _MAGIC: Final = {"png": b"\x89PNG\r\n\x1a\n", "jpeg": b"\xff\xd8\xff"}
-_MAX_PIXELS: Final = 1 << 26  # of a picture in a file: its size is a claim
+_MAX_PIXELS: Final = 1 << 26  # of a picture in a file, whose size is a claim
 _QUALITY: Final = 90
 
 
 def check_format(name: str) -> FrameFormat:
-    """A format of frames that can be written here.
+    """The name of a format of frames, checked.
 
     Raises:
         RecordingError: it is neither "png" nor "jpeg".
@@ -33,7 +33,7 @@ def check_format(name: str) -> FrameFormat:
 
 
 def check_image_format(name: str) -> None:
-    """Whether it is a format of images of states that can be written here.
+    """Checks the name of a format for images of states.
 
     Raises:
         RecordingError: it is neither "raw" nor "png".
@@ -54,10 +54,10 @@ def _pillow() -> Any:
 
 
 def check_picture(value: Any, where: str) -> Picture:
-    """What an environment rendered.
+    """The picture that an environment rendered, checked.
 
     Raises:
-        RecordingError: it is no array of uint8, height x width x 3.
+        RecordingError: it is no uint8 array of shape (height, width, 3).
     """
     if isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.shape[2:] == (3,) and value.size:
         return value
@@ -68,10 +68,10 @@ def check_picture(value: Any, where: str) -> Picture:
 
 
 def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
-    """A picture as the bytes of a PNG, which gives it back exactly, or of a JPEG, which does not."""
+    """A picture as a PNG, which is exact, or as a JPEG, which is not."""
     out = io.BytesIO()
     image = _pillow().fromarray(picture)
-    if form == "png":  # higher levels take longer
+    if form == "png":
         image.save(out, "PNG", compress_level=1)
     else:
         image.save(out, "JPEG", quality=_QUALITY)
@@ -82,7 +82,7 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
     """The picture in the bytes of a PNG or a JPEG.
 
     Raises:
-        FormatError: they are none, or claim more than 2^26 pixels.
+        FormatError: they are neither, or claim more than 2^26 pixels.
         MissingExtraError: Pillow is not installed.
     """
     image_module = _pillow()
@@ -99,7 +99,7 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
 
 
 def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
-    """uint8 pixels, height x width x 1, 3 or 4, as a PNG that gives them back exactly."""
+    """uint8 pixels, (height, width, 1 or 3 or 4), as a PNG, which is exact."""
     flat = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
     out = io.BytesIO()
     _pillow().fromarray(np.ascontiguousarray(flat)).save(out, "PNG", compress_level=1)
@@ -107,10 +107,10 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
 
 
 def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np.ndarray[Any, Any]:
-    """The pixels of a PNG of 1 to `most` pictures of this shape (height, width, channels), one below the other.
+    """The pixels of a PNG that holds 1 to `most` pictures of shape (height, width, channels), one below the other.
 
     Raises:
-        FormatError: it is no PNG, or of another size, depth or kind.
+        FormatError: it is no PNG, or has another size, depth or kind.
         MissingExtraError: Pillow is not installed.
     """
     image_module = _pillow()
@@ -119,7 +119,7 @@ def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np
     mode = {1: "L", 3: "RGB", 4: "RGBA"}[channels]
     try:
         with image_module.open(io.BytesIO(data), formats=("PNG",)) as image:
-            kind = image.tile[0][3]  # as it is in the file; of 16 bits a channel, `mode` has 8
+            kind = image.tile[0][3]  # as in the file: `mode` also stands for 16 bits a channel
             if image.size not in sizes or (kind, image.mode) != (mode, mode):
                 heights = f"{height}" if most == 1 else f"1 to {most} times {height}"
                 raise FormatError(
@@ -134,13 +134,13 @@ def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np
 
 
 def format_of(data: bytes | memoryview) -> FrameFormat | None:
-    """What the first bytes say; None if they are neither a PNG's nor a JPEG's."""
+    """The format that the first bytes show; None if they are neither a PNG's nor a JPEG's."""
     head = bytes(data[:8])
     return next((name for name in get_args(FrameFormat) if head.startswith(_MAGIC[name])), None)
 
 
 def resized(picture: Picture, width: int, height: int | None = None) -> Picture:
-    """A picture of another width (pixels); the height follows unless it is given."""
+    """The picture scaled to a width (pixels); without `height` it keeps its proportions."""
     if height is None:
         height = max(1, round(picture.shape[0] * width / picture.shape[1]))
     if picture.shape[:2] == (height, width):

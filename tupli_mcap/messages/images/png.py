@@ -1,4 +1,4 @@
-"""Images as PNG: `sensor_msgs/msg/CompressedImage`, which viewers show and which gives every pixel back."""
+"""Images as PNG in `sensor_msgs/msg/CompressedImage`, which viewers show; every pixel is exact."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tupli_mcap.messages.images.stack import new_frames
 from tupli_mcap.messages.layout import ImageLayout
 from tupli_mcap.spaces.leaves import Leaf
 
-_STAMP = struct.Struct("<iI")  # kept bit for bit, also one that no clock says
+_STAMP = struct.Struct("<iI")  # kept bit for bit, even if it is no valid time
 
 
 class PngCodec:
-    """An `ImageCodec`: a PNG of each row of an image leaf, or of the newest frames of a stack. It needs Pillow.
+    """An `ImageCodec` that stores each row of an image leaf as a PNG. It needs Pillow.
 
-    A stack's frames are each stored once, as `StackCodec` does it; an image is a stack of one frame.
+    Of a stack, it stores the newest frames of a row, as `StackCodec` does; an image is a stack of one frame.
     """
 
     def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
@@ -34,7 +34,7 @@ class PngCodec:
         self._height, self._width, self._channels = (*frame, 1)[:3]
 
     def _is_raw(self, data: Any, count: int) -> bool:
-        """Whether these are the rows of a journal."""
+        """Whether `data` is rows of constant size, as a journal holds them."""
         if len(data) != count * self._dtype.itemsize:
             return False
         return bool((np.frombuffer(data, self._dtype)["fixed"] == self._fixed).all())

@@ -1,4 +1,4 @@
-"""Frames of sliding windows, each stored once: in pixels here, as PNG in `png`."""
+"""Stacks of frames: each frame of a sliding window is stored once, here as pixels, in `png` as PNG."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ _COUNT = struct.Struct("<I")
 
 
 def new_frames(windows: Array) -> list[int]:
-    """How many frames of each row are not the newest ones of the row before; all of the first one's.
+    """How many frames of each row are new: its other frames are the newest ones of the row before.
 
-    `windows` are the frames of each row, the oldest first: (rows, frames, bytes of a frame).
+    All frames of the first row are new. `windows` are the frames of each row, the oldest first: uint8 (rows, frames,
+    bytes of a frame).
     """
     k = windows.shape[1]
     new = [k] * len(windows)
@@ -37,10 +38,10 @@ def new_frames(windows: Array) -> list[int]:
 
 
 class StackCodec:
-    """Frames of a sliding window, each stored once.
+    """An `ImageCodec` that stores each frame of a sliding window once, as pixels.
 
-    A message holds the newest frames of a row, as one picture below the other: so many that the older ones are the
-    newest of the row before it in the chunk. The first row of a chunk holds all of them, and so does any other misfit.
+    A message holds the new frames of a row, newer ones below older ones. The other frames are the newest ones of the
+    row before in the chunk. The first row of a chunk holds all its frames, and so does a row that shares none.
     """
 
     def __init__(self, leaf: Leaf, layout: ImageLayout) -> None:
@@ -93,7 +94,7 @@ class StackCodec:
             (length,) = _LENGTH.unpack_from(source, at + 1)
             new, rest = divmod(length + 9 - start, frame)
             end = at + start + new * frame
-            least = 1 if i else self._frames  # the first row of a chunk has nothing to go on with
+            least = 1 if i else self._frames  # no row comes before the first one
             if rest or not least <= new <= self._frames or end > len(source):
                 raise FormatError(
                     f"{where}: row {i} expected 1 to {self._frames} frames, found {length} bytes"

@@ -1,7 +1,7 @@
-"""Values of variable size: Text, Sequence, Graph, OneOf, and what holds them.
+"""Values of variable size: Text, Sequence, Graph, OneOf, and the Dicts and Tuples inside them.
 
-codec           a space's codec: encode, decode, schema
-leaf_codecs     constant leaves and Text
+codec           makes the codec of a space: encode, decode, schema
+leaf_codecs     numbers and Text
 nested_codecs   Tuple, Dict, Sequence, Graph, OneOf
-widening        how several values become one array
+widening        finds leaves that need a wider dtype than the space declares
 """

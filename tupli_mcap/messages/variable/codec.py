@@ -1,17 +1,16 @@
 """Values of variable size (Text, Sequence, Graph, OneOf, and whatever is inside them) as fields of a message.
 
-A space becomes a tree of small functions when the field is made, so that writing a value looks nothing up.
-The structure comes from the space alone:
+`VariableField` turns a space into a tree of small functions. The space alone decides the structure:
 
 | space | one value | items of a Sequence | stacked, or the nodes and edges of a Graph |
 |---|---|---|---|
 | Box, Discrete, MultiDiscrete, MultiBinary | `T` or `T[n]` | `T[]`, all elements in a row | the same |
 | the same without elements | no field | a message of one dummy byte each | `uint32`, their number |
 | Text | `string` | `string[]` | the same |
-| Dict, Tuple | a message, a field an entry | `Message[]` | a message of stacked fields |
-| Sequence | as its column to the right | a message with a field `value` each | the same |
+| Dict, Tuple | a message with a field for each entry | `Message[]` | a message of stacked fields |
+| Sequence | its items, or its stack | a message with a field `value` each | the same |
 | Graph | message: `nodes`, `has_edges`, `edges`, `has_edge_links`, `edge_links` | `Message[]` | the same |
-| OneOf | message: `index`, and a field an option, empty unless chosen | `Message[]` | the same |
+| OneOf | message: `index`, and a field for each option, empty unless chosen | `Message[]` | the same |
 """
 
 from __future__ import annotations
@@ -54,19 +53,28 @@ from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel
 
 _MAX_DEPTH = 64
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
-_DUMMY = "structure_needs_at_least_one_member"  # the name ROS 2 gives it
+_DUMMY = "structure_needs_at_least_one_member"  # ROS 2's own name for this field
 
 
 class VariableField:
-    """One field of a message that holds values of `space`; it has no state and may be shared by threads.
+    """A field of a message that holds values of `space`. Thread-safe.
 
-    `field_type` is its ROS type, `definitions` the names and texts of the messages nested in it. `path` names
-    the field in errors. `taken` is a set of type names (without package) in use; this field adds its own.
-    `dtypes` are those of `widening.variable_dtypes`, where leaves are stored wider than their space declares.
+    Args:
+        space: of the values.
+        name: of the field.
+        type_prefix: of the names of nested messages.
+        path: names the field in errors; `name` by default.
+        taken: type names (without package) that are in use; this field adds its own.
+        dtypes: dtypes of leaves that are stored wider than the space declares, by path, as
+            `widening.variable_dtypes` returns them.
+
+    Attributes:
+        field_type: ROS type of the field.
+        definitions: names and texts of the messages nested in it.
 
     Raises:
-        SpaceError: a space that is no part of Gymnasium, a dtype that no message can hold, or one for a leaf
-            that is not in the space.
+        SpaceError: a space that is not Gymnasium's own, a dtype that no message can hold, or a path in `dtypes` that
+            is not in the space.
     """
 
     def __init__(
@@ -97,7 +105,7 @@ class VariableField:
         """Append `value` to `out`, aligned from `origin`.
 
         Raises:
-            StepError: another structure, or a leaf that is not stored exactly; `out` is as before.
+            StepError: another structure, or a leaf that cannot be stored exactly; `out` is unchanged.
         """
         start = len(out)
         try:
@@ -107,7 +115,7 @@ class VariableField:
             raise StepError(f"{self.path}{err}") from err.__cause__
 
     def decode(self, data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
-        """Return the value at `offset`, of the types the space's samples have, and the offset after it.
+        """Return the value at `offset`, with the types of the space's samples, and the offset after it.
 
         Raises:
             FormatError: the bytes are no value of the space.
@@ -123,7 +131,7 @@ class _Builder:
     """Makes codecs and collects the message definitions they need."""
 
     taken: set[str]
-    wide: dict[str, str]  # path to dtype; each is taken out when it is used
+    wide: dict[str, str]  # path to dtype; a used one is removed
     definitions: list[tuple[str, str]] = field(default_factory=list)
 
     def single(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
@@ -151,7 +159,7 @@ class _Builder:
         return Leaf.of(space, path, self.wide.pop(path, None))
 
     def _items(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
-        """A tuple of values, as a Sequence without `stack` has it."""
+        """A tuple of values: a Sequence without `stack`."""
         if type(space) in _NUMERIC and 0 not in (space.shape or ()):
             return numeric_items(self._leaf(space, path))
         codec = self.single(space, f"{type_name}Item", path, depth)
@@ -160,7 +168,7 @@ class _Builder:
         return items_of(codec)
 
     def _stacked(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
-        """Values of a space in one batch, as `gymnasium.vector.utils.concatenate` makes it."""
+        """A batch of values, as `gymnasium.vector.utils.concatenate` makes it."""
         if type(space) in _NUMERIC:
             leaf = self._leaf(space, path)
             return numeric_batch(leaf) if leaf.count else empty_batch(leaf)
@@ -215,7 +223,7 @@ class _Builder:
     def _message(
         self, type_name: str, fields: list[tuple[str, str]], encode: Encode, decode: Decode
     ) -> Codec:
-        """A nested message; `fields` are ROS type and name of what `encode` writes, no type for no bytes."""
+        """A nested message; `fields` are ROS type and name of each field, with no type if it takes no bytes."""
         lines = [f"{ros} {name}\n" for ros, name in fields if ros]
         unique, n = type_name, 2
         while unique in self.taken:

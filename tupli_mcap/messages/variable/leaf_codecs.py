@@ -1,4 +1,4 @@
-"""How the leaves of a value of variable size are written and read: numbers, one or many, and text."""
+"""Writes and reads the leaves of a value of variable size: numbers, one or many, and text."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Decode = Callable[[memoryview, int, int], tuple[Any, int]]
 
 @dataclass(frozen=True)
 class Codec:
-    """How a value is stored; `kind` says how it is left out: fixed and message as `[]`, others empty."""
+    """Writes and reads a value of the ROS type `ros`; `kind` says how a missing value is stored (see `Maybe`)."""
 
     ros: str
     kind: Literal["nothing", "fixed", "array", "string", "message"]
     encode: Encode
     decode: Decode
-    count: int = 1  # elements, where fixed
+    count: int = 1  # elements, if the kind is "fixed"
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Leaf:
 
     @classmethod
     def of(cls, space: gym.Space[Any], path: str, wide: str | None = None) -> Leaf:
-        """The leaf of a space, of its dtype or of a wider one."""
+        """The leaf of a space, with the space's dtype or the wider one `wide`."""
         dtype, shape = np.dtype(space.dtype), tuple(space.shape or ())
         if dtype.name not in ROS_TYPES or not dtype.isnative:
             raise SpaceError(
                 f"{path}: expected a dtype of {', '.join(ROS_TYPES)}, found {dtype.str} ({dtype.name})"
             )
-        # As Gymnasium's own samples are: an integer or bool Box rounds, which turns a 0-d array to a scalar.
+        # Types of Gymnasium's samples: a Box of integers or bools rounds, which turns a 0-d array into a scalar.
         is_array = type(space) is spaces.MultiBinary or (type(space) is spaces.Box and dtype.kind == "f")
         if wide is not None:
             if wide not in ROS_TYPES:
@@ -61,7 +61,7 @@ class Leaf:
         return math.prod(self.shape)
 
     def to_bytes(self) -> Callable[[Any], bytes]:
-        """A function from a value to its little-endian bytes, or to a StepError without the path."""
+        """A function that turns a value into little-endian bytes, or raises a StepError without the path."""
         dtype, shape, array = self.dtype, self.shape, np.ndarray
         scalar = dtype.type if shape == () and dtype.isnative else None
 
@@ -77,7 +77,7 @@ class Leaf:
         return array[0] if self.scalar else array.reshape(self.shape)
 
     def split(self, array: np.ndarray[Any, Any], number: int) -> tuple[Any, ...]:
-        """The items of a Sequence whose elements lie in a row."""
+        """The items of a Sequence, whose elements follow each other in `array`."""
         if self.shape == () and not self.scalar:
             return tuple([array[i : i + 1].reshape(()) for i in range(number)])
         return tuple(array.reshape(number, *self.shape))
@@ -102,7 +102,7 @@ def numeric(leaf: Leaf) -> Codec:
 
 
 def numeric_items(leaf: Leaf) -> Codec:
-    """A tuple of arrays or scalars, their elements in a row."""
+    """A tuple of arrays or scalars, whose elements follow each other."""
     dtype, count, itemsize = leaf.dtype, leaf.count, leaf.dtype.itemsize
     to_bytes = leaf.to_bytes()
 
@@ -189,11 +189,11 @@ def text() -> Codec:
 
 
 def expect_tuple(value: Any) -> None:
-    """StepError unless `value` is a tuple: a list would come back as one."""
+    """Raises StepError unless `value` is a tuple: a list would be read back as one."""
     if not isinstance(value, tuple):
         raise StepError(f": expected a tuple, found {shorten(value)}")
 
 
 def exact_bytes(value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    """The little-endian bytes of a value that need not be of this dtype, or StepError."""
+    """The little-endian bytes of a value, cast to `dtype`; raises StepError if the cast is not exact."""
     return exact_array(value, dtype, shape, "").tobytes()

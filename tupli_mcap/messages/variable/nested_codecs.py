@@ -1,6 +1,6 @@
-"""How values made of other values are written and read: Dict, Tuple, Sequence, Graph and OneOf.
+"""Writes and reads values made of other values: Dict, Tuple, Sequence, Graph and OneOf.
 
-A StepError grows on its way up: each level puts its own step of the path before the message.
+Each level puts its part of the path before the message of a StepError from below.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Step = tuple[Any, str, Encode]  # key, its path, its encoder
 
 
 def encode_dict(steps: Sequence[Step]) -> Encode:
-    """Entries in the order of the space, whatever the order of the value."""
+    """Encodes entries in the order of the space; the value's order does not matter."""
     keys = [key for key, _, _ in steps]
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
@@ -74,7 +74,7 @@ def decode_tuple(decoders: Sequence[Decode]) -> Decode:
 
 
 def items_of(codec: Codec) -> Codec:
-    """A tuple of as many values as there are, each a message or a string."""
+    """A tuple of any number of values, each a message or a string."""
     put, get = codec.encode, codec.decode
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
@@ -88,7 +88,7 @@ def items_of(codec: Codec) -> Codec:
 
     def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
         number, offset = cdr.read_length(data, offset, origin)
-        if number > len(data) - offset:  # an item takes a byte at least
+        if number > len(data) - offset:  # each item takes at least one byte
             raise FormatError(f"expected {number} items at offset {offset}, found {len(data) - offset} bytes")
         values = []
         for _ in range(number):
@@ -101,9 +101,9 @@ def items_of(codec: Codec) -> Codec:
 
 @dataclass(frozen=True)
 class Maybe:
-    """A value that may be missing: something else in the message says whether it is there.
+    """A value that may be missing: another field of the message says whether it is there.
 
-    `codec` writes a value that is there, `skip` writes a missing one and `miss` reads it.
+    `codec` writes and reads a value, `skip` writes a missing one, `miss` reads a missing one.
     """
 
     codec: Codec
@@ -138,7 +138,7 @@ def _miss_array(data: memoryview, offset: int, origin: int) -> int:
 
 
 def _counted(codec: Codec) -> Codec:
-    """A value of a fixed number of elements (a message is one) as a sequence, which may also be empty."""
+    """A value of a fixed number of elements (a message is one) as a sequence, so that it can be empty."""
     put, get, count = codec.encode, codec.decode, codec.count
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
@@ -187,7 +187,7 @@ def decode_graph(nodes: Codec, edges: Maybe | None, links: Maybe) -> Decode:
 
 
 def _encode_maybe(maybe: Maybe, value: Any, out: bytearray, origin: int) -> None:
-    """A boolean, and the value; None and an empty array are not the same graph."""
+    """A boolean, then the value: None and an empty array differ."""
     if value is None:
         out += b"\0"
         maybe.skip(out, origin)
@@ -243,7 +243,7 @@ def decode_one_of(options: Sequence[Maybe]) -> Decode:
 
 
 def with_dummy(encode: Encode, decode: Decode) -> tuple[Encode, Decode]:
-    """For a message without fields, which CDR does not have: one byte."""
+    """Adds one byte to a message without fields, which CDR cannot have."""
 
     def encode_byte(value: Any, out: bytearray, origin: int) -> None:
         encode(value, out, origin)

@@ -1,7 +1,7 @@
-"""Which dtypes store the numbers inside a value of variable size, where an environment strays from its space.
+"""Finds the numbers inside a value of variable size that need a wider dtype than their space declares.
 
 A path starts after the value itself: `[]` is an item of a Sequence, `['a']` an entry of a Dict, `[1]` one of
-a Tuple or an option of a OneOf; `.nodes`, `.edges` and `.edge_links` are of a Graph.
+a Tuple or an option of a OneOf; `.nodes`, `.edges` and `.edge_links` are parts of a Graph.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.spaces.exact import decide_dtype
 from tupli_mcap.spaces.leaves import Leaf
 
-EDGE_LINKS = np.dtype(np.int32)  # as Gymnasium samples them; the space does not say
+EDGE_LINKS = np.dtype(np.int32)  # of Gymnasium's samples; a Graph space declares none
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def variable_dtypes(space: gym.Space[Any], values: Sequence[Any], path: str) -> dict[str, str]:
     """Return path and dtype name of the leaves that `values` (a recording's first) need wider than declared.
 
-    `path` names the value in warnings; there is one for each leaf. Values of another structure count for
-    nothing here: they are refused when they are stored.
+    Each such leaf gets a warning, in which `path` names the value. Values of another structure are ignored here and
+    refused when they are stored.
 
     Raises:
         StepError: a leaf has values of a dtype no message can hold.
