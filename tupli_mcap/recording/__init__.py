@@ -1,15 +1,15 @@
 """One recording, one `.mcap` file: written, appended to, read, recovered, rewritten.
 
-recording, episode, frames    `Recording`, and what it gives; `verbs` are those it shares with a dataset
-opened, contents              what `Recording` is built on: an open file, and everything that is known of it then
-index, limits                 the episode index, and whether it can be true
+recording, episode, frames    `Recording`, its episodes and frames; `verbs` are the methods it shares with a dataset
+opened, contents              an open file, and its contents from the summary or from recovery
+index, limits                 the episode index, and its checks against the file's size
 channels                      the channels that a layout needs
-description, series           what `info` shows
+description, series           the facts that `info` shows
 blocks                        whole episodes in bounded memory
-signature_file                the attachment that a signature is
-about/                        what is said of the run, and of episodes afterwards
-columns/, recover/            from rows to columns; from what a killed process left to episodes
-write/, edit/, check/, sign/  new recordings; out of others; whether they are right; who vouches for them
+signature_file                the attachment with a signature
+about/                        runs, annotations, success of episodes
+columns/, recover/            turns rows into columns; turns what a killed process left into episodes
+write/, edit/, check/, sign/  makes recordings; makes them of others; verifies them; signs them
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
-# Imported on first use: who records or reads needs none of them.
+# Imported on first use: recording and reading need none of them.
 _HOMES = {
     "check.report": "Problem VerifyReport",
     "check.verify": "verify_recording",

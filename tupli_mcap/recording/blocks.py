@@ -15,7 +15,7 @@ from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
 
 BLOCK_BYTES = 8 << 20
-_VARIABLE_STEP_BYTES = 2048  # a guess, for steps of variable size
+_VARIABLE_STEP_BYTES = 2048  # assumed for a step of variable size
 _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
 
 
@@ -23,10 +23,14 @@ _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
 class Block:
     """Consecutive steps of some episodes.
 
-    positions: of the episodes, in the recording. rows: their index rows. lengths: how many steps of each are here
-    (int64). first_step: where the block begins in its first episode; other than 0 only if it is the one episode of
-    the block. whole: the block holds its episodes to their ends. finals: the final states, by leaf name, of the
-    episodes `finals_of` (places in `rows`) that end in this block; empty if none is known.
+    Attributes:
+        positions: of the episodes in the recording.
+        rows: the index rows of the episodes.
+        lengths: steps of each episode in this block, int64.
+        first_step: step of the first episode at which the block begins; not 0 only if the block has one episode.
+        whole: the block holds its episodes to their ends.
+        finals: by leaf name, the known final states of the episodes that end in this block.
+        finals_of: the episodes of `finals`, as indexes in `rows`.
     """
 
     layout: StepLayout
@@ -44,7 +48,7 @@ class Block:
 
     @cached_property
     def leaves(self) -> dict[str, Any]:
-        """The columns by leaf name: an array (steps, *shape), or a list where a leaf is of variable size."""
+        """The columns by leaf name: an array (steps, *shape), or a list for a leaf of variable size."""
         groups = (
             (self.layout.state, self.columns.states),
             (self.layout.action, self.columns.actions),
@@ -63,7 +67,7 @@ class Block:
         return np.cumsum(self.lengths) - 1
 
     def place(self, step: int) -> tuple[int, int]:
-        """The episode's number and the step in it, of a step of the columns."""
+        """The number of the episode that a step of the columns belongs to, and its step there."""
         at = int(np.searchsorted(self.starts, step, side="right")) - 1
         return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
 
@@ -122,7 +126,7 @@ def _block(
 
 
 def step_bytes(layout: StepLayout, *, images: bool = True) -> int:
-    """What a step takes, at least; of variable size, a guess."""
+    """Bytes that a step takes at least; an assumed number if its size varies."""
     if not layout.constant:
         return _VARIABLE_STEP_BYTES
     return layout.step_message.record_size + (sum(leaf.size for leaf in layout.images) if images else 0)

@@ -38,12 +38,17 @@ def register_channels(
 ) -> Channels:
     """Adds the channels a layout needs, or finds them in a recording that is appended to.
 
-    `sub_environments` is None for a single environment; `info` is the schema and the metadata of `/info`.
-    `cameras` are names; the ids of the last one's channels are returned. `png` are the image leaves that are stored as
-    PNG, by name.
+    Args:
+        container: of the file.
+        name: of the recording, for errors.
+        layout: of its messages.
+        sub_environments: how many; None for a single environment.
+        info: schema and metadata of `/info`; None without infos.
+        cameras: names. The returned ids are those of the last one.
+        png: names of image leaves that are stored as PNG.
 
     Raises:
-        RecordingError: a channel of that topic has another schema.
+        RecordingError: a channel with one of the topics has another schema.
     """
     channel, description = _Registrar(container, name).channel, layout.to_metadata()
     environments = [Topics.of(i) for i in ([None] if sub_environments is None else range(sub_environments))]

@@ -26,7 +26,10 @@ CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
 _VERSIONS = ("1", "2")
-_KEYS = {"image": "leaf", "frame": "camera"}  # of the metadata of such a channel: of what it is
+_KEYS = {
+    "image": "leaf",
+    "frame": "camera",
+}  # kind of a channel -> key of its metadata that has the name in its topic
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),
@@ -35,23 +38,26 @@ _VALUES = (
 
 
 class NewerVersionError(FormatError):
-    """A recording of a format that this version of the package does not know: nothing in it can be judged."""
+    """The recording has a format that this version of the package does not know, so that it cannot check it."""
 
 
 @dataclass
 class Contents:
-    """What the summary says of a finished file, or recovery of another.
+    """The contents of a recording: from the summary of a finished file, else from recovery.
 
     Attributes:
         metadata: of the recording, undamaged.
-        schemas, channels: by id. attachments: by name, without the episode index.
-        metadata_indexes: where the metadata records are.
-        table: the chunks (CHUNK_ROWS), those in `memory` with offsets from IN_MEMORY on.
-        memory: the bytes of rows that are in no chunk of the file. tail: the same as the writer takes them.
+        schemas, channels: by id.
+        attachments: by name, without the episode index.
+        metadata_indexes: offsets of the metadata records.
+        table: the chunks (CHUNK_ROWS); those in `memory` have offsets from IN_MEMORY on.
+        memory: the bytes of rows that are in no chunk of the file.
+        tail: the same rows, as a writer takes them.
+        index: the episode index.
         complete: the writer finished the file.
-        data_end: the offset where the episode index begins, or what a writer that goes on cuts off.
+        data_end: the offset where the episode index begins; a writer that appends cuts the file there.
         undefined: the channels that only the journal defines.
-        used_episodes: a number beyond those of episodes whose steps, or ends, are lost.
+        used_episodes: a number above those of episodes whose steps or ends are lost.
     """
 
     metadata: dict[str, str]
@@ -72,7 +78,7 @@ class Contents:
 
     @property
     def next_episode(self) -> int:
-        """The number of the next episode: no number is given twice, not even one that was left out in rewriting."""
+        """The number of the next episode. No number is used twice, not even that of an episode that was left out."""
         told = self.metadata.get("next_episode", "0")
         numbers = self.index.episodes["episode"]
         free = max(self.used_episodes, int(numbers.max()) + 1 if len(numbers) else 0)
@@ -104,7 +110,7 @@ def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
 
 
 def _check_place(channel: Channel, topic: Topic, name: str) -> None:
-    """Raises FormatError unless the metadata of a channel of images or frames says the place that its topic says."""
+    """Raises FormatError unless a channel's metadata name the sub-environment, and leaf or camera, of its topic."""
     expected = {"env": str(topic.env), _KEYS[topic.kind]: topic.name}
     told = {key: channel.metadata.get(key) for key in expected}
     if told != expected:
@@ -114,7 +120,7 @@ def _check_place(channel: Channel, topic: Topic, name: str) -> None:
 
 
 def is_ours(topic: str) -> bool:
-    """Whether the metadata of a channel of that topic are ours."""
+    """Whether the specification defines metadata for channels of that topic."""
     if topic in (FINAL_STATE, INFO):
         return True
     place = parse(topic)
@@ -122,7 +128,12 @@ def is_ours(topic: str) -> bool:
 
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
-    """The metadata without its checksum; FormatError unless it is whole, and of a format this version reads."""
+    """The metadata of a recording without `crc`.
+
+    Raises:
+        FormatError: they are damaged or incomplete.
+        NewerVersionError: this version of the package does not know the format.
+    """
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     check_version(metadata, source.name)
     for key, what, pattern in _VALUES:
@@ -132,8 +143,7 @@ def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
 
 
 def check_version(metadata: Mapping[str, str], name: str) -> None:
-    """Raises NewerVersionError unless this version of the package knows the format of a recording with these metadata,
-    which are undamaged."""
+    """Raises NewerVersionError unless this package knows the format that these (undamaged) metadata name."""
     version = metadata.get("format_version")
     if version not in _VERSIONS:
         known = " or ".join(map(repr, _VERSIONS))

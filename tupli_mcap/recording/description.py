@@ -30,9 +30,9 @@ _MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each
 
 
 class Spread(NamedTuple):
-    """Of one number an episode: mean, population standard deviation, smallest, largest.
+    """Mean, population standard deviation, minimum and maximum of one number of each episode.
 
-    They are those of the others where `nan` of the episodes have no number; NaN where none has one.
+    `nan` episodes have no number and are left out; if none has a number, all are NaN.
     """
 
     mean: float
@@ -43,7 +43,7 @@ class Spread(NamedTuple):
 
 
 class ChannelFacts(NamedTuple):
-    """A channel: `size` is what its messages take in memory, `stored` in the file (bytes)."""
+    """A channel: its messages take `size` bytes in memory, `stored` bytes in the file."""
 
     topic: str
     schema: str
@@ -54,18 +54,22 @@ class ChannelFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordingDescription:
-    """Facts about a recording; spaces and spreads are None where there is no step or no episode.
+    """Facts about a recording. Spaces are None without a step, spreads are None without an episode.
 
-    state: as `state_of` says.
-    size: bytes of the file. created_ns, start_ns, end_ns: wall clock; the latter two are 0 without
-        an episode.
-    compression: bytes of messages for one byte of chunks in the file; None without a chunk.
-    ends: episodes by how they ended. environment: the name that its run says, else its benchmark; None if none does.
-    run: what is known of the run, or of the first one. runs: `name` and number of `episodes` of each.
-    made_of: of which recordings it was made; None if it was recorded.
-    metadata_keys: those that episodes have. success: see `success_rate`.
-    observation, action: their spaces in lines for people, see `space_lines`; empty where there is no step.
-    signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
+    Attributes:
+        state: see `state_of`.
+        size: of the file (bytes).
+        created_ns, start_ns, end_ns: wall clock; the latter two are 0 without an episode.
+        environment: the name in its run, else in its benchmark; None if neither has one.
+        signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
+        run: the parts of its run, or of the first one, that are known.
+        runs: `name` and number of `episodes` of each run.
+        made_of: the recordings it was made of; None if it was recorded.
+        metadata_keys: keys of the episodes' metadata.
+        success: see `success_rate`.
+        ends: number of episodes by how they ended.
+        observation, action: their spaces in lines for people, see `space_lines`; empty without a step.
+        compression: bytes of messages for one byte of chunks in the file; None without a chunk.
     """
 
     name: str
@@ -100,9 +104,10 @@ class RecordingDescription:
 
 
 def describe(recording: Recording, positions: Array | None = None) -> RecordingDescription:
-    """The facts; only the summary, the episode index and attachments such as `benchmark.json` are read.
+    """Describes a recording from its summary, its episode index and attachments such as `benchmark.json`.
 
     Args:
+        recording: an open one.
         positions: of the episodes that count for times, ends, steps, lengths, returns, success and metadata keys; all
             by default. Other facts are those of the whole file.
 
@@ -151,8 +156,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
 
 
 def state_of(recording: Recording) -> str:
-    """ "complete"; "recording", while a writer is at work; "recovered": its writer did not finish it, what chunks and
-    journal hold is there; or "incomplete": the journal is missing, too."""
+    """The state of the file: "complete"; "recording" while a writer works on it; "recovered" if its writer did not
+    finish it and its journal is there; "incomplete" if its journal is missing."""
     if recording.complete:
         return "complete"
     path = recording.path
@@ -183,14 +188,14 @@ def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
 
 
 def success_rate(recording: Recording, positions: Array) -> float | None:
-    """The share of some episodes that succeeded, among those whose metadata say `success` or `is_success`; None if none
-    do."""
+    """The share of episodes that succeeded, among those whose metadata have `success` or `is_success`; None if none
+    have."""
     said = successes(recording, positions)
     return sum(said) / len(said) if said else None
 
 
 def successes(recording: Recording, positions: Array) -> list[bool]:
-    """Whether episodes succeeded: those of some whose metadata say `success` or `is_success`."""
+    """Whether each episode succeeded; episodes whose metadata have neither `success` nor `is_success` are left out."""
     texts = recording.all_metadata()
     said = []
     for i in positions.tolist():
@@ -203,7 +208,7 @@ def successes(recording: Recording, positions: Array) -> list[bool]:
 
 
 def describe_space(space: gym.Space[Any]) -> str:
-    """A space in one line: `Box(-inf, inf, (4,), float32)`; bounds that differ are given as their range."""
+    """A space in one line: `Box(-inf, inf, (4,), float32)`; bounds that differ are shown as their range."""
     if isinstance(space, gym.spaces.Box):
         low, high = _bound(space.low), _bound(space.high)
         return f"Box({low}, {high}, {space.shape}, {space.dtype})"
@@ -217,9 +222,9 @@ def describe_space(space: gym.Space[Any]) -> str:
 
 
 def space_lines(leaves: Sequence[Leaf], labels: Labels) -> list[str]:
-    """A space in lines: what each leaf is, and below it each dimension with its bounds, where they differ.
+    """A space in lines: one for each leaf, and below it one for each dimension if their bounds differ.
 
-    Such as `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`.
+    For example `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`.
     """
     return [line for leaf in leaves for line in _leaf_lines(leaf, labels)]
 
@@ -251,7 +256,7 @@ def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
 
 
 def _is_unbounded(leaf: Leaf, low: Any, high: Any) -> bool:
-    """Whether the bounds say no more than the dtype; those of bytes are worth saying."""
+    """Whether the bounds are those of the dtype; False for uint8 and int8, whose bounds are always shown."""
     dtype = np.dtype(leaf.dtype)
     if dtype.kind == "f":
         return bool(low == -np.inf and high == np.inf)
@@ -278,7 +283,7 @@ def _bound(values: np.ndarray[Any, Any]) -> str:
 
 
 def spread_of(values: np.ndarray[Any, Any]) -> Spread | None:
-    """The spread of one number an episode; None without an episode."""
+    """The spread of one number of each episode; None without an episode."""
     if len(values) == 0:
         return None
     numbers = values.astype(np.float64)
@@ -290,7 +295,7 @@ def spread_of(values: np.ndarray[Any, Any]) -> Spread | None:
 
 
 def nan_text(count: int, episodes: int) -> str:
-    """How many of the episodes have NaN for a number, as words; empty if none has."""
+    """Says for people how many of the episodes have NaN; empty if none has."""
     if not count:
         return ""
     return (
@@ -312,10 +317,10 @@ def _channels(contents: Contents) -> list[ChannelFacts]:
 
 
 def claimed_signer(recording: Recording) -> str | None:
-    """The fingerprint of the key that a recording says has signed it, unchecked; None if it is not signed.
+    """The fingerprint of the key that a recording's signature names, unchecked; None if it is not signed.
 
     Raises:
-        FormatError: its signature is no signature.
+        FormatError: the signature cannot be decoded.
     """
     if SIGNATURE_NAME not in recording.attachments:
         return None

@@ -1,4 +1,4 @@
-"""An episode as it is read: columns on access, steps when iterated."""
+"""`Episode` and its steps: columns are read on access, steps on iteration."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Step(_Step, SaysWhatIsMeant):
     """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded.
 
     Attributes:
-        env: the sub-environment that took it, 0 for a single one; no part of the tuple.
+        env: the sub-environment that took the step, 0 for a single one; not part of the tuple.
     """
 
     env: int = 0
 
 
 class Described(Protocol):
-    """What knows the metadata of an episode."""
+    """Knows the metadata of an episode."""
 
     metadata: dict[str, Any]
 
@@ -60,7 +60,7 @@ class Episode(GymnasiumNames):
         self._position = position
         self._row = recording.index[position]
         self.listed: Described | None = None
-        """What a dataset lists of it, whose metadata follow annotations."""
+        """The dataset's entry of this episode; its metadata follow later annotations."""
 
     def __len__(self) -> int:
         return int(self._row["length"])
@@ -70,11 +70,11 @@ class Episode(GymnasiumNames):
     @overload
     def __getitem__(self, steps: slice) -> Columns: ...
     def __getitem__(self, steps: int | slice) -> Step | Columns:
-        """A step, or the columns (without `next_states`) of some consecutive ones; only their rows are copied.
+        """One step, or the columns (without `next_states`) of consecutive steps; only their rows are copied.
 
         Raises:
             IndexError: there is no such step.
-            RecordingError: it is no number, and no slice of consecutive steps.
+            RecordingError: `steps` is neither a number nor a slice of consecutive steps.
         """
         if isinstance(steps, int | np.integer) and not isinstance(steps, bool):
             return self._step(int(steps))
@@ -95,7 +95,7 @@ class Episode(GymnasiumNames):
         return next(self._steps(self[number : number + 1], infos))
 
     def __eq__(self, other: object) -> bool:
-        """Whether it is the same episode, however it was opened."""
+        """Whether it is the same episode of the same recording, opened in any way."""
         return isinstance(other, Episode) and self.id == other.id
 
     def __hash__(self) -> int:
@@ -143,12 +143,12 @@ class Episode(GymnasiumNames):
 
     @property
     def run(self) -> Run:
-        """The run it is of."""
+        """Its run."""
         return self._recording.run_of(self._position)
 
     @cached_property
     def metadata(self) -> dict[str, Any]:
-        """What the metadata callback returned last, updated by annotations."""
+        """The metadata: what the metadata callback last returned, with annotations applied."""
         return self._recording.episode_metadata(self._position)
 
     def annotate(self, **values: Any) -> None:
@@ -193,7 +193,7 @@ class Episode(GymnasiumNames):
 
     @property
     def all_states(self) -> Any:
-        """The states, and behind them the final state where it is known: one more than there are steps."""
+        """The states, followed by the final state if it is known: then one more than there are steps."""
         if self._row["final_row"] < 0:
             return self.states
         layout, finals = self._recording.layout, self._recording.final_states([self._position])
@@ -228,17 +228,17 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def final_state(self) -> Any:
-        """The observation after the last step; None if it is not known (episodes built by hand)."""
+        """The observation after the last step; None if it is not known (imported episodes, for example)."""
         return self._recording.final_state(self._position)
 
     @cached_property
     def infos(self) -> list[dict[str, Any] | None] | None:
-        """The recorded info of each step (None for a step without); None if the recording has no infos."""
+        """The recorded info of each step (None for a step without one); None if the recording has no infos."""
         return self._recording.infos(self._position)
 
     @property
     def tuples(self) -> list[RLTuple]:
-        """The steps as PyTupli's tuples; the info is empty where none was recorded."""
+        """The steps as PyTupli's tuples; the info is empty if none was recorded."""
         return [RLTuple.from_env_step(*step[:5], step.info or {}) for step in self]
 
     @property
@@ -247,10 +247,10 @@ class Episode(GymnasiumNames):
         return self._position
 
     def to_rerun(self, stream: Any = None) -> Any:
-        """Sends the episode and a blueprint into a `rerun.RecordingStream`, by default a new one; returns it.
+        """Sends the episode and a blueprint to a `rerun.RecordingStream`, by default a new one; returns the stream.
 
-        Its steps are numbered from 0, so give each episode a stream of its own; `tupli_mcap.viewer.send` sends several
-        into one, after each other.
+        Steps are numbered from 0, so give each episode its own stream; `tupli_mcap.viewer.send` sends several episodes
+        to one stream, one after the other.
 
         Raises:
             MissingExtraError: rerun-sdk is not installed.
@@ -269,7 +269,7 @@ class Episode(GymnasiumNames):
     ) -> Film:
         """A film of recorded pictures (frames, or an image of the states), which a notebook shows; nothing is executed.
 
-        `episode.video("best.mp4")` writes it, too. See `tupli_mcap.replay.film` for the arguments and errors.
+        `episode.video("best.mp4")` also writes it. See `tupli_mcap.replay.film` for the arguments and errors.
         """
         from tupli_mcap.replay import film
 
@@ -277,7 +277,7 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def frames(self) -> Frames:
-        """The recorded pictures, of the camera "render" or else the first one; empty if none were recorded.
+        """The recorded pictures of the camera "render", or else of the first one; empty if none were recorded.
         `frames.steps` says which states they show."""
         return self._recording.frames(self._position)
 
@@ -319,14 +319,14 @@ class Episode(GymnasiumNames):
 
 
 def reward_getter(space: Any, column: Any) -> Any:
-    """A function from a step's index to its reward: a Python number where it is a scalar."""
+    """A function from a step's index to its reward: a Python number if it is a scalar."""
     if isinstance(column, np.ndarray):
         return lambda i: column[i].item() if column.ndim == 1 else column[i]
     return item_getter(space, column)
 
 
 def item_getter(space: Any, columns: Any) -> Any:
-    """A function from a step's index to its value, of the type the space's own samples have."""
+    """A function from a step's index to its value, with the type of the space's own samples."""
     from gymnasium import spaces
 
     if type(space) is spaces.Dict:

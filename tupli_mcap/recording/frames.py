@@ -1,4 +1,4 @@
-"""The recorded frames of an episode, as they are read: each is decoded when it is asked for."""
+"""The recorded frames of an episode; each is decoded on access."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
 
 class _Table(NamedTuple):
-    """What the rows of a camera's channel show: `rows` is sorted by episode, then by row."""
+    """The episodes and steps that the rows of a camera show: `rows` is sorted by episode, then by row."""
 
     episodes: Array
     steps: Array
@@ -41,7 +41,7 @@ class _Table(NamedTuple):
 
 
 class Cameras:
-    """The cameras of a recording. No frame is read before it is asked for.
+    """The cameras of a recording. Frames are read on access.
 
     Raises:
         FormatError: a camera's channel is missing or has another schema.
@@ -83,7 +83,7 @@ class Cameras:
         return self._channels[camera, env]
 
     def rows(self, camera: str, env: int, episode: int, length: int) -> tuple[Array, Array, Array]:
-        """(rows, steps, log_times) of an episode's frames; those of steps that are not there are left out."""
+        """(rows, steps, log_times) of an episode's frames; frames of steps that are missing are left out."""
         table = self._table(camera, env)
         low, high = np.searchsorted(table.episodes, [episode, episode + 1])
         kept = slice(int(low), int(high))
@@ -102,7 +102,7 @@ class Cameras:
     def _table(self, camera: str, env: int) -> _Table:
         if (camera, env) not in self._tables:
             pictures, pairs = self.channels(camera, env)
-            # a writer that is at work may have moved one of them to the file, and not yet the other
+            # a live writer may have moved one of them to the file, and not yet the other
             count = min(self._store.count(pictures), self._store.count(pairs))
             self._store.fetch(span.chunk for span in self._store.spans(pairs, 0, count))
             parts = [
@@ -117,11 +117,11 @@ class Cameras:
 
 
 class Frames(Sequence[Picture]):
-    """The frames of one episode, in order; `frames[i]` is decoded from the file whenever it is asked for.
+    """The frames of one episode, in order; each access to `frames[i]` decodes it from the file.
 
     Attributes:
-        steps: int64, what each frame shows: the state after so many steps of the episode (0: after the reset).
-        times: int64, when each was rendered (ns).
+        steps: int64; a frame shows the state after this many steps of the episode (0: after the reset).
+        times: int64; when each frame was rendered (ns).
     """
 
     def __init__(
@@ -142,10 +142,10 @@ class Frames(Sequence[Picture]):
     @overload
     def __getitem__(self, i: slice) -> Frames: ...
     def __getitem__(self, i: int | slice) -> Picture | Frames:
-        """uint8, height x width x 3.
+        """The picture: uint8 (height, width, 3).
 
         Raises:
-            MissingExtraError: Pillow is not installed; `encoded` does without it.
+            MissingExtraError: Pillow is not installed; `encoded` does not need it.
             FormatError: the bytes are no picture.
         """
         if isinstance(i, slice):
@@ -161,7 +161,7 @@ class Frames(Sequence[Picture]):
         return self._recording.file.cameras.frame(self.camera, self._env, int(self._rows[i]))
 
     def of_step(self, step: int) -> Picture:
-        """The frame of the state after `step` steps; RecordingError if it was not recorded."""
+        """The frame of the state after `step` steps; raises RecordingError if it was not recorded."""
         found = np.flatnonzero(self.steps == step)
         if not len(found):
             told = ", ".join(map(str, self.steps[:8].tolist())) + (", ..." if len(self) > 8 else "")
@@ -181,10 +181,11 @@ def gathered(parts: Iterable[tuple[Frames, Array, Array]], total: int) -> Array:
     """The frames of some steps as one column: uint8 (total, height, width, 3).
 
     Args:
-        parts: of each episode its frames, and of which states they are wanted, as in `of_step`, at which places.
+        parts: for each episode its frames, the wanted steps as in `of_step`, and their places in the column.
+        total: length of the column.
 
     Raises:
-        RecordingError: one was not recorded, or they differ in size.
+        RecordingError: a frame was not recorded, or frames differ in size.
     """
     column: Array = np.empty((0, 0, 0, 3), np.uint8)
     for frames, steps, places in parts:

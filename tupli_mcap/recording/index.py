@@ -1,6 +1,6 @@
-"""The episode index: the last attachment of a recording, one fixed-size row an episode and one a chunk.
+"""The episode index: the last attachment of a recording, with one fixed-size row for each episode and each chunk.
 
-The metadata texts lie beside the rows and are read only when asked for.
+The metadata texts lie beside the rows and are parsed on access.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _HEAD = struct.Struct("<8sQQQ")
 _MAGIC = b"TMIDX\0\0\1"
 _SIZE = struct.Struct("<Q")
 _MAX_METADATA = 1 << 26
-# Rows differ, in the numbers of episodes and the checksums of chunks: they compress far less than this.
+# Rows differ in the numbers of episodes and the checksums of chunks, and compress far less than this.
 _MAX_ROW_RATIO = 256
 
-NO_SEED, HAS_SEED, LARGE_SEED = range(3)  # `has_seed`: a large one is in `/episode_start`, and here it is 0
+NO_SEED, HAS_SEED, LARGE_SEED = range(3)  # `has_seed`: a large seed is in `/episode_start`, and 0 here
 
 EPISODE_ROWS = np.dtype(
     [
@@ -37,7 +37,7 @@ EPISODE_ROWS = np.dtype(
 
 
 class EpisodeRow(NamedTuple):
-    """One row; `start_row`, `end_row` and `final_row` (-1: none) count in the three episode channels."""
+    """One row; `start_row`, `end_row` and `final_row` (-1: none) are rows of the three episode channels."""
 
     first_row: int
     length: int
@@ -64,7 +64,7 @@ def indexed_seed(seed: int | None) -> tuple[int, int]:
 
 
 class IndexBuilder:
-    """Collects rows while recording: 96 bytes an episode, plus its metadata text."""
+    """Collects rows while recording: 96 bytes for each episode, plus its metadata text."""
 
     def __init__(self) -> None:
         self.rows = bytearray()
@@ -95,7 +95,7 @@ class IndexBuilder:
                 first_row, length, total, start_time, end_time, indexed, start_row, end_row,
                 final_row, len(self.metadata), len(text), number, env, end, has_seed,
             )  # fmt: skip
-        except struct.error as err:  # only what was read from a damaged journal
+        except struct.error as err:  # values from a damaged journal
             raise FormatError(
                 f"episode {number}: expected times before 2^63 ns, and numbers that fit the index, found a start at "
                 f"{start_time} and an end at {end_time} ns: a clock was set wrong, or the journal is damaged ({err})"
@@ -109,7 +109,7 @@ class IndexBuilder:
         self.count += len(episodes)
 
     def encode(self, chunk_rows: bytes | bytearray) -> bytes:
-        """The attachment's bytes, episodes in the order of their numbers."""
+        """The attachment's bytes, with episodes in the order of their numbers."""
         rows = np.frombuffer(bytes(self.rows), EPISODE_ROWS)
         rows = rows[np.argsort(rows["episode"], kind="stable")]
         head = _HEAD.pack(_MAGIC, self.count, len(chunk_rows) // CHUNK_ROWS.itemsize, len(self.metadata))
@@ -126,7 +126,7 @@ def _compress(data: bytes) -> bytes:
 def _decompress(
     data: bytes, at: int, size: int, where: str, ratio: int = _MAX_ROW_RATIO
 ) -> tuple[bytes, int]:
-    """A part of `size` bytes, at most `ratio` times its compressed ones, and where the next one starts."""
+    """A part of `size` bytes, at most `ratio` times its compressed bytes, and the offset of the next part."""
     if at + _SIZE.size > len(data):
         raise FormatError(
             f"{where}: expected a part of the episode index at byte {at}, found {len(data)} bytes"

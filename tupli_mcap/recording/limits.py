@@ -1,4 +1,4 @@
-"""Checks the episode index and the chunk table against the file before anything is allocated or read by them."""
+"""Checks the episode index and the chunk table against the file before anything is allocated from them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)
 
 _U32 = 2**32 - 1
-_CHUNK_FIXED = 9 + 40  # of a Chunk record, before and after the name of its compression
+_CHUNK_FIXED = 9 + 40  # bytes of a Chunk record without the name of its compression and the compressed data
 _NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
 _RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
 
 
 def check_chunks(table: Array, end: int, name: str) -> None:
-    """Raises FormatError unless the chunks of a file's chunk table lie apart, before `end`, and can hold their rows."""
+    """Raises FormatError unless the chunks in `table` do not overlap, lie before `end`, and can hold their rows."""
     offset, length, size = table["offset"], table["length"], table["uncompressed"]
     inside = (offset >= len(MAGIC)) & (offset <= end) & (length >= _CHUNK_FIXED) & (length <= end)
     inside &= offset + length <= end  # no overflow: both are at most `end`
@@ -51,8 +51,8 @@ def check_rows(table: Array, sizes: Mapping[int, tuple[int, bool]], name: str) -
     """Raises FormatError unless the chunks of a file have the bytes that their rows take.
 
     Args:
-        table: CHUNK_ROWS that `check_chunks` has looked at.
-        sizes: by channel, the bytes of a row, and whether all have so many; otherwise none has fewer.
+        table: CHUNK_ROWS that `check_chunks` has checked.
+        sizes: by channel, bytes of a row, and whether this is exact or the least.
         name: of the file.
     """
     room = table["uncompressed"] - table["skip"]
@@ -77,11 +77,11 @@ def check_episodes(
         steps: rows of the step channel of each sub-environment.
         others: rows of each of EPISODE_TOPICS.
         name: of the file.
-        whole: whether each row of the step channels has to be of an episode.
+        whole: whether each row of the step channels must belong to an episode.
     """
     _check_places(rows, steps, others, name)
     held = int(rows["length"].sum())
-    if whole and held != sum(steps):  # episodes lie apart: no sub-environment has more than it should
+    if whole and held != sum(steps):  # episodes do not overlap, so no sub-environment can have more
         raise FormatError(
             f"{name}: the episode index gives {held} of the {sum(steps)} steps to episodes; recover it into a new file"
         )
@@ -91,7 +91,7 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
     if not len(rows):
         return
     env, first, length, start, end, final, how, numbers = (
-        np.ascontiguousarray(rows[name])  # each is looked at several times
+        np.ascontiguousarray(rows[name])  # each is used several times
         for name in ("env", "first_row", "length", "start_row", "end_row", "final_row", "end", "episode")
     )
     good = env < len(steps)
@@ -113,7 +113,7 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
             f"{name}: expected episodes in the order of their numbers, each once, in the episode index"
         )
     if ((env[1:] == env[:-1]) & (first[1:] >= (first + length)[:-1])).all():
-        return  # one after the other, as a single environment is recorded: nothing to sort
+        return  # in order, as a single environment is recorded: nothing to sort
     order = np.lexsort((first, env))
     same = env[order][1:] == env[order][:-1]
     if (same & (first[order][1:] < (first + length)[order][:-1])).any():
@@ -123,11 +123,10 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
 
 
 class StepClaims:
-    """What the episode index says of the rows of a step channel: where episodes end.
+    """Compares the rows of a step channel with the episode index. Thread-safe.
 
-    The index is held against the last row of each episode and of each chunk. Such a row says how many steps of its
-    episode came before it, so this finds every boundary that is not where the rows have it. Threads and stores may
-    share the object.
+    The last rows of episodes and of chunks are compared. Such a row says how many steps of its episode came before it,
+    so this finds every wrong boundary.
 
     Args:
         index: EPISODE_ROWS; no two episodes share a row.
@@ -140,14 +139,14 @@ class StepClaims:
 
     @cached_property
     def _claims(self) -> tuple[Array, Array, dict[int, slice]]:
-        """The rows that are looked at, counted within their chunk; the `episode` and `step` that each should say; by
-        the first row of a chunk, which of them are its.
+        """The rows to compare, counted within their chunk; the `episode` and `step` that each must have, as one number;
+        and, by the first row of a chunk, the slice of them that belongs to the chunk.
         """
         index = self._index
         mine = index["env"] == self._env
         if not mine.all():
             index = index[mine]
-        # field by field: NumPy takes far longer for rows of many fields
+        # field by field: NumPy is slow with rows of many fields
         firsts, lengths = index["first_row"].astype(np.int64), index["length"].astype(np.int64)
         episodes = index["episode"].astype(np.int64)
         if (firsts[1:] < firsts[:-1]).any():
@@ -171,15 +170,15 @@ class StepClaims:
         return rows, numbers, dict(zip(starts.tolist(), of_chunk, strict=True))
 
     def check(self, first: int, numbers_at: Callable[[Array], Array], where: str) -> None:
-        """Holds the rows of a chunk against the index.
+        """Compares the rows of a chunk with the index.
 
         Args:
             first: the number of its first row.
-            numbers_at: gives `episode` and `step` of some of its rows as one number (`<u8`); 0 is the first row.
-            where: the file, and what of it is read.
+            numbers_at: returns `episode` and `step` of some of its rows as one number (`<u8`); row 0 is the first one.
+            where: the file and the channel, for errors.
 
         Raises:
-            FormatError: a row is of another episode or step.
+            FormatError: a row belongs to another episode or step.
         """
         rows, numbers, of_chunk = self._claims
         mine = of_chunk[first]

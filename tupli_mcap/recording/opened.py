@@ -1,5 +1,4 @@
-"""Opening a recording: the file is read as far as its summary and index, or recovered in memory, and checked before
-anything is allocated."""
+"""Opens a recording: reads summary and index, or recovers it in memory, and checks them before it allocates."""
 
 from __future__ import annotations
 
@@ -43,11 +42,11 @@ from tupli_mcap.trust import TrustedKey, is_trusted
 
 CACHE_BYTES = 512 << 20
 _ATTEMPTS = 5
-_PAUSE = 0.01  # seconds: a writer begins, ends or goes on within that
+_PAUSE = 0.01  # seconds to wait for a writer that is just beginning or closing
 
 
 class AttachmentInfo(NamedTuple):
-    """What a recording says of an attachment."""
+    """An entry of the attachments in a recording's summary."""
 
     name: str
     media_type: str
@@ -55,9 +54,11 @@ class AttachmentInfo(NamedTuple):
 
 
 class OpenFile(NamedTuple):
-    """The file of an open recording, for those who copy, check or sign what is in it.
+    """The file of an open recording, for code that copies, checks or signs its contents.
 
-    topics: the id of each topic's channel. steps: the ids of the step channels, by sub-environment.
+    Attributes:
+        topics: topic -> channel id.
+        steps: ids of the step channels, by sub-environment.
     """
 
     source: Source
@@ -69,17 +70,17 @@ class OpenFile(NamedTuple):
 
 
 class RecordedBenchmark(NamedTuple):
-    """The environment a recording was made with, as data. signature: the attachment of a signed recording."""
+    """The environment of a recording, as data. `signature` is the attachment of a signed recording."""
 
     id: str
     record: EnvironmentRecord
     signature: bytes | None = None
 
     def make_env(self, *, trust: bool = False, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """Rebuilds the environment, with another `render_mode` if one is given and it has that.
+        """Rebuilds the environment; a given `render_mode` is used if the environment has it.
 
         Raises:
-            UntrustedError: code from the file would run, and neither is it trusted here, nor the key that signed it.
+            UntrustedError: code from the file would run, and this user trusts neither it nor the key that signed it.
         """
         trust = trust or (self.needs_trust and self.voucher is not None)
         return build(self.record, trust=trust, render_mode=render_mode)
@@ -96,7 +97,7 @@ class RecordedBenchmark(NamedTuple):
 
 
 class OpenedRecording:
-    """An open file whose structure is sound, and what it says of itself. The arguments are those of `Recording`."""
+    """An open file with a sound structure, and the facts in it. The arguments are those of `Recording`."""
 
     def __init__(
         self,
@@ -166,7 +167,7 @@ class OpenedRecording:
             self._columns = ColumnReader(self._layout, self._store, self._images)
 
     def _check_others(self, topics: Mapping[str, Channel]) -> None:
-        """The messages of episodes are what their topics say."""
+        """Checks the schemas of the channels of episodes."""
         for topic, name, text in (
             (EPISODE_START, START_NAME, START_SCHEMA), (EPISODE_END, END_NAME, END_SCHEMA),
         ):  # fmt: skip
@@ -174,7 +175,7 @@ class OpenedRecording:
                 self._check_schema(topics[topic], name, text)
 
     def _check_sizes(self, layout: StepLayout, steps: Sequence[int]) -> None:
-        """The chunks hold the rows that the index says, and each step has its images, before columns are allocated."""
+        """Checks that the chunks have room for the rows in the index, and that each step has its images."""
         if layout.constant:
             size = layout.step_message.record_size
         else:  # at least
@@ -196,18 +197,18 @@ class OpenedRecording:
     def _check_schema(self, channel: Channel, name: str, text: str) -> None:
         schema = self._contents.schemas.get(channel.schema_id)
         if schema is None or schema.name != name or schema.data != text.encode():
-            raise FormatError(f"{self.name}: the schema of {channel.topic} is not the one its spaces have")
+            raise FormatError(f"{self.name}: the schema of {channel.topic} is not that of its spaces")
 
     # ---- facts
 
     @property
     def uuid(self) -> str:
-        """32 hex digits, made when the recording was."""
+        """32 hex digits, made with the recording."""
         return self.metadata["uuid"]
 
     @property
     def size(self) -> int:
-        """Bytes of the file, as it was opened."""
+        """Bytes of the file when it was opened."""
         return self._source.size
 
     @property
@@ -223,7 +224,7 @@ class OpenedRecording:
 
     @property
     def layout(self) -> StepLayout:
-        """The layout of the steps; RecordingError if there is none yet."""
+        """The layout of the steps; raises RecordingError before the first step."""
         if self._layout is None:
             raise RecordingError(
                 f"{self.name} has no step yet, so its spaces are not known; record a step first"
@@ -232,22 +233,22 @@ class OpenedRecording:
 
     @property
     def observation_space(self) -> gym.Space[Any]:
-        """The space of the states, of one sub-environment; RecordingError before the first step."""
+        """The space of the states of one sub-environment; raises RecordingError before the first step."""
         return self.layout.observation_space
 
     @property
     def action_space(self) -> gym.Space[Any]:
-        """The space of the actions, of one sub-environment; RecordingError before the first step."""
+        """The space of the actions of one sub-environment; raises RecordingError before the first step."""
         return self.layout.action_space
 
     @property
     def num_envs(self) -> int:
-        """Sub-environments; 1 for a single environment."""
+        """Number of sub-environments; 1 for a single environment."""
         return len(self._step_channels)
 
     @property
     def is_vector(self) -> bool:
-        """True if a vector environment was recorded, of one sub-environment or more."""
+        """True if a vector environment was recorded, even one with a single sub-environment."""
         return Topics.of(0).step in self._topics
 
     @property
@@ -257,7 +258,7 @@ class OpenedRecording:
 
     @property
     def attachments(self) -> Mapping[str, AttachmentInfo]:
-        """The attachments, the episode index left out."""
+        """The attachments without the episode index."""
         return {
             name: AttachmentInfo(name, a.media_type, a.data_size)
             for name, a in self._contents.attachments.items()
@@ -272,7 +273,7 @@ class OpenedRecording:
 
     @property
     def labels(self) -> Labels:
-        """Names of dimensions and values, and the seconds of a step, as far as the recording says them.
+        """Names of dimensions and values, and the seconds of a step; parts that the recording lacks are empty.
 
         Raises:
             FormatError: they do not fit the recording.
@@ -310,7 +311,7 @@ class OpenedRecording:
 
     @property
     def file(self) -> OpenFile:
-        """Its channels, chunks and messages. It is closed with the recording."""
+        """Its channels, chunks and messages; closing the recording closes it."""
         return OpenFile(
             self._source, self._contents, self._store, self._topics, self._step_channels, self._cameras
         )
@@ -321,7 +322,7 @@ class OpenedRecording:
 
 
 def _stored_bytes(layout: StepLayout, leaf: Leaf) -> int:
-    """What a leaf takes in a message, at least."""
+    """Bytes that a leaf takes at least in a message."""
     return 1 if leaf.kind == "variable" else leaf.size * layout.dtypes[leaf.name].itemsize
 
 
@@ -334,14 +335,14 @@ def _absolute(source: str | os.PathLike[str]) -> str:
     return name if is_url(name) else os.path.abspath(name)  # noqa: PTH100 - links stay
 
 
-# ---- the contents: by the summary, or by recovery in memory
+# ---- the contents: from the summary, or by recovery in memory
 
 
 def read_contents(source: Source) -> Contents:
-    """Reads a finished file by its summary, another by recovery; anew if a writer changes it meanwhile.
+    """Reads the contents from the summary of a finished file, or by recovery; again if a writer changes it meanwhile.
 
     Raises:
-        FormatError: no MCAP file, no recording of ours, or damaged.
+        FormatError: the file is no MCAP file, is no recording, or is damaged.
     """
     for _ in range(_ATTEMPTS):
         size = source.size
@@ -361,11 +362,11 @@ def _read_contents(source: Source) -> Contents:
         from tupli_mcap.recording.recover.find_journal import find_journal
         from tupli_mcap.recording.recover.unfinished import recover_contents
 
-        journal = find_journal(source)  # a writer that closed in between has left a summary, and no journal
+        journal = find_journal(source)  # a writer that closed in the meantime left a summary, and no journal
         if not has_summary(source):
             return recover_contents(source, journal)
     summary = read_summary(source)
-    # the one at the end where it is there, so that all that is read here lies at the end of the file
+    # prefer the record at the end: everything read here then lies at the end of the file
     place = summary.metadata.get(REPEATED_METADATA, summary.metadata.get(RECORDING_METADATA))
     if place is None:
         raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")

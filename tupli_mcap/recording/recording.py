@@ -31,9 +31,9 @@ _THREADS = min(4, os.cpu_count() or 1)
 class Recording(DescribedRecording, DatasetVerbs):
     """An MCAP recording, open for reading.
 
-    Opening reads the summary and the episode index only. A file without a summary (its writer was killed, or is still
+    Opening reads only the summary and the episode index. A file without a summary (its writer was killed, or is still
     at work) is recovered in memory: `complete` is False, all finished steps are there, the last episode is
-    "interrupted". Nothing in the file is executed. Reading is safe from several threads.
+    "interrupted". Nothing in the file is executed. Reading is thread-safe.
 
     Args:
         source: a path, a URL (with the extra `remote`), or an open binary file.
@@ -74,10 +74,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         return iter(self.episodes)
 
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
-        """Gives episodes (their numbers; None: all) metadata that take precedence over what was recorded.
+        """Gives episodes (their numbers; None: all) metadata that take precedence over the recorded ones.
 
         Raises:
-            RecordingError: it has no path; otherwise as `annotate_episodes`.
+            RecordingError: the recording has no path. Other errors are those of `annotate_episodes`.
         """
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
@@ -95,10 +95,9 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def seeds(self) -> list[int | None]:
-        """The seed of each episode, None where it has none. Seeds beyond 64 bits are read from the starts of their
-        episodes.
+        """The seed of each episode, None if it has none. Seeds beyond 64 bits are read from the episodes' starts.
 
-        In files of earlier versions the index lacks such seeds; there, only `Episode.seed` has them.
+        The index of files from earlier versions does not mark such seeds; there, only `Episode.seed` has them.
         """
         rows = self.index
         fields = zip(rows["has_seed"].tolist(), rows["seed"].tolist(), strict=True)
@@ -124,10 +123,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         return starts
 
     def resets_before(self, i: int) -> list[EpisodeStart]:
-        """The resets without a step just before that of episode `i`, the earliest first.
+        """The resets without a step directly before that of episode `i`, the earliest first.
 
-        They are known where later resets had no seed, so that the random stream goes on from them. Where one is
-        `continued`, there was no reset: from there on, the random stream is not that of the episode before.
+        They are recorded if later resets had no seed, since the random stream then goes on from them. An entry that is
+        `continued` was no reset: it says that the random stream does not go on from the episode before.
         """
         row = self.index[i]
         found: list[EpisodeStart] = []
@@ -175,7 +174,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return self._columns
 
     def infos(self, i: int) -> list[dict[str, Any] | None] | None:
-        """The recorded infos of episode `i`, one a step; None if the recording has none."""
+        """The recorded info of each step of episode `i`; None if the recording has no infos."""
         channel = self._topics.get(INFO)
         if channel is None:
             return None
@@ -198,7 +197,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return self._cameras.names
 
     def frames(self, i: int, camera: str | None = None) -> Frames:
-        """The frames of episode `i`; none if the recording has no camera, or the episode no frames.
+        """The frames of episode `i`; empty if the recording has no camera, or the episode no frames.
 
         Args:
             camera: one of `cameras`; by default "render", or else the first one.
@@ -233,9 +232,9 @@ class Recording(DescribedRecording, DatasetVerbs):
             fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times", "infos" and
                 "frames"; the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
-            images: False reads no image of a state: the columns of image leaves are empty. Not for `next_states`.
+            images: False leaves the columns of image leaves empty and reads no image; not possible for `next_states`.
 
-        Where an episode's final state is not known, `next_states` repeats its last state.
+        If an episode's final state is not known, `next_states` repeats its last state.
         """
         fields = FIVE if fields is None else field_names(fields)
         if not images and "next_states" in fields:
@@ -275,7 +274,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return columns
 
     def _infos_of(self, i: int) -> list[dict[str, Any]]:
-        """A dict a step of episode `i`; empty where no info was recorded."""
+        """A dict for each step of episode `i`; empty if no info was recorded."""
         infos = self.infos(i)
         return (
             [{} for _ in range(int(self.index["length"][i]))]
@@ -284,7 +283,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         )
 
     def _positions(self, episodes: Any) -> Any:
-        """Positions in the index, from positions or a mask; RecordingError if they are something else."""
+        """Positions in the index, from positions or a mask; raises RecordingError for anything else."""
         try:
             chosen = np.asarray(episodes)
         except ValueError:  # values of different shapes
@@ -304,7 +303,7 @@ class Recording(DescribedRecording, DatasetVerbs):
     def read_steps(
         self, i: int, start: int, stop: int, fields: Sequence[str] = FIVE, *, images: bool = True
     ) -> Columns:
-        """Columns of the steps `start:stop` of episode `i`; the chunks they lie in stay in the cache."""
+        """Columns of the steps `start:stop` of episode `i`; their chunks stay in the cache."""
         row = self.index[i]
         count = stop - start
         if not 0 <= start <= stop <= int(row["length"]):
@@ -345,7 +344,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def stored(self) -> StoredSteps:
-        """A handle to the recording's step chunks. Raises RecordingError if there is no step yet."""
+        """A handle to the recording's step chunks; raises RecordingError before the first step."""
         finals = self._topics.get(FINAL_STATE)
         where, source = self.address, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
@@ -385,7 +384,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return plots.report(self, **options)
 
     def __reduce__(self) -> tuple[Callable[..., Recording], tuple[str, str, int]]:
-        """A copy in another process opens the file itself."""
+        """Pickles the path: a copy in another process opens the file itself."""
         if self.address is None:
             raise RecordingError(
                 f"{self.name} was opened as a file object, which cannot be copied; give its path"

@@ -1,4 +1,4 @@
-"""A recording summed up in a few short series of numbers, for `info`."""
+"""Sums a recording up in a few short series of numbers, for `info`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.spaces.leaves import Leaf
 
 READ_BYTES = 4 << 20
-"""Steps of so many bytes are read at most; of longer recordings, some at a few places."""
+"""Bytes of steps that are read at most; of longer recordings, steps at a few places are read."""
 _PLACES, _AT_EACH = 16, 256
 _VARIABLE_PLACES, _VARIABLE_AT_EACH = 8, 32  # steps of variable size are decoded one by one
 _FIELDS = ("states", "actions", "rewards")
@@ -26,11 +26,12 @@ _MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
 
 
 class Series(NamedTuple):
-    """Some numbers in their order (NaN: there is none), and what the first and the last stand for.
+    """A short series of numbers; NaN stands for a missing one.
 
-    least, most: of a course, the smallest and the largest of the numbers; of a distribution, the range of the values
-    that were counted. odd: how many values are left out, since they are not finite. each: how many episodes one number
-    is the mean of, at most.
+    Attributes:
+        least, most: of a course, the smallest and the largest number; of a distribution, the range of the values.
+        odd: number of values that are left out because they are not finite.
+        each: one number is the mean of at most this many episodes.
     """
 
     name: str
@@ -42,10 +43,14 @@ class Series(NamedTuple):
 
 
 class Sketch(NamedTuple):
-    """courses: means of consecutive episodes. distributions: counts of steps, from the least value to the most.
+    """The series of a recording.
 
-    sampled: how many steps the distributions are of. hidden: dimensions that are left out. error: why the steps could
-    not be read; empty if they could, or need not be.
+    Attributes:
+        courses: means of consecutive episodes.
+        distributions: counts of steps, from the smallest value to the largest.
+        sampled: number of steps that the distributions count.
+        hidden: number of dimensions that are left out.
+        error: why the steps could not be read; empty if there was no error.
     """
 
     courses: tuple[Series, ...]
@@ -58,7 +63,7 @@ class Sketch(NamedTuple):
 def sketch(recording: Recording, points: int, positions: Array | None = None) -> Sketch:
     """Series of at most `points` numbers, of the episodes at some positions (all by default).
 
-    A few steps are read, if the recording is a local file; no image.
+    If the recording is a local file, a few steps are read, without images.
     """
     positions = np.arange(len(recording.index)) if positions is None else positions
     rows = recording.index[positions]
@@ -71,7 +76,7 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
         return Sketch(courses, (), 0, 0)
     try:
         pieces = list(_pieces(recording, positions))
-    except TupliError as err:  # a damaged chunk hides nothing else
+    except TupliError as err:  # a damaged chunk must not hide the other series
         return Sketch(courses, (), 0, 0, str(err))
     layout = recording.layout
     shown = tuple(
@@ -102,7 +107,7 @@ def _course(name: str, values: Array, points: int) -> Series | None:
 
 
 def _pieces(recording: Recording, positions: Array) -> Iterator[Columns]:
-    """Steps of all these episodes, or some at even distances."""
+    """All steps of these episodes, or some at even distances."""
     total = int(recording.index["length"][positions].sum())
     constant = recording.layout.constant
     most = READ_BYTES // step_bytes(recording.layout, images=False)
@@ -118,7 +123,7 @@ def _pieces(recording: Recording, positions: Array) -> Iterator[Columns]:
 
 
 def _consecutive(recording: Recording, positions: Array, begin: int, stop: int) -> Iterator[Columns]:
-    """The steps `begin:stop` of these episodes, counted from one to the next."""
+    """The steps `begin:stop` of these episodes, numbered across them."""
     lengths = recording.index["length"][positions].astype(np.int64)
     ends = np.cumsum(lengths)
     first, last = np.searchsorted(ends, [begin, stop - 1], side="right").tolist()
@@ -151,12 +156,12 @@ def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
     if not len(values):
         return Series(name, (), np.nan, np.nan, odd)
     least, most = float(values.min()), float(values.max())
-    if isinstance(leaf.space, spaces.Discrete):  # values that never occur are seen, too
+    if isinstance(leaf.space, spaces.Discrete):  # values that never occur are shown, too
         least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
     bins, end = points, most
     if (
         np.array_equal(values, np.round(values)) and most - least < 2**52
-    ):  # each bin has as many whole numbers
+    ):  # each bin has the same number of whole numbers
         width = np.ceil((most - least + 1) / points)
         bins = int(np.ceil((most - least + 1) / width))
         end = least + width * bins

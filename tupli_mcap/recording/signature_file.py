@@ -1,4 +1,4 @@
-"""The attachment `signature.ed25519`: its form, and what a signature in it is good for without reading a step."""
+"""The attachment `signature.ed25519`, and the checks of a signature that need no step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from tupli_mcap.errors import FormatError
 
 SIGNATURE_NAME = "signature.ed25519"
 SIGNATURE_MEDIA_TYPE = "application/json"
-# What anybody may state about a recording at any time, so that no signature of it covers them.
+# Attachments that anybody may add at any time, so no signature covers them.
 STATEMENTS = (SIGNATURE_NAME, "replay-certificate.json")
 _MAX_BYTES = 16 << 20
-# Names what is signed, so that nobody's key can be made to sign something else that looks like a manifest.
+# Is signed with the manifest, so that no signature made for another purpose passes for one of a manifest.
 _PURPOSE = b"tupli_mcap signature v1\0"
 _HEX_KEY = r"^[0-9a-f]{64}$"
-# What an environment is rebuilt from, and what is said of runs and episodes, must be signed; other attachments may be
-# added later.
+# An environment is rebuilt from these, or they say something about runs and episodes: they must be signed. Other
+# attachments may be added later.
 _COVERED_KINDS = (
     "benchmark.json",
     "env.cloudpickle",
@@ -54,7 +54,7 @@ class Signed(NamedTuple):
         return cls(key.public_key, key.sign(_PURPOSE + canonical_json(manifest)), manifest)
 
     def fits(self) -> bool:
-        """Whether the signature is the key's, of this manifest."""
+        """Whether the key made this signature of this manifest."""
         return signing.is_signed(self.public_key, self.signature, _PURPOSE + canonical_json(self.manifest))
 
     def encode(self) -> bytes:
@@ -71,7 +71,7 @@ class Signed(NamedTuple):
 
     @classmethod
     def decode(cls, data: bytes, where: str) -> Signed:
-        """Raises FormatError if the bytes are no signature."""
+        """Parses the attachment; raises FormatError if the bytes are no signature."""
         if len(data) > _MAX_BYTES:
             raise FormatError(
                 f"{where}: expected a signature of at most {_MAX_BYTES} bytes, found {len(data)}"
@@ -91,12 +91,15 @@ class Signed(NamedTuple):
 
 
 def voucher(signature: bytes, digest: str, where: str) -> trust.TrustedKey | None:
-    """The trusted key that signed an environment, by the manifest alone; None if there is none.
+    """The trusted key that signed an environment; None if there is none. Only the manifest is checked.
 
-    signature: the attachment's bytes. digest: computed from the environment that is at hand.
+    Args:
+        signature: the attachment's bytes.
+        digest: computed from the environment that would be rebuilt.
+        where: the file, for errors.
 
     Raises:
-        MissingExtraError: there is a trusted key to ask, and the extra `sign` is not installed.
+        MissingExtraError: a trusted key would have to be checked, and the extra `sign` is not installed.
     """
     try:
         signed = Signed.decode(signature, where)
@@ -109,11 +112,11 @@ def voucher(signature: bytes, digest: str, where: str) -> trust.TrustedKey | Non
 
 
 def is_covered_kind(name: str) -> bool:
-    """Whether an attachment of that name must have been signed."""
+    """Whether a signature must cover an attachment of that name."""
     return name.startswith(_COVERED_KINDS)
 
 
 def stays_signed(present: Iterable[str], added: Iterable[str]) -> bool:
-    """Whether a signature outlives adding attachments: they replace nothing, and nothing is rebuilt from them."""
+    """Whether a signature still fits after attachments are added: they replace none, and need not be signed."""
     before = set(present).difference(STATEMENTS)
     return not any(name in before or is_covered_kind(name) for name in added)

@@ -1,4 +1,4 @@
-"""What a recording does as the dataset of its episodes does it."""
+"""The methods that a recording shares with the dataset of its episodes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class DatasetVerbs(SaysWhatIsMeant):
-    """The verbs of `Dataset`: arguments and errors are the same, and are told there."""
+    """Methods of `Dataset`, where their arguments and errors are documented."""
 
     @property
     def dataset(self) -> Dataset:
@@ -50,7 +50,7 @@ class DatasetVerbs(SaysWhatIsMeant):
 
     @property
     def keys(self) -> list[str]:
-        """What `filter`, `sort` and `split` may name."""
+        """The keys that `filter`, `sort` and `split` understand."""
         return self.dataset.keys
 
     def filter(self, test: Test) -> Dataset:
@@ -92,7 +92,7 @@ class DatasetVerbs(SaysWhatIsMeant):
         return self.dataset.stats(fields)
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
-        """A row a step, or a row an episode."""
+        """A table with a row for each step, or for each episode."""
         return self.dataset.to_pandas(level)
 
     def to_arrow(self, level: Level = "steps") -> pa.Table:
@@ -125,5 +125,5 @@ class DatasetVerbs(SaysWhatIsMeant):
         return self.dataset.trim(steps, target, overwrite=overwrite)
 
     def __add__(self, other: Recording | Dataset) -> Dataset:
-        """The episodes of both, these first."""
+        """The episodes of both, those of this recording first."""
         return self.dataset + other

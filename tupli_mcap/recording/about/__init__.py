@@ -1,7 +1,7 @@
-"""What is said of a recording beside its steps.
+"""Facts about a recording besides its steps.
 
-run          the run that it is of: name, settings, what the process was
-annotations  what somebody said about episodes afterwards
-success      whether an episode succeeded, as infos and metadata say it
+run          its run: name, settings, facts about the process
+annotations  statements about episodes, made after they were recorded
+success      whether an episode succeeded, from infos and metadata
 described    an open recording with all of these
 """

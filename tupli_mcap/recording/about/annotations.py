@@ -1,7 +1,7 @@
-"""What somebody said about episodes after they were recorded; kept as `annotations.json`.
+"""Annotations: statements about episodes, made after they were recorded; kept as `annotations.json`.
 
-Each annotation gives values to some episodes. Later ones count more than earlier ones, and all of them more than the
-metadata that were recorded. A value of null takes a key away.
+Each annotation gives values to some episodes. A later value of a key replaces an earlier one and the recorded one. A
+value of null removes the key.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_ANNOTATIONS: Final = 1 << 26  # bytes of `annotations.json`
 
 
 class Annotation(NamedTuple):
-    """`episodes` are their numbers, `by` the user's name, `at` a time (ISO 8601 in UTC)."""
+    """One statement about the episodes with these numbers, `by` a user, `at` a time (ISO 8601 in UTC)."""
 
     episodes: list[int]
     values: dict[str, Any]
@@ -41,11 +41,11 @@ class Annotations:
                 self._of_episode.setdefault(number, []).append(annotation)
 
     def of(self, episode: int) -> Sequence[Annotation]:
-        """Those of an episode (its number), the earliest first."""
+        """The annotations of the episode with this number, the earliest first."""
         return self._of_episode.get(episode, ())
 
     def applied(self, episode: int, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """An episode's metadata with what was said about it."""
+        """An episode's metadata with its annotations applied."""
         found = dict(metadata)
         for annotation in self.of(episode):
             for key, value in annotation.values.items():

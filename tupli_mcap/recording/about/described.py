@@ -1,4 +1,4 @@
-"""What is said of a recording: the runs it is of, the metadata of its episodes, and what was said of them later."""
+"""Runs of a recording, and the metadata and annotations of its episodes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class DescribedRecording(OpenedRecording):
 
     @property
     def run(self) -> Run:
-        """The run it is of; of a recording made of several, the first one. `run_of` says which an episode is of."""
+        """The run of the recording; the first one if it was made of several. `run_of` gives the run of an episode."""
         return self.runs[0]
 
     @cached_property
     def runs(self) -> list[Run]:
-        """The runs that it is of, more than one where it was made of other recordings.
+        """The runs of the episodes; several only if the recording was made of others.
 
         Raises:
-            FormatError: what it says of them is damaged.
+            FormatError: `run.json` is damaged.
         """
         rows = self.index
         ended = int(rows["end_time"].max()) if len(rows) else 0
@@ -44,7 +44,7 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def run_places(self) -> list[int]:
-        """For each episode, which of `runs` it is of."""
+        """The index in `runs` of each episode's run."""
         return self.recorded_runs.places(len(self.index))
 
     def run_of(self, i: int) -> Run:
@@ -53,7 +53,7 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def recorded_runs(self) -> RecordedRuns:
-        """`runs` as `run.json` has them: empty where the recording does not say it."""
+        """The runs as `run.json` has them; missing parts are empty."""
         info = self.attachments.get(RUN_NAME)
         if info is None:
             return RecordedRuns([Run()])
@@ -64,7 +64,7 @@ class DescribedRecording(OpenedRecording):
 
     @property
     def _environment_name(self) -> str:
-        with contextlib.suppress(TupliError):  # damaged, which opening it says
+        with contextlib.suppress(TupliError):  # whoever opens the benchmark is told of damage
             return self.benchmark.record.name
         return ""
 
@@ -92,7 +92,11 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def annotations(self) -> Annotations:
-        """What was said about its episodes after they were recorded; FormatError if that is damaged."""
+        """The annotations of its episodes.
+
+        Raises:
+            FormatError: `annotations.json` is damaged.
+        """
         info = self.attachments.get(ANNOTATIONS_NAME)
         if info is None:
             return Annotations()
@@ -103,7 +107,7 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def readable_runs(self) -> list[Run]:
-        """`runs`, or where they are damaged, with a warning, one run that is known by the file only."""
+        """`runs`; if `run.json` is damaged, a warning and one run named after the file."""
         try:
             return self.runs
         except FormatError as err:
@@ -112,13 +116,13 @@ class DescribedRecording(OpenedRecording):
             return [Run().known_as(name, "", self.created_ns, 0)]
 
     def listed_runs(self) -> list[dict[str, Any]]:
-        """The run of each episode as filters see it; see `readable_runs`."""
+        """The run of each episode, as filters see it; damage is handled as in `readable_runs`."""
         found = [run.as_dict() for run in self.readable_runs]
         places = self.run_places if len(found) > 1 else []
         return [found[place] for place in places] or found * len(self.index)
 
     def episode_metadata(self, i: int) -> dict[str, Any]:
-        """The metadata of episode `i`, with what was said about it later."""
+        """The metadata of episode `i`, with annotations applied."""
         number = int(self.index["episode"][i])
         return self.annotations.applied(number, self.recorded_metadata(i))
 
@@ -132,7 +136,7 @@ class DescribedRecording(OpenedRecording):
         return value
 
     def all_metadata(self) -> list[str]:
-        """The metadata of all episodes as JSON texts; "{}" where there is none."""
+        """The metadata of all episodes as JSON texts, annotations applied; "{}" if there are none."""
         index = self._contents.index
         texts = ["{}"] * len(index.episodes)
         for i in np.flatnonzero(index.episodes["metadata_length"]).tolist():

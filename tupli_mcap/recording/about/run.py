@@ -1,6 +1,6 @@
-"""What a recording says of the run it is of: a name, what was tried, where its code stood; kept as `run.json`.
+"""The run of a recording: its name, its settings, the version of its code; kept as `run.json`.
 
-A run is one start of a program. All files that a wrapper goes on in are of the same run.
+A run is one start of a program. All files of a series belong to the same run.
 """
 
 from __future__ import annotations
@@ -25,13 +25,20 @@ _TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host
 
 @dataclass(frozen=True)
 class Run(SaysWhatIsMeant):
-    """A run, as its recording says it. What is not known is empty.
+    """A run. Parts that are not known are empty.
 
-    id: 32 hex digits, the same in all files of the run. name: given by who recorded, else that of the file.
-    metadata: given by who recorded: the algorithm, its settings. tags: words for it. split: "train", "eval" or another
-    word. environment: the Gymnasium id, or else the class. started, ended: ISO 8601 in UTC. command: the arguments of
-    the process. git: `commit` and `dirty` of the program's directory. versions: of Python and of packages. host: the
-    machine's name.
+    Attributes:
+        id: 32 hex digits, the same in all files of the run.
+        name: given by the user, else that of the file.
+        metadata: given by the user: the algorithm, its settings.
+        tags: words given by the user.
+        split: "train", "eval" or another word.
+        environment: the Gymnasium id, else the class.
+        started, ended: ISO 8601 in UTC.
+        command: the arguments of the process.
+        git: `commit` and `dirty` of the program's directory.
+        versions: of Python and of packages.
+        host: the machine's name.
     """
 
     id: str = ""
@@ -51,10 +58,10 @@ class Run(SaysWhatIsMeant):
     def given(
         cls, name: str | None, metadata: Mapping[str, Any] | None, tags: Sequence[str], split: str
     ) -> Self:
-        """What somebody says of a run; paths in the metadata become texts.
+        """A run with the parts that a user gives; paths in the metadata become texts.
 
         Raises:
-            RecordingError: a part is something else than text, or than JSON can hold.
+            RecordingError: a part has another type, or JSON cannot hold it.
         """
         if isinstance(tags, str) or not all(isinstance(tag, str) and tag for tag in tags):
             raise RecordingError(f"tags: expected a list of words, found {tags!r:.80}")
@@ -65,7 +72,7 @@ class Run(SaysWhatIsMeant):
                 )
         if metadata is not None and not (isinstance(metadata, Mapping) and all(map(_is_text, metadata))):
             raise RecordingError(
-                f"metadata: expected a dict with texts as keys (of a Namespace, vars(args)), found {metadata!r:.80}"
+                f"metadata: expected a dict with texts as keys (for a Namespace, vars(args)), found {metadata!r:.80}"
             )
         run = cls(name=name or "", metadata=_plain(dict(metadata or {})), tags=tuple(tags), split=split)
         RecordedRuns([run]).to_json()
@@ -73,10 +80,10 @@ class Run(SaysWhatIsMeant):
 
     @classmethod
     def of_document(cls, document: object, where: str) -> Self:
-        """A run as `run.json` has it; keys that are not known are left out.
+        """A run from the JSON value in `run.json`; unknown keys are ignored.
 
         Raises:
-            FormatError: it is something else.
+            FormatError: it is no run.
         """
         if not isinstance(document, dict):
             raise FormatError(f"{where}: expected a run as a JSON object, found {document!r:.80}")
@@ -94,7 +101,7 @@ class Run(SaysWhatIsMeant):
         return cls(**said)
 
     def as_dict(self) -> dict[str, Any]:
-        """Its parts but command and versions, as plain values: what filters see (`run.name`, `run.metadata.lr`)."""
+        """The parts that filters see (`run.name`, `run.metadata.lr`), as plain values: all but command and versions."""
         return {
             key: list(value) if key in _LISTS else value
             for key, value in vars(self).items()
@@ -102,7 +109,7 @@ class Run(SaysWhatIsMeant):
         }
 
     def known_as(self, name: str, environment: str, started_ns: int, ended_ns: int) -> Self:
-        """The same, with what its file says where the run itself does not."""
+        """The same run, its empty parts filled from facts about its file; times are in ns."""
         return replace(
             self,
             name=self.name or name,
@@ -119,11 +126,13 @@ def file_name(name: str) -> str:
 
 
 class RecordedRuns(NamedTuple):
-    """The runs that the episodes of a recording are of.
+    """The runs of a recording's episodes.
 
-    runs: one, where the recording was not made of others. spans: (episodes, place in `runs`), by the order of episodes
-    in the index; episodes beyond the last span are of the last run. before: what an only run was called and said to be
-    before it was edited, the latest last.
+    Attributes:
+        runs: one, unless the recording was made of others.
+        spans: (number of episodes, index in `runs`) in the order of the index; episodes beyond the last span belong to
+            the last run.
+        before: earlier versions of an edited run, the latest last.
     """
 
     runs: Sequence[Run]
@@ -131,16 +140,16 @@ class RecordedRuns(NamedTuple):
     before: Sequence[Run] = ()
 
     def places(self, episodes: int) -> list[int]:
-        """The place in `runs` of each episode."""
+        """The index in `runs` of each episode's run."""
         each = itertools.chain.from_iterable(itertools.repeat(place, count) for count, place in self.spans)
         found = list(itertools.islice(each, episodes))
         return found + [len(self.runs) - 1] * (episodes - len(found))
 
     def to_json(self) -> bytes:
-        """The content of `run.json`: the parts that are not empty, but for `ended`, which the episodes say.
+        """The content of `run.json`: all parts that are not empty, without `ended`, which follows from the episodes.
 
         Raises:
-            RecordingError: JSON cannot hold the metadata, or they are too many.
+            RecordingError: JSON cannot hold the metadata, or they are too large.
         """
         document: dict[str, Any] = {"runs": [_document(run) for run in self.runs]}
         if self.spans:
@@ -157,7 +166,7 @@ class RecordedRuns(NamedTuple):
 
     @classmethod
     def from_json(cls, data: bytes, where: str) -> Self:
-        """Raises FormatError unless it is what `to_json` makes."""
+        """The runs in `data`; raises FormatError unless it is as `to_json` makes it."""
         try:
             document = jsonvalue.loads(data.decode())
         except (FormatError, ValueError, RecursionError) as err:

@@ -1,4 +1,4 @@
-"""Whether an episode succeeded, as the info of its last step says it."""
+"""Whether an episode succeeded, from the info of its last step or from its metadata."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from tupli_mcap import jsonvalue
 
 KEYS = ("is_success", "success")
-"""What infos and metadata call it."""
+"""The keys that infos and metadata use."""
 
 
 def success_of(said: Any) -> bool | None:
-    """Whether an info or metadata say that the episode succeeded; None if they do not say."""
+    """Whether the episode succeeded, from an info or from metadata; None if they have no such key."""
     if isinstance(said, dict) and said:
         for key in KEYS:
             value = said.get(key)
@@ -26,7 +26,7 @@ def success_of(said: Any) -> bool | None:
 
 
 def with_success(metadata: str, info: Any) -> str:
-    """Metadata (a JSON text) with what the info of the last step says, unless they say it already."""
+    """Metadata (a JSON text) with `success` from the info of the last step, unless they have such a key."""
     said = success_of(info)
     if said is None:
         return metadata
@@ -37,7 +37,7 @@ def with_success(metadata: str, info: Any) -> str:
 
 
 def tells_success(infos: Any) -> bool:
-    """Whether the infos of a batch of sub-environments say it of one of them."""
+    """Whether the infos of a batch have a key of `KEYS` for any sub-environment."""
     found = [infos] if isinstance(infos, Mapping) else infos
     finals = [info["final_info"] for info in found if "final_info" in info]
     finals = [one for final in finals for one in ([final] if isinstance(final, Mapping | None) else final)]

@@ -1,9 +1,9 @@
-"""Whether a recording is what it says it is.
+"""Verifies recordings.
 
-verify        `verify_recording`: does everything below
+verify        `verify_recording` checks everything below
 structure     the records of the file, and their checksums
-episodes      the index and the events against the steps
-frames        frames and images against the steps
-signature     a signature against what it covers
-report        what is found, for people and as JSON
+episodes      index, starts, ends, final states, images and infos against the steps
+frames        frames against the steps
+signature     a signature against everything that it covers
+report        the problems found, for people and as JSON
 """

@@ -1,4 +1,4 @@
-"""Alignment of a recording: every row belongs to one episode, every episode starts, goes on and ends."""
+"""Checks the episodes of a recording: every row belongs to one, and each has a start, consecutive steps and an end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tupli_mcap.spaces.leaves import Leaf
 
 
 def verify_episodes(recording: Recording, findings: Findings) -> None:
-    """Holds the rows of all channels, the messages of the episodes and the index against each other."""
+    """Compares the rows of all channels, the records of the episodes and the index with each other."""
     findings.report.episodes = len(recording.index)
     findings.report.steps = recording.num_steps
     if not recording.num_envs:
@@ -62,7 +62,7 @@ class _Checker:
     # ---- steps
 
     def steps(self, env: int, channel: int) -> None:
-        """Every row of a step channel against the episode it lies in."""
+        """Checks every row of a step channel against its episode."""
         topic = self._channels[channel].topic
         episodes = self._rows[self._rows["env"] == env]
         episodes = episodes[np.argsort(episodes["first_row"], kind="stable")]
@@ -74,7 +74,7 @@ class _Checker:
             where, until = int(expected[i]), int(begins[i])
             self._error("rows", f"rows {where} to {until} belong to no episode", channel=topic)
         if (firsts != expected[:-1]).any():
-            return  # what follows would say the same of every episode
+            return  # otherwise every later episode would be reported
         sums = np.zeros(len(episodes))
         row = 0
         try:
@@ -105,12 +105,12 @@ class _Checker:
         steps = rows - np.where(known, firsts[at] if len(firsts) else 0, 0)
         last = known & (steps == (lengths[at] if len(firsts) else 0) - 1)
         checks = {
-            "is not numbered as its episode": known
+            "has the number of another episode": known
             & (facts.episode != (episodes["episode"][at] if len(episodes) else 0)),
-            "does not count from the one before": known & (facts.step != steps),
+            "has a step that does not follow the one before": known & (facts.step != steps),
             "has a flag that is neither 0 nor 1": (facts.terminal > 1) | (facts.timeout > 1),
             "ends its episode before its last step": known & ~last & ((facts.terminal | facts.timeout) != 0),
-            "has other flags than the end of its episode says": last
+            "has flags that differ from the end of its episode": last
             & (_end_of(facts) != (episodes["end"][at] if len(episodes) else 0)),
         }
         for what, wrong in checks.items():
@@ -129,12 +129,12 @@ class _Checker:
         for i in np.flatnonzero(~close).tolist():
             listed, total = float(episodes["return"][i]), float(sums[i])
             if not (math.isfinite(listed) and math.isfinite(total)):
-                continue  # the order of summation decides
+                continue  # depends on the order of summation
             why = f"its return is {listed!r}, its rewards sum up to {total!r}"
             self._error("episode", why, episode=int(episodes["episode"][i]))
 
     def images(self, channel: int) -> None:
-        """Image channels have a row for each step, and the bytes that never change."""
+        """Checks that image channels have a row for each step, with the right constant bytes and stamp."""
         topics = Topics.of_step(self._channels[channel].topic)
         for leaf in self._layout.images:
             topic = topics.image(leaf.name)
@@ -155,7 +155,7 @@ class _Checker:
                 self._error("image", _plain(err, self._recording), channel=topic)
 
     def bools(self, channel: int, leaves: Sequence[Leaf]) -> None:
-        """The bools of rows of constant size; decoding looks at others."""
+        """Checks the bools in rows of constant size; decoding checks those of other rows."""
         names = [leaf.name for leaf in leaves if leaf.size and self._layout.dtypes.get(leaf.name) == np.bool_]
         if not names or not self._layout.constant:
             return
@@ -177,7 +177,7 @@ class _Checker:
                             channel=place,
                         )
         except FormatError:
-            return  # said of the steps already
+            return  # `steps` has reported it
 
     # ---- messages of episodes
 
@@ -189,7 +189,7 @@ class _Checker:
             self._error("rows", _plain(err, self._recording), channel=topic)
 
     def starts(self) -> None:
-        """Every episode has one start, where the index says, and it says what the index says."""
+        """Checks that every episode has one start, in the row that the index names, with the facts in the index."""
         seen: set[int] = set()
         for row, time, body in self._messages(EPISODE_START):
             place: dict[str, Any] = {"channel": EPISODE_START}
@@ -210,7 +210,7 @@ class _Checker:
             seen.add(start.episode)
             entry = self._rows[i]
             seed, has_seed = indexed_seed(start.seed_number)
-            if not entry["has_seed"] and has_seed == LARGE_SEED:  # as earlier writers had it
+            if not entry["has_seed"] and has_seed == LARGE_SEED:  # earlier writers did not mark such seeds
                 has_seed = NO_SEED
             facts = (start.env, start.first_row, time, seed, has_seed)
             index = tuple(int(entry[name]) for name in ("env", "first_row", "start_time", "seed", "has_seed"))
@@ -220,7 +220,7 @@ class _Checker:
             self._error("episode", "it has no start", episode=number, channel=EPISODE_START)
 
     def ends(self) -> None:
-        """Every episode has one end, and it says what the index says."""
+        """Checks that every episode has one end, with the facts in the index."""
         seen: set[int] = set()
         for row, time, body in self._messages(EPISODE_END):
             place: dict[str, Any] = {"channel": EPISODE_END}
@@ -257,7 +257,7 @@ class _Checker:
             self._error("episode", "it has no end", episode=number, channel=EPISODE_END)
 
     def finals(self) -> None:
-        """Final states are those of episodes that say they have one."""
+        """Checks that the final states are those that the index names."""
         layout, topic = self._layout, FINAL_STATE
         rows = {int(row["final_row"]): row for row in self._rows if row["final_row"] >= 0}
         constant = all(leaf.kind != "variable" for leaf in layout.final_leaves)
@@ -290,7 +290,7 @@ class _Checker:
             self._error("final_state", "it is missing", episode=int(entry["episode"]), channel=topic)
 
     def _is_of_an_unfinished_step(self, row: int, number: int) -> bool:
-        """Whether a final state was written ahead of a step that its recorder did not finish, and does not count."""
+        """Whether a final state is of a step that its recorder did not finish, so that it does not count."""
         i = self._at.get(number)
         if i is None:
             return False
@@ -298,7 +298,7 @@ class _Checker:
         return end == INTERRUPTED and not 0 <= final_row <= row
 
     def infos(self) -> None:
-        """Each info is of a step of the recording, and each step has at most one."""
+        """Checks that each info is of a step of the recording, and that each step has at most one."""
         channel = self._topics.get(INFO)
         if channel is None:
             return
@@ -322,7 +322,7 @@ class _Checker:
 
 
 def _end_of(facts: StepFacts) -> Array:
-    """How each row would end its episode, by its flags."""
+    """How each row would end its episode, from its flags."""
     return np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
 
 

@@ -1,4 +1,4 @@
-"""Frames of a recording, held against its episodes and against each other."""
+"""Checks the frames of a recording against its episodes and each other."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recording import Recording
 
-_TOLD = 3  # rows of a channel that are named, of each defect
+_TOLD = 3  # rows of a channel that are reported for each defect
 
 
 def verify_frames(recording: Recording, findings: Findings) -> None:
-    """Every picture has its row, both are of one time, and what they show is told in order."""
+    """Checks that every picture has a row in `/frame`, with the same time, and that these rows are in order."""
     for camera in recording.cameras:
         for env in range(recording.num_envs):
             _Pair(recording, findings, camera, env).run()
@@ -47,7 +47,7 @@ class _Pair:
             self._error(self._plain(err), self._topics.camera)
 
     def _pairs(self, channel: int) -> Array:
-        """The times of the rows, which are checked."""
+        """Checks the rows of `/frame`; returns their times (int64, ns)."""
         parts = [
             self._store.rows(chunk, FRAME_LAYOUT.dtype, keep=False) for chunk in self._store.chunks(channel)
         ]
@@ -55,7 +55,9 @@ class _Pair:
         episodes, steps = rows["episode"].astype(np.int64), rows["step"].astype(np.int64)
         again = (episodes[1:] == episodes[:-1]) & (steps[1:] <= steps[:-1])
         for i in np.flatnonzero(again)[:_TOLD].tolist():
-            self._error(f"row {i + 1} is of a step before, or of the same", self._topics.frame)
+            self._error(
+                f"row {i + 1} is of an earlier step than the row before, or the same", self._topics.frame
+            )
         runs = (
             episodes[np.flatnonzero(np.append(True, episodes[1:] != episodes[:-1]))]
             if len(rows)
@@ -72,8 +74,8 @@ class _Pair:
         if lost and self._recording.complete:
             self._findings.note(
                 "frame",
-                f"{lost} frames of camera {self._camera!r} are of steps that are not here",
-                "nothing to be done: a power loss or a lost journal leaves such, and they are never shown",
+                f"{lost} frames of camera {self._camera!r} are of steps that are not in the recording",
+                "nothing to be done: a power loss or a lost journal leaves such frames, and they are never shown",
             )
         return rows["#log_time"].astype(np.int64)
 
@@ -90,11 +92,11 @@ class _Pair:
         except FormatError as err:
             return f"cannot be decoded: {err}"
         if frame.form not in ("png", "jpeg") or format_of(frame.data) != frame.form:
-            return f"is no picture in the format that it says, {frame.form!r:.40}"
+            return f"is no picture of its format {frame.form!r:.40}"
         if frame_id != self._camera:
             return f"is of camera {frame_id!r:.60}"
         if frame.time_ns != log_time or pair_time not in (None, log_time):
-            return "has two times"
+            return "has another time than its header or its row of /frame"
         return ""
 
     def _error(self, message: str, topic: str) -> None:

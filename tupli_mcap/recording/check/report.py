@@ -1,4 +1,4 @@
-"""What verification finds: typed problems, each with its place and what to do about it."""
+"""The problems that verification finds, each with its place and what to do about it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-_MOST = 1000  # problems that are kept of a file; the others are counted
+_MOST = 1000  # problems of a file that are kept; others are counted
 RECOVER = "save what is good with tupli-mcap recover"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something found in a file. `severity` "error": the file is damaged; "note": worth to know.
+    """Something found in a file.
 
-    kind: "file", "record", "chunk", "message_index", "attachment", "metadata", "summary", "index", "layout", "rows",
-        "episode", "final_state", "info", "image", "frame", "benchmark", "signature", "journal", or one of a storage's.
-    offset: in the file (bytes). channel: a topic. episode, step: numbers.
-    follows: damage found elsewhere in the file is enough to explain it.
+    Attributes:
+        kind: "file", "record", "chunk", "message_index", "attachment", "metadata", "summary", "index", "layout",
+            "rows", "episode", "final_state", "info", "image", "frame", "benchmark", "signature", "journal", or one of
+            a storage's.
+        severity: "error" if the file is damaged; "note" if it is not.
+        offset: in the file (bytes).
+        channel: a topic.
+        episode, step: numbers.
+        follows: other damage in the file explains it.
     """
 
     kind: str
@@ -33,7 +38,7 @@ class Problem:
 
     @property
     def place(self) -> str:
-        """Where it is, for people; empty if it is the whole file."""
+        """The place, for people; empty for the whole file."""
         parts = [
             f"{name} {value}"
             for name, value in (
@@ -49,11 +54,15 @@ class Problem:
 
 @dataclass
 class VerifyReport:
-    """What was verified in a file, and what was found.
+    """The result of verifying a file: counts of what was checked, and the problems.
 
-    kind: "recording" or "storage". state: "complete", "unfinished" (its writer was killed) or "recording" (a
-    writer is at work on it). signed_by: the fingerprint of the key whose signature fits, and what this user calls it
-    where he trusts it; empty if the file is not signed. more: problems beyond the first thousand.
+    Attributes:
+        kind: "recording" or "storage".
+        state: "complete", "unfinished" (its writer was killed) or "recording" (a writer works on it).
+        size: of the file (bytes).
+        signed_by: the fingerprint of the key whose signature fits, and the name this user gave it if they trust it;
+            empty if the file is not signed.
+        more: number of problems beyond the first thousand.
     """
 
     path: str
@@ -80,12 +89,12 @@ class VerifyReport:
         return not self.errors
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON has it."""
+        """The report as a JSON value."""
         return {**asdict(self), "ok": self.ok}
 
 
 class Findings:
-    """Takes problems down in a report."""
+    """Adds problems to a report."""
 
     def __init__(self, report: VerifyReport) -> None:
         self.report = report
@@ -93,7 +102,7 @@ class Findings:
 
     @contextlib.contextmanager
     def following(self, explained: bool) -> Iterator[None]:
-        """Damage found within follows from what was found before, if `explained`."""
+        """Marks damage that is found within as following from earlier damage, if `explained`."""
         before, self._explained = self._explained, self._explained or explained
         try:
             yield
@@ -101,11 +110,11 @@ class Findings:
             self._explained = before
 
     def error(self, kind: str, message: str, **place: Any) -> None:
-        """Damage, where it is (`Problem`'s fields)."""
+        """Adds damage; `place` are fields of `Problem`."""
         self._add(Problem(kind, message, follows=self._explained, **place))
 
     def note(self, kind: str, message: str, advice: str, **place: Any) -> None:
-        """Something that is no damage."""
+        """Adds something that is no damage."""
         self._add(Problem(kind, message, "note", advice, **place))
 
     def _add(self, problem: Problem) -> None:

@@ -1,7 +1,7 @@
 """Checks a signature against everything that it covers.
 
-The manifest covers what is read from a file, not its bytes: chunks may be compressed anew, and attachments that were
-added since (a replay certificate, a quality card) are named as not covered.
+The manifest covers the contents a reader sees, not the bytes of the file: others may compress chunks anew. Attachments
+that were added after signing (a replay certificate, a quality card) are listed as not covered.
 """
 
 from __future__ import annotations
@@ -22,17 +22,19 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.file_end import read_tail
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 
-# Of the metadata; the other keys are about the file as it happened to be written.
+# Keys of the metadata that are signed; the others depend on how the file was written.
 _IDENTITY = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
 
 
 class Signature(NamedTuple):
     """A signature that fits its recording.
 
-    public_key: of the signer, 64 hex digits. fingerprint: the same as `ssh-keygen -l` shows it.
-    name: what this user calls the key; None where the key is not trusted here.
-    environment: the digest of the environment that was signed; None if the recording carries none.
-    not_covered: attachments that were added after signing, or that others may replace (a replay certificate).
+    Attributes:
+        public_key: of the signer, 64 hex digits.
+        fingerprint: of the key, as `ssh-keygen -l` shows it.
+        name: the name this user gave the key; None if the key is not trusted here.
+        environment: the digest of the signed environment; None if the recording carries none.
+        not_covered: attachments that were added after signing, or that others may replace (a replay certificate).
     """
 
     public_key: str
@@ -48,12 +50,14 @@ class Signature(NamedTuple):
 
 
 def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:
-    """Checks the signature of a recording against everything it covers; all chunks are read.
+    """Checks the signature of a recording against everything it covers; reads all chunks.
 
-    walk: of the file, if somebody has made it already.
+    Args:
+        recording: a finished one.
+        walk: a `Structure` of the file that has run; None to make one.
 
     Raises:
-        SignatureError: there is none, or it does not fit: the message says what was changed.
+        SignatureError: there is none, or it does not fit; the message says what was changed.
         FormatError: the file is damaged.
         MissingExtraError: the extra `sign` is not installed.
     """
@@ -65,7 +69,9 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
     if not signed.fits():
         raise SignatureError(f"{name}: its signature was not made by the key {fingerprint} that it names")
     if not recording.complete:
-        raise SignatureError(f"{name}: what was signed is finished, this recording is not")
+        raise SignatureError(
+            f"{name}: expected a finished recording, as all signed ones are, found an unfinished one"
+        )
     current = manifest(recording)
     _compare(signed.manifest, current, f"{name}, signed by {fingerprint}")
     check_readers(recording, current["attachments"], walk)
@@ -79,7 +85,7 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
 
 
 def manifest(recording: Recording) -> dict[str, Any]:
-    """What a signature covers, as it is in the file now."""
+    """The manifest of the file as it is."""
     carried = "benchmark.json" in recording.attachments
     return {
         "format": "tupli_mcap.manifest",
@@ -95,7 +101,7 @@ def manifest(recording: Recording) -> dict[str, Any]:
 
 
 def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
-    """The part of the manifest that is about episodes."""
+    """The part of the manifest about episodes."""
     contents = recording.file.contents
     index = contents.index
     return {
@@ -109,7 +115,7 @@ def manifest_of_episodes(recording: Recording) -> dict[str, Any]:
 
 
 def _channel(file: OpenFile, number: int) -> dict[str, Any]:
-    """Of a channel: its topic, and the digest of its definition and of all its message records, in order."""
+    """A channel's topic, number of messages, and digest of its definition and all its message records in order."""
     channel = file.contents.channels[number]
     schema = file.contents.schemas.get(channel.schema_id)
     definition = {
@@ -125,8 +131,12 @@ def _channel(file: OpenFile, number: int) -> dict[str, Any]:
 
 
 def check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
-    """Other readers go by the definitions in the chunks, by the summary's indexes, or by the order of the file: what
-    they see must be what was hashed, so all of it must agree, and nothing `covered` may be there twice."""
+    """Checks that other readers see what was hashed: they use the definitions in the chunks, the summary's indexes, or
+    the order of the file. So all of these must agree, and nothing `covered` may be there twice.
+
+    Raises:
+        SignatureError: they do not.
+    """
     if walk is None:
         source = recording.file.source
         walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
@@ -139,13 +149,14 @@ def check_readers(recording: Recording, covered: Container[str], walk: Structure
     ]
     if wrong:
         raise SignatureError(
-            f"{recording.name}: other readers may see something else in it than what is signed: {wrong[0]}; "
+            f"{recording.name}: other readers may see something else in it than was signed: {wrong[0]}; "
             "ask its signer for another copy, or write it anew with tupli-mcap bundle"
         )
 
 
 def _compare(signed: Mapping[str, Any], current: Mapping[str, Any], where: str) -> None:
-    """Raises SignatureError at the first difference; new attachments that nothing is rebuilt from are none."""
+    """Raises SignatureError at the first difference; new attachments are allowed if no environment is rebuilt from
+    them."""
     for part in ("format", "version", "recording", "environment"):
         if signed.get(part) != current[part]:
             raise SignatureError(

@@ -1,4 +1,4 @@
-"""Structure of a file: every record, every CRC, the order of records, and the summary against the data."""
+"""Checks the structure of a file: every record, every CRC, the order of records, and the summary against the data."""
 
 from __future__ import annotations
 
@@ -50,9 +50,10 @@ class _Waiting(NamedTuple):
 
 
 class Structure:
-    """Walks the data section of a recording, then holds the summary and the index against it.
+    """Walks the data section of a recording, then compares the summary and the index with it.
 
-    journal_lost: there is no journal that holds what a killed writer was about to write.
+    Args:
+        journal_lost: there is no journal with the rows that a killed writer was about to write.
     """
 
     def __init__(self, source: Source, tail: Tail, findings: Findings, *, journal_lost: bool = False) -> None:
@@ -73,7 +74,7 @@ class Structure:
         self._behind_damage = False
         self._started: set[int] = set()
         self._records = 0
-        self.missing = False  # damage that rows may have been lost with
+        self.missing = False  # there was damage that may have cost rows
         self._ended = False
         self._outside: set[tuple[type[Any], int]] = set()  # definitions outside chunks
         self._names: set[tuple[int, str]] = set()
@@ -87,7 +88,7 @@ class Structure:
     # ---- the data section
 
     def run(self) -> None:
-        """Everything that can be said without knowing the layout.
+        """Checks everything that does not depend on the layout.
 
         Raises:
             NewerVersionError: the recording's format is not known.
@@ -111,7 +112,7 @@ class Structure:
             what = f"the last record is cut off, {damage.end - damage.offset} bytes are left of it"
             if not (self._journal_lost and self.channels):
                 self._findings.note("record", what, "nothing to be done", offset=damage.offset)
-                return  # a killed writer's last write
+                return  # the last write of a killed writer; its journal has these rows
             self.missing = True
             self._findings.error("record", f"{what}, and no journal holds it", offset=damage.offset)
             return
@@ -167,7 +168,7 @@ class Structure:
             )
 
     def _named(self, record: Found) -> None:
-        """Header and metadata."""
+        """Checks the header or a metadata record."""
         if record.opcode == Opcode.HEADER:
             header = parse_record(record.opcode, record.body, record.offset, self._source.name)
             if header.profile != PROFILE:
@@ -196,7 +197,7 @@ class Structure:
         self._names.add((opcode, name))
 
     def _crc(self, values: dict[str, str], known: Sequence[str], kind: str, offset: int) -> bool:
-        """Whether pairs have the checksum they say."""
+        """Whether `crc` is right for the pairs."""
         try:
             check_crc(values, known, "the metadata")
         except FormatError as err:
@@ -248,7 +249,7 @@ class Structure:
         )
 
     def _rows(self, record: Found, chunk: Chunk, content: ChunkRecords) -> None:
-        """The rows of a chunk: in order, without gap, with the times its header says."""
+        """Checks the rows of a chunk: in order, without gap, with the times in its header."""
         headers, number = content.headers, content.channel
         topic = self.channels[number].topic if number in self.channels else f"{number}"
         place = {"offset": record.offset, "channel": topic}
@@ -271,7 +272,7 @@ class Structure:
         if (headers["#cdr"] != _CDR).any():
             self._findings.error("rows", "expected plain little-endian CDR", **place)
         if (chunk.start_time, chunk.end_time) != (int(times[0]), int(times[-1])):
-            self._findings.error("chunk", "its header says other times than its messages", **place)
+            self._findings.error("chunk", "its header has other times than its messages", **place)
 
     def _message_index(self, record: Found, waiting: _Waiting | None) -> None:
         if waiting is None:
@@ -282,7 +283,7 @@ class Structure:
         number, entries = message_index(record.body)
         content = waiting.records
         if number != content.channel or not np.array_equal(entries, content.index_entries()):
-            why = "it says other times or offsets than its chunk has"
+            why = "it has other times or offsets than its chunk"
             self._findings.error("message_index", why, offset=record.offset)
 
     # ---- the summary
@@ -296,7 +297,7 @@ class Structure:
         for kind, number in sorted((kind.__name__.lower(), number) for kind, number in known - self._outside):
             self._findings.error("layout", f"{kind} {number} is not defined outside of the chunks")
         if not self._tail.finished or self._findings.report.state == "unfinished":
-            return  # its writer was killed, perhaps while it wrote the end
+            return  # its writer was killed, maybe while it wrote the end
         if self._waiting is not None:
             why = "expected the message index of the chunk"
             self._findings.error("message_index", why, offset=self._waiting.offset)
@@ -313,7 +314,9 @@ class Structure:
             if not self._tail.why:
                 self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
-        last = {index.name: index for index in self._attachments}  # one that was replaced may keep its bytes
+        last = {
+            index.name: index for index in self._attachments
+        }  # the bytes of a replaced one may still be there
         self._attachments = sorted(last.values(), key=lambda index: index.offset)
         self._summary(self._tail.summary.start)
 
@@ -348,7 +351,7 @@ class Structure:
             if _ordered(opcode, listed) != _ordered(opcode, wanted):
                 what = Opcode(opcode).name.lower().replace("_", " ")
                 why = (
-                    f"its {len(listed)} {what} records say other than the data, where there are {len(wanted)}"
+                    f"its {len(listed)} {what} records differ from those of the data, which has {len(wanted)}"
                 )
                 with self._findings.following(self.missing):
                     self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
@@ -378,5 +381,5 @@ class Structure:
 
 
 def _ordered(opcode: int, records: list[Any]) -> list[Any]:
-    """Definitions by id: the summary may have them in another order."""
+    """The records, definitions sorted by id: the summary may have these in another order."""
     return sorted(records, key=lambda r: r.id) if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else records

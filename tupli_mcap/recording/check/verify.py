@@ -1,4 +1,4 @@
-"""`verify_recording` looks for everything that can be wrong with a recording. Nothing in it is executed."""
+"""`verify_recording` checks everything that can be wrong with a recording. It executes nothing from the file."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ _FROM_STORAGE = "load its benchmark from the storage it is in"
 
 
 def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
-    """Checks a file: structure, every CRC, indexes against contents, layouts, alignment, digests.
+    """Checks a file: structure, every CRC, indexes against contents, layouts, episodes, digests.
 
-    A file that cannot be read, or is no recording, is reported as a problem. Chunks are read one at a time.
+    A file that cannot be read, or is no recording, is a problem in the report. Chunks are read one at a time.
 
     Raises:
         RecordingError: there is no such file.
@@ -107,7 +107,7 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unr
     if lost and structure.channels:  # a journal is made before the channels
         findings.note(
             "journal",
-            f"{lost}: steps not yet in a chunk are not here",
+            f"{lost}: steps that were not yet in a chunk are missing",
             "keep a recording and its journal together",
         )
 
@@ -134,17 +134,17 @@ def _lost_journal(source: Source) -> tuple[str, bool]:
 
 
 def _contents(source: Source, structure: Structure, findings: Findings) -> None:
-    """What a reader sees."""
+    """Opens the file as a reader does, and checks its contents."""
     damaged = len(findings)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # what they say of the journal is a note
+            warnings.simplefilter("ignore", UserWarning)  # about the journal, which has a note
             recording = Recording(source.name if source.path is None else source.path)
     except (FormatError, RecordingError) as err:
-        if not damaged:  # else the reader says again what is known, or what follows from it
+        if not damaged:  # otherwise it repeats known damage, or follows from it
             findings.error("layout", str(err).removeprefix(f"{source.name}: "))
         return
-    recording.file.store.claims = None  # which rows differ from the index is said one by one
+    recording.file.store.claims = None  # rows that differ from the index are reported one by one
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)
@@ -155,7 +155,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
 
 
 def _layout(recording: Recording, structure: Structure, findings: Findings) -> None:
-    """The definitions in the file are those that the spaces give."""
+    """Checks that the definitions in the file are those of the spaces."""
     if not recording.num_envs:
         return
     channels = recording.file.contents.channels
@@ -180,11 +180,11 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
         wanted = expected.schemas[channel.schema_id]
         same = (schema.name, schema.encoding, schema.data) == (wanted.name, "ros2msg", wanted.data)
         if not same or defined.message_encoding != "cdr":
-            findings.error("layout", "its schema is not the one its spaces have", channel=channel.topic)
+            findings.error("layout", "its schema is not that of its spaces", channel=channel.topic)
 
 
 def _carried(recording: Recording, structure: Structure, findings: Findings) -> None:
-    """The benchmark and the artifacts, by their digests; what is said of runs and episodes."""
+    """Checks the attachments: digests of benchmark and artifacts, runs, annotations, the signature."""
     for name in recording.attachments:
         try:
             if name.startswith(_ARTIFACT):
@@ -207,7 +207,7 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
 
 
 def _names_pickle(recording: Recording) -> bool:
-    """Whether `benchmark.json` says that a pickle lies beside it."""
+    """Whether `benchmark.json` names a pickle."""
     try:
         document = json.loads(recording.read_attachment("benchmark.json"))
         return document["environment"]["pickle"] is not None

@@ -1,10 +1,10 @@
-"""From rows to columns.
+"""Reads rows as columns.
 
-chunk_store    decompresses chunks, and keeps some
-runs           which rows of which chunks go where
-gather         columns out of chunks, of one file or of many: what everybody reads by
-read           columns of one recording; where its steps lie, for readers of many
-fields         names of columns
-statistics     mean, range and quantiles of a leaf, without keeping its values
-threads        a small pool
+chunk_store    decompresses chunks, and caches some
+runs           finds the chunks that hold rows
+gather         copies rows of chunks into columns, from one file or many
+read           columns of one recording; a handle to its step chunks
+fields         the names of columns
+statistics     statistics of a leaf's values
+threads        runs tasks on a few threads
 """

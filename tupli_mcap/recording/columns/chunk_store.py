@@ -1,7 +1,7 @@
 """Decompressed chunks, by channel and row, with a cache.
 
-Everything a file says of a chunk is a claim: sizes are capped before anything is allocated, CRCs are checked, and the
-rows' own headers must agree with the chunk table.
+Everything a file says about a chunk is a claim: sizes are capped before anything is allocated, CRCs are checked, and
+the rows' headers must agree with the chunk table.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.limits import StepClaims
 from tupli_mcap.remote import RemoteSource
 
-IN_MEMORY = 1 << 63  # chunk offsets from here on index rows recovered from a journal
+IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory
 _MESSAGE_HEAD = np.dtype(
     {
         "names": ["channel", "sequence"],
@@ -57,7 +57,7 @@ class Span(NamedTuple):
 
 
 class KeptChunk:
-    """A decompressed chunk, and what has been found out about it."""
+    """A decompressed chunk, and views of it that have been checked."""
 
     __slots__ = ("data", "records", "rows")
 
@@ -68,7 +68,7 @@ class KeptChunk:
 
 
 class ChunkCache:
-    """Decompressed chunks, the ones used last, of one or several stores. Safe from several threads, and after a fork.
+    """The decompressed chunks of one or several stores that were used last. Thread-safe, also after a fork.
 
     Args:
         budget: bytes to keep; one chunk is kept even if it is larger.
@@ -82,12 +82,12 @@ class ChunkCache:
         self._process = os.getpid()
 
     def _held(self) -> threading.Lock:
-        if self._process != os.getpid():  # forked: the lock may be held by a thread that is not here
+        if self._process != os.getpid():  # forked: a thread of the parent may hold the lock
             self._lock, self._process = threading.Lock(), os.getpid()
         return self._lock
 
     def get(self, key: tuple[int, int]) -> KeptChunk | None:
-        if not self._kept:  # as while a whole recording is read, whose threads need not wait for each other
+        if not self._kept:  # so that threads that read a whole recording do not wait for each other
             return None
         with self._held():
             if key in self._kept:
@@ -103,7 +103,7 @@ class ChunkCache:
                 self._bytes -= len(self._kept.popitem(last=False)[1].data)
 
     def clear(self) -> None:
-        """Keeps nothing any more."""
+        """Forgets all chunks."""
         with self._held():
             self._kept.clear()
             self._bytes = 0
@@ -116,10 +116,10 @@ class ChunkCache:
 
 
 class Decoder(Protocol):
-    """What the chunks of a channel go through before they are rows of constant size."""
+    """Turns the chunks of a channel into rows of constant size."""
 
     def decode(self, data: Any, count: int, where: str) -> Any:
-        """The records of `count` rows; FormatError if the chunk does not hold them."""
+        """The records of `count` rows; raises FormatError if the chunk does not hold them."""
         ...
 
 
@@ -128,7 +128,7 @@ _numbers = itertools.count()
 
 @functools.lru_cache(maxsize=4)
 def _heads(rows: int, length: int, channel: int) -> tuple[bytes, bytes]:
-    """What all the rows of a chunk begin with, as `_HEAD` and `_REST`."""
+    """The bytes with which every row of a chunk begins, as `_HEAD` and `_REST`."""
     head = _ROW_HEAD.pack(5, length, channel)
     return head[:8] * rows, head[7:] * rows
 
@@ -137,7 +137,7 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
     """Whether each of the rows, `size` bytes long, begins as a row of the channel does."""
     if not rows:
         return True
-    if rows < _MANY_ROWS:  # chunks of a few numbers of rows share what they begin with
+    if rows < _MANY_ROWS:  # few sizes of such chunks occur, so their heads are cached
         heads, rests = _heads(1 << rows.bit_length(), size - 9, channel)
     else:
         heads, rests = _heads.__wrapped__(rows, size - 9, channel)
@@ -146,7 +146,7 @@ def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
 
 
 def _check_sequence(sequences: Array, first: int, where: str) -> None:
-    """Raises FormatError unless rows are numbered from `first` on."""
+    """Raises FormatError unless the rows are numbered from `first` on."""
     wrong = sequences != np.arange(first, first + len(sequences))
     if wrong.any():
         i = int(np.argmax(wrong))
@@ -156,12 +156,12 @@ def _check_sequence(sequences: Array, first: int, where: str) -> None:
 
 
 class ChunkStore:
-    """The chunks of a recording. `table` is a CHUNK_ROWS array; `memory` holds rows that are only in the journal.
-
-    Reading is safe from several threads. A copy in another process (where the source can be copied) starts with an
-    empty cache.
+    """The chunks of a recording. Thread-safe. An unpickled copy (if the source can be copied) has an empty cache.
 
     Args:
+        source: the file.
+        table: the chunks, as CHUNK_ROWS.
+        memory: rows that are in no chunk of the file.
         cache: the budget (bytes) of a cache of its own, or a cache that is shared with other stores.
     """
 
@@ -174,10 +174,10 @@ class ChunkStore:
         self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
         self._checked = np.zeros(len(table), np.bool_)
         self._held = np.zeros(len(table), np.bool_)  # against `claims`
-        self._number = next(_numbers)  # tells the stores apart that share a cache
-        self.codecs: Mapping[int, Decoder] = {}  # of the channels whose rows have to be decoded
-        # What the episode index says of the step channels: the rows of all channels are held against it and the chunk
-        # table before they are given out. None: they are given out as they are.
+        self._number = next(_numbers)  # tells stores apart that share a cache
+        self.codecs: Mapping[int, Decoder] = {}  # by channel; rows of other channels are not encoded
+        # By step channel, the rows that the episode index names. Unless it is None, the rows of all channels are
+        # compared with it and with the chunk table before they are returned.
         self.claims: Mapping[int, StepClaims] | None = None
         self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
         self._counts: dict[int, int] = {}
@@ -213,7 +213,7 @@ class ChunkStore:
         return self.table[self.chunks(channel)]
 
     def spans(self, channel: int, first: int, count: int) -> Iterator[Span]:
-        """Where the rows `first:first + count` of a channel lie."""
+        """The places of the rows `first:first + count` of a channel."""
         if count == 0:
             return
         if first < 0 or count < 0 or first + count > self.count(channel):
@@ -234,7 +234,7 @@ class ChunkStore:
             at += 1
 
     def elsewhere(self, source: Source, cache: ChunkCache) -> ChunkStore:
-        """The same chunks, read from another source, kept in another cache."""
+        """A store of the same chunks that reads from another source and uses another cache."""
         store = ChunkStore(source, self.table, self._memory, cache)
         store.codecs, store.claims = self.codecs, self.claims
         return store
@@ -246,13 +246,13 @@ class ChunkStore:
         self._held = np.zeros(len(self.table), np.bool_)
 
     def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
-        """Where the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64) lie, in their order.
+        """The places of the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64), in their order.
 
         Returns:
-            Chunks, the first row in each, and how many rows (int64).
+            Chunks, the first row within each, and numbers of rows (int64).
 
         Raises:
-            FormatError: there are no such rows.
+            FormatError: the recording has no such rows.
         """
         runs, found = [], []
         for channel in np.unique(channels).tolist():
@@ -267,7 +267,7 @@ class ChunkStore:
         return chunks, begins, steps
 
     def _locate(self, channel: int, first: Array, counts: Array) -> tuple[Array, Array, Array, Array]:
-        """The same for one channel and runs that are not empty; before it, which run each is of."""
+        """The same for one channel and runs that are not empty; the first array gives the run of each entry."""
         if not len(first):
             none = np.empty(0, np.int64)
             return none, none, none, none
@@ -287,7 +287,7 @@ class ChunkStore:
         return run, chosen[at], start - firsts[at], end - start
 
     def fetch(self, chunks: Iterable[int]) -> None:
-        """Chunks that will be read next: those of a file on a server begin to come, in few requests."""
+        """Announces chunks that will be read next: a remote file requests them together."""
         if not isinstance(self._source, RemoteSource):
             return
         numbers = [
@@ -305,7 +305,7 @@ class ChunkStore:
         return self.chunk(i, keep=keep).data
 
     def chunk(self, i: int, *, keep: bool = True) -> KeptChunk:
-        """A chunk and what is known of it; cached unless `keep` is False."""
+        """A chunk and its checked views; cached unless `keep` is False."""
         kept = self._cache.get((self._number, i))
         if kept is None:
             kept = KeptChunk(self._read(i))
@@ -328,7 +328,7 @@ class ChunkStore:
                 f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}"
             )
         name = COMPRESSIONS[compression].replace("none", "")
-        # what is not compressed is used where it is
+        # data that is not compressed is used in place
         record = self._source.lend(offset, length) if name else self._source.view(offset, length)
         opcode, claimed, _, _, found_size, crc, name_length = CHUNK_HEAD.unpack_from(record)
         start = CHUNK_HEAD.size + name_length + 8
@@ -340,7 +340,7 @@ class ChunkStore:
         data = decompress(name, record[start:], size, where)
         if crc != row_crc or not (self._checked[i] or crc32(data) == crc):
             raise FormatError(f"{where}: its CRC differs, the chunk is damaged or another one")
-        self._checked[i] = isinstance(record.obj, mmap)  # what is mapped stays as it is, and is checked once
+        self._checked[i] = isinstance(record.obj, mmap)  # mapped data is checked once
         return memoryview(data)[skip:] if skip else data
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
@@ -349,7 +349,7 @@ class ChunkStore:
         codec = self.codecs.get(channel)
         kept = self.chunk(i, keep=keep) if codec is None else self._decoded(i, codec, keep=keep)
         if kept.rows is not None:
-            if kept.rows.dtype is not dtype:  # the same bytes in other words: `items_dtype`
+            if kept.rows.dtype is not dtype:  # another view of the same bytes: `items_dtype`
                 kept.rows = kept.rows.view(dtype)
             return kept.rows
         data = kept.data
@@ -368,14 +368,14 @@ class ChunkStore:
         return rows
 
     def _hold_rows(self, i: int, data: Any, channel: int, n: int, size: int) -> None:
-        """Raises FormatError unless the rows of a chunk are those that the index says."""
+        """Raises FormatError unless the rows of a chunk are those that the index names."""
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(channel)
         if claims is None or not n:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
             claims.check(first, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
-        self._held[i] = True  # its CRC says that it stays the same
+        self._held[i] = True  # once is enough: the CRC shows later changes
 
     def _hold_records(self, i: int, data: Any, records: Array) -> None:
         """The same for a chunk of variable layout."""
@@ -390,7 +390,7 @@ class ChunkStore:
         self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
-        """A chunk as rows of constant size, which are kept instead of what it holds."""
+        """A chunk as rows of constant size; these are cached, not the encoded ones."""
         kept = self._cache.get((self._number, ~i))
         if kept is None:
             where = f"{self._source.name}: chunk {i}"
@@ -400,7 +400,7 @@ class ChunkStore:
         return kept
 
     def records(self, i: int, *, keep: bool = True) -> tuple[Any, Array]:
-        """A chunk of variable layout, and where each message record begins and ends in it: int64 (rows, 2)."""
+        """A chunk of variable layout, and the offsets where each message record begins and ends: int64 (rows, 2)."""
         kept = self.chunk(i, keep=keep)
         if kept.records is None:
             records = self._find_records(i, kept.data)
@@ -427,10 +427,10 @@ class ChunkStore:
         return found
 
     def all_messages(self, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
-        """(row, log_time, body) of the messages of a channel, of which no chunk is kept; none if it is None.
+        """(row, log_time, body) of the messages of a channel; none if it is None. No chunk is cached.
 
         Raises:
-            FormatError: a chunk is damaged; the messages before it were given out.
+            FormatError: a chunk is damaged; the messages before it have been yielded.
         """
         row = 0
         for chunk in [] if channel is None else self.chunks(channel):

@@ -1,4 +1,4 @@
-"""The columns of steps that can be asked for by name, and the names they have elsewhere."""
+"""The names of the columns of steps, and Gymnasium's names for them."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _OTHER_NAMES = MappingProxyType(
 def field_names(
     fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
 ) -> list[str]:
-    """The fields under our names, each once; Gymnasium's names mean the same.
+    """The fields under this package's names, each once; Gymnasium's names are understood.
 
     Raises:
-        error: one of them is unknown, or they are no names.
+        error: a name is unknown, or is no text.
     """
     try:
         given = [fields] if isinstance(fields, str) else list(fields)

@@ -1,7 +1,7 @@
-"""Columns out of chunks: of one file or of many, of one layout or of several.
+"""Copies rows of chunks into columns, from one file or many, of one layout or several.
 
-Rows are of a kind: steps, the images of a leaf, final states. A `RowFormat` says how those of the files of one layout
-become columns, a `Rows` reads a kind of all files, and a `Plan` says which kinds the fields of a step are made of.
+There are three kinds of rows: steps, images of a leaf, final states. A `RowFormat` turns rows of one kind and layout
+into columns, a `Rows` reads one kind from all files, and a `Plan` makes the fields of steps from several kinds.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from tupli_mcap.recording.columns.runs import Part
 from tupli_mcap.recording.columns.threads import do_all
 from tupli_mcap.spaces.leaves import Leaf
 
-EPISODE = "episode"  # the column of the number that a final state says its episode has
+EPISODE = "episode"  # the column with the episode's number in rows of final states
 _BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
 _FEW = 2048  # bytes
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": LOG_TIME}
-_LITTLE = sys.byteorder == "little"  # as the rows are
-_MANY_ROWS = 1000  # fewer are copied before they have been looked at in another way
+_LITTLE = sys.byteorder == "little"  # the byte order of rows
+_MANY_ROWS = 1000  # from this many rows on, `_items_dtype` pays
 
 
 class Column(NamedTuple):
-    """What one row of a column is: an array or a number; a value of variable size where `dtype` is None."""
+    """The type of one row of a column: an array or a number; a value of variable size if `dtype` is None."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any] | None
@@ -49,14 +49,14 @@ class Column(NamedTuple):
 
 
 class RowFormat:
-    """How the rows of one kind become columns, in files of one layout.
+    """Turns rows of one kind into columns, in files of one layout.
 
     Args:
-        columns: what the columns hold, in a dtype for the values of all layouts.
+        columns: the columns, in dtypes for the values of all layouts.
         dtype: of a Message record; None for rows of variable size.
-        decode: gives columns of the messages whose records begin and end at places of a buffer, for variable size.
-        fields: the name that each column has in these rows, where it is another one.
-        turned: the image leaf whose frames lie first in these rows, and last in its values; None for all others.
+        decode: for rows of variable size, returns columns of the messages whose records are at some places of a buffer.
+        fields: the name of a column in these rows, if it differs.
+        turned: a stack whose frames come first in these rows and last in its values; None for all others.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class RowFormat:
             self._items = _items_dtype(dtype) if all(same) else None
 
     def reader(self, columns: Mapping[str, Any]) -> Callable[[ChunkStore, Part, bool], None]:
-        """What reads a chunk, and copies rows of it into columns."""
+        """A function that reads a chunk and copies rows of it into columns."""
         if self._decode is not None:
             targets = {self._fields[name]: column for name, column in columns.items()}
             return partial(self._read_decoded, self._decode, targets)
@@ -107,7 +107,7 @@ class RowFormat:
 
 
 class Files(NamedTuple):
-    """Recordings: their layouts, which of these each file has, and the chunks of each file."""
+    """Recordings: the different layouts, the layout of each file, and the chunks of each file."""
 
     layouts: Sequence[StepLayout]
     layout_of: Sequence[int]
@@ -115,7 +115,7 @@ class Files(NamedTuple):
 
 
 class Rows:
-    """The rows of one kind in some files, and the columns that are made of them."""
+    """The rows of one kind in some files, and their columns."""
 
     def __init__(self, files: Files, columns: Mapping[str, Column], formats: Sequence[RowFormat]) -> None:
         self.columns = columns
@@ -131,7 +131,7 @@ class Rows:
     def tasks(
         self, columns: Mapping[str, Any], parts: Sequence[Part], keep: bool = True
     ) -> list[Callable[[], None]]:
-        """What fills columns, by name: a task for each part. `keep` leaves the chunks in the stores' cache."""
+        """Tasks that fill columns (by name), one for each part. `keep` leaves the chunks in the stores' cache."""
         filled = {name: column for name, column in columns.items() if isinstance(column, list) or column.size}
         if not filled:
             return []
@@ -144,7 +144,7 @@ class Rows:
     def check(self, columns: Mapping[str, Any], parts: Sequence[Part], *, whole: bool) -> None:
         """Raises FormatError if bools in parts of columns are neither 0 nor 1 in their files.
 
-        `whole`: the columns have nothing but these parts.
+        `whole` says that the columns hold these parts and nothing else.
         """
         for name in self._bools:
             if name not in columns or (whole and _are_bools(columns[name])):
@@ -156,7 +156,7 @@ class Rows:
                     )
 
     def fetch(self, parts: Sequence[Part]) -> None:
-        """Chunks that will be read next."""
+        """Announces chunks that will be read next."""
         for file, some in itertools.groupby(parts, lambda part: part.file):
             self._stores[file].fetch(part.chunk for part in some)
 
@@ -177,7 +177,7 @@ class Rows:
 
 
 def step_rows(files: Files) -> Rows:
-    """The leaves of steps that are no images, "terminal", "timeout" and `LOG_TIME`."""
+    """Rows of steps: the leaves that are no images, "terminal", "timeout" and `LOG_TIME`."""
     apart = image_names(files.layouts)
     leaves = [leaf for leaf in files.layouts[0].leaves if leaf.name not in apart]
     plain = {"terminal": Column((), _BOOL), "timeout": Column((), _BOOL), LOG_TIME: Column((), _U64)}
@@ -187,7 +187,7 @@ def step_rows(files: Files) -> Rows:
 
 
 def final_rows(files: Files) -> Rows:
-    """The leaves of final states, and `EPISODE`."""
+    """Rows of final states: the leaves, and `EPISODE`."""
     leaves, plain = files.layouts[0].state, {EPISODE: Column((), _U32)}
     return _rows(
         files, leaves, plain, lambda layout: layout.final_message.dtype, lambda decoder: decoder.finals
@@ -195,7 +195,7 @@ def final_rows(files: Files) -> Rows:
 
 
 def image_rows(files: Files, name: str) -> Rows:
-    """A leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
+    """Rows of a leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
     (leaf,) = (leaf for leaf in files.layouts[0].state if leaf.name == name)
     columns = {name: _column(files, leaf)}
 
@@ -210,7 +210,7 @@ def image_rows(files: Files, name: str) -> Rows:
 
 
 def image_names(layouts: Sequence[StepLayout]) -> dict[str, str]:
-    """The leaves that are images in one of the layouts: paths by their ROS names in the first layout."""
+    """The leaves that are images in one of the layouts: ROS name in the first layout -> path."""
     paths = {leaf.path for layout in layouts for leaf in layout.images}
     return {leaf.name: leaf.path for leaf in (layouts[0].state if layouts else ()) if leaf.path in paths}
 
@@ -234,7 +234,7 @@ def _rows(
 
 
 def _column(files: Files, leaf: Leaf) -> Column:
-    """A leaf of the first layout, in a dtype that holds the values of all layouts."""
+    """The column of a leaf of the first layout, in a dtype that holds the values of all layouts."""
     if leaf.kind == "variable":
         return Column((), None)
     dtype = files.layouts[0].dtypes[leaf.name]
@@ -244,7 +244,7 @@ def _column(files: Files, leaf: Leaf) -> Column:
 
 
 def _own_names(files: Files, layout: StepLayout) -> dict[str, str]:
-    """ROS names of leaves in a layout, by those in the first one."""
+    """ROS names of leaves: in the first layout -> in this one."""
     names = {leaf.path: leaf.name for leaf in layout.leaves}
     return {leaf.name: names[leaf.path] for leaf in files.layouts[0].leaves}
 
@@ -253,21 +253,21 @@ def _own_names(files: Files, layout: StepLayout) -> dict[str, str]:
 
 
 class Kind(Protocol):
-    """Rows of one kind, however they are read."""
+    """Rows of one kind, with any way to read them."""
 
     @property
     def columns(self) -> Mapping[str, Column]: ...
 
 
 class Plan(NamedTuple):
-    """How to read some fields: which columns of which kinds of rows, and how the fields are made of them."""
+    """How to read some fields: the columns of each kind of rows, and how they become fields."""
 
     sources: list[tuple[int, list[str]]]
     fields: list[tuple[str, Callable[[list[Any]], Any], list[str]]]
 
     @classmethod
     def of(cls, fields: Sequence[str], layout: StepLayout, kinds: Sequence[Kind]) -> Plan:
-        """For fields but "next_states"."""
+        """The plan for some fields; "next_states" must not be among them."""
         nests: dict[str, Callable[[list[Any]], Any]] = {
             "states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward,
             "times": _times,
@@ -284,7 +284,7 @@ class Plan(NamedTuple):
         return plan
 
     def nest(self, columns: Mapping[str, Any]) -> dict[str, Any]:
-        """The fields, of the columns of all sources."""
+        """The fields, made of all columns."""
         return {field: nest([columns[name] for name in names]) for field, nest, names in self.fields}
 
 
@@ -303,14 +303,14 @@ def _times(values: list[Any]) -> Array:
 
 
 def _are_bools(column: Array) -> bool:
-    """Whether what was copied into a column of bools is 0 or 1."""
-    if column.nbytes < _FEW:  # NumPy takes as long to begin
+    """Whether all bytes of a column of bools are 0 or 1."""
+    if column.nbytes < _FEW:  # faster than NumPy for so few
         return not column.tobytes().translate(None, b"\0\1")
     return bool(np.bitwise_or.reduce(column.view(np.uint8), axis=None) <= 1)
 
 
 def put(column: Any, places: slice | Array, values: Any) -> None:
-    """Sets rows of a column, which is a list where values are of variable size."""
+    """Sets rows of a column, which is a list if its values are of variable size."""
     if isinstance(places, slice) or isinstance(column, np.ndarray):
         column[places] = values
         return
@@ -319,7 +319,7 @@ def put(column: Any, places: slice | Array, values: Any) -> None:
 
 
 def _items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The dtype of a row with each field of several numbers as one item of bytes, which NumPy copies faster."""
+    """A dtype of the same row in which a field of several numbers is one item of bytes, which NumPy copies faster."""
     fields = [(name, *found[:2]) for name, found in (dtype.fields or {}).items()]
     spec: Any = {
         "names": [name for name, _, _ in fields],
@@ -336,7 +336,7 @@ def _item_format(field: np.dtype[Any]) -> Any:
 
 
 def _as_items(column: Array) -> Array:
-    """A column of shape (rows, ...) as `_items_dtype` has it: one item a row. The memory is the same."""
+    """A view of a column of shape (rows, ...) with one item for each row, as in `_items_dtype`."""
     if column.ndim == 1 or not _LITTLE:
         return column
     size = math.prod(column.shape[1:])

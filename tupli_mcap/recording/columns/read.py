@@ -1,4 +1,4 @@
-"""Columns of one recording: one preallocated array a leaf, filled chunk by chunk, in threads if asked."""
+"""Reads columns of one recording: one array for each leaf, filled chunk by chunk, with several threads if asked."""
 
 from __future__ import annotations
 
@@ -19,17 +19,21 @@ from tupli_mcap.recording.columns.gather import EPISODE, Files, Plan, Rows, fina
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
 from tupli_mcap.recording.columns.threads import do_all
 
-_MOST_KEYS = 20  # of infos that are shown
+_MOST_KEYS = 20  # keys of infos that are shown
 
 
 @dataclass(repr=False)
 class Columns(GymnasiumNames):
-    """Columns of the asked fields, None for the others.
+    """Columns of the requested fields, None for the others.
 
-    A constant leaf is an array of shape (steps, *leaf shape), a leaf of variable size a list; both are nested as the
-    space is. `episode_lengths` (int64) says where episodes end. `times` (int64, ns) is the wall clock when each step
-    returned. `infos` has a dict a step, which is empty where none was recorded. `frames` are the pictures of the
-    states: uint8 (steps, height, width, 3).
+    A leaf of constant size is an array of shape (steps, *leaf shape), one of variable size a list; both are nested as
+    the space is.
+
+    Attributes:
+        episode_lengths: steps of each episode, int64.
+        times: wall clock when each step returned, int64, ns.
+        infos: a dict for each step, empty if none was recorded.
+        frames: the pictures of the states, uint8 (steps, height, width, 3).
     """
 
     episode_lengths: Array
@@ -53,7 +57,7 @@ class Columns(GymnasiumNames):
 
 
 def _described(column: Any) -> str:
-    """A column in short: dtype and shape, or how many values; of dicts, their keys."""
+    """A column in short: dtype and shape, or the number of values; for dicts, their keys."""
     if isinstance(column, np.ndarray):
         return f"{column.dtype} {column.shape}"
     if isinstance(column, dict):
@@ -142,7 +146,7 @@ class ColumnReader:
         return images
 
     def final_columns(self, channel: int, episodes: Array) -> list[Any]:
-        """A column of final states for each leaf of the state, of index rows that all have one."""
+        """Final states of episodes (index rows that all have one): a column for each leaf of the state."""
         names = [leaf.name for leaf in self._layout.state]
         parts = parts_of(final_runs(episodes, channel), self._store)
         columns = self._finals.read([*names, EPISODE], parts, len(episodes), 1)
@@ -159,9 +163,12 @@ class ColumnReader:
 class StoredSteps(NamedTuple):
     """The steps of a recording, by channel and row.
 
-    `channels` are the step channels by sub-environment; `images` says for each image leaf (ROS name) which channel
-    holds the images of a step channel; `final_channel` is None where there is no final state; `where` is the path or
-    the URL that opens the file again, None if there is none; `source` is the file while the recording is open.
+    Attributes:
+        channels: the step channels by sub-environment.
+        images: for each image leaf (ROS name), step channel -> image channel.
+        final_channel: None if there is no final state.
+        where: the path or the URL that opens the file again; None if there is none.
+        source: the file, while the recording is open.
     """
 
     layout: StepLayout
@@ -173,7 +180,7 @@ class StoredSteps(NamedTuple):
     source: Source
 
     def channels_of(self, envs: Array, leaf: str | None) -> Array:
-        """The step channel (or that of an image leaf) of each sub-environment's number in `envs`."""
+        """The step channel, or the channel of an image leaf, of each sub-environment in `envs`."""
         if len(envs) and int(envs.max()) >= len(self.channels):
             raise FormatError(
                 f"an episode names sub-environment {envs.max()}, but there are {len(self.channels)}"

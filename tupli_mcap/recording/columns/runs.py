@@ -1,4 +1,4 @@
-"""Which rows of which chunks go where: runs of a channel's rows, or any rows of many files, cut at the chunks."""
+"""Finds the chunks that hold rows: runs of one channel's rows, or any rows of many files, cut at the chunks."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
-_FEW = 4  # so many pieces are copied one by one
+_FEW = 4  # up to this many pieces are copied one by one
 Numbers = Array | Sequence[int]
 
 
 class Part(NamedTuple):
-    """Rows of one chunk: `steps[i]` of them from row `begin[i]` on, which go to `out[i]` on. int64, or lists where few.
+    """Rows of one chunk: `steps[i]` rows from row `begin[i]` on go to the places from `out[i]` on.
 
-    Without `steps`, one row each. `file` is the number of the file among several.
+    These are int64 arrays, or lists if they are short. Without `steps`, each is one row. `file` is the number of the
+    file among several.
     """
 
     file: int
@@ -28,7 +29,7 @@ class Part(NamedTuple):
     out: Numbers
 
     def indexes(self) -> tuple[slice | Array, slice | Array]:
-        """The rows of the chunk, and where they go."""
+        """The rows in the chunk, and their places in the columns."""
         begin, out = np.asarray(self.begin), np.asarray(self.out)
         if self.steps is None:
             return begin, out
@@ -47,7 +48,7 @@ class Part(NamedTuple):
             for name, target in targets:
                 target[places] = rows[name][source]
             return
-        picked = rows.take(source)  # whole rows: one walk through the chunk instead of one a field
+        picked = rows.take(source)  # whole rows: one pass over the chunk instead of one for each field
         for name, target in targets:
             target[places] = picked[name]
 
@@ -65,7 +66,7 @@ def _indexes(begin: Array, steps: Array) -> slice | Array:
 
 
 class Runs(NamedTuple):
-    """Consecutive rows of a channel each, which go to the columns one run after the other; int64 arrays, or lists."""
+    """Runs of consecutive rows of a channel, which go to the columns one after the other; int64 arrays, or lists."""
 
     channels: Numbers
     first: Numbers
@@ -73,13 +74,13 @@ class Runs(NamedTuple):
 
 
 def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
-    """The runs of index rows, in their order; neighbours that continue each other are one run.
+    """The runs of episodes (index rows) in their order; runs that follow each other in the file are joined.
 
     Args:
-        channels: that of each sub-environment.
+        channels: of the sub-environments.
 
     Raises:
-        FormatError: an episode is of another sub-environment.
+        FormatError: an episode names another sub-environment.
     """
     env = episodes["env"].astype(np.int64)
     if len(env) and env.max() >= len(channels):
@@ -89,7 +90,7 @@ def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
 
 
 def final_runs(episodes: Array, channel: int) -> Runs:
-    """The runs of the final states of index rows in `/final_state`."""
+    """The runs in `/final_state` of the final states of episodes (index rows)."""
     rows = episodes["final_row"].astype(np.int64)
     return _joined(np.full_like(rows, channel), rows, np.ones_like(rows))
 
@@ -106,9 +107,9 @@ def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
     """The parts of some runs, one for each chunk.
 
     Raises:
-        FormatError: there are no such rows.
+        FormatError: the recording has no such rows.
     """
-    if len(runs.first) <= _FEW:  # a window, an episode: arrays would take longer than it is worth
+    if len(runs.first) <= _FEW:  # a window or an episode: array operations take longer
         return _of_few(runs, store)
     channels, first, steps = map(np.asarray, runs)
     chunks, begin, counts = store.locate(channels, first, steps)
@@ -148,8 +149,8 @@ def _by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Arra
 class Segments(NamedTuple):
     """Rows 0 to n - 1 that lie in chunks of several recordings.
 
-    Segment i holds the rows from `starts[i]` (int64, ascending, the next one ends it) on, which are those of chunk
-    `units[i]` from `begins[i]` on. A unit is a chunk of a file: `file_of` and `chunk_of` say which.
+    Segment i holds the rows from `starts[i]` (int64, ascending) up to the next start: they are the rows of unit
+    `units[i]` from its row `begins[i]` on. A unit is the chunk `chunk_of` of the file `file_of`.
     """
 
     total: int
@@ -160,12 +161,12 @@ class Segments(NamedTuple):
     chunk_of: Array
 
     def of(self, rows: Array) -> Array:
-        """The segments that rows lie in."""
+        """The segment of each row."""
         found: Array = np.searchsorted(self.starts, rows, side="right") - 1
         return found
 
     def parts(self, rows: Array | slice) -> list[Part]:
-        """The parts of rows, in any order, one for each chunk; a slice is of rows that there are, and not empty."""
+        """The parts of rows in any order, one for each chunk; a slice must not be empty or go beyond the rows."""
         if isinstance(rows, slice):
             return self._between(rows.start, rows.stop)
         if not len(rows):
@@ -187,7 +188,7 @@ class Segments(NamedTuple):
 
 
 def _by_value(values: Array) -> list[tuple[int, Array]]:
-    """The different values, ascending, and where each of them is."""
+    """The different values, ascending, and the places of each."""
     if (values == values[0]).all():
         return [(int(values[0]), np.arange(len(values)))]
     order = np.argsort(values, kind="stable")
@@ -205,7 +206,7 @@ class SegmentsBuilder:
         self._parts: list[tuple[Array, Array, Array, Array]] = []  # starts, file, chunk, begin
 
     def add(self, file: int, chunks: Array, begins: Array, steps: Array) -> None:
-        """Appends pieces of a file's chunks, each of `steps` rows, in their order."""
+        """Appends pieces of a file's chunks in their order: `steps[i]` rows of `chunks[i]` from `begins[i]` on."""
         starts = self._total + np.cumsum(steps) - steps
         self._parts.append((starts, np.full(len(chunks), file), chunks, begins))
         self._total += int(steps.sum())
@@ -213,7 +214,7 @@ class SegmentsBuilder:
     def build(self) -> Segments:
         parts = [np.concatenate([np.empty(0, np.int64), *part]) for part in zip(*self._parts, strict=True)]
         starts, files, chunks, begins = parts or [np.empty(0, np.int64)] * 4
-        # a piece that continues the one before, in the same chunk, is of its segment
+        # a piece that continues the one before in the same chunk belongs to its segment
         new = (np.diff(files, prepend=-1) != 0) | (np.diff(chunks, prepend=-1) != 0)
         new[1:] |= np.diff(begins) != np.diff(starts)
         starts, files, chunks, begins = (each[new] for each in (starts, files, chunks, begins))

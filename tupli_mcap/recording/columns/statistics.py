@@ -1,4 +1,4 @@
-"""What the values of a leaf are like, element by element, in memory that does not grow with the steps."""
+"""Statistics of a leaf's values, element by element; their memory does not grow with the steps."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from gymnasium import spaces
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.spaces.leaves import Leaf
 
-_MOST_CHOICES = 1 << 14  # of all elements together, up to which they are counted
-_NARROW = 64  # elements a step up to which a transposed copy makes reductions quicker
+_MOST_CHOICES = 1 << 14  # up to this many values of all elements together are counted
+_NARROW = 64  # up to this many elements for each step, a transposed copy makes reductions faster
 _INT64_MAX = 2**63 - 1
-# bools have no range, and NumPy is slow with float16
+# NumPy has no minimum of bools, and is slow with float16
 _WIDER: dict[str, DType] = {"bool": np.dtype(np.uint8), "float16": np.dtype(np.float32)}
 
 
 class ElementStatistics:
-    """Statistics of a leaf of constant size. Every array has an entry for each element that is looked at.
+    """Statistics of a leaf of constant size. Every array has one entry for each chosen element.
 
     Args:
-        leaf: whose values are looked at.
+        leaf: the leaf.
         dtype: of the values.
-        elements: of the flattened leaf (C order), those that are looked at; None: all.
+        elements: the chosen elements of the flattened leaf (C order); None for all.
 
     Attributes:
         low, high: the smallest and the largest value that the space allows.
-        seen: values of each element.
-        nan, infinite: how many of them are (int64).
-        least, most: of the finite values; as far apart the wrong way as can be where there is none.
-        choices: how often each value from `low` on occurs; empty for a Box, and where there are more than 16,384.
+        seen: number of values of each element.
+        nan, infinite: numbers of values that are NaN or infinite, int64.
+        least, most: of the finite values; without any, `least` is the largest and `most` the smallest possible value.
+        choices: how often each value from `low` on occurs; empty for a Box, and for more than 16,384 values.
     """
 
     def __init__(self, leaf: Leaf, dtype: DType, elements: Array | None = None) -> None:
@@ -51,23 +51,23 @@ class ElementStatistics:
 
     @property
     def finite(self) -> Array:
-        """How many values are finite."""
+        """Numbers of finite values."""
         found: Array = self.seen - self.nan - self.infinite
         return found
 
     @property
     def mean(self) -> Array:
-        """Of the finite values; NaN where there is none."""
+        """Mean of the finite values; NaN if there is none."""
         return np.where(self.finite, self._mean, np.nan)
 
     @property
     def std(self) -> Array:
-        """The population standard deviation of the finite values; NaN where there is none."""
+        """Population standard deviation of the finite values; NaN if there is none."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(self._squares / self.finite)
 
     def add(self, columns: Array) -> None:
-        """Takes values of each element: shape (elements, values)."""
+        """Adds values of each element: shape (elements, values)."""
         if not columns.size:
             return
         columns, before = columns.astype(self.dtype, copy=False), self.finite
@@ -88,7 +88,7 @@ class ElementStatistics:
             counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
 
     def _add_moments(self, columns: Array, finite: Any, before: Array) -> None:
-        """Chan, Golub and LeVeque (1983): mean and sum of squares of two sets out of those of each."""
+        """Joins mean and sum of squares of two sets of values: Chan, Golub and LeVeque (1983)."""
         count = self.finite - before
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # numbers may be too large to add
             mean = columns.sum(axis=1, dtype=np.float64, where=finite) / count
@@ -100,13 +100,13 @@ class ElementStatistics:
 
 
 def columns_of(values: Array) -> Array:
-    """Values of a leaf, shape (n, ...), as one row for each element: shape (elements, n)."""
+    """Values of a leaf, shape (n, ...), with one row for each element: shape (elements, n)."""
     flat = values.reshape(len(values), math.prod(values.shape[1:]))
     return np.ascontiguousarray(flat.T) if flat.shape[1] <= _NARROW else flat.T
 
 
 def element_bounds(leaf: Leaf) -> tuple[Array, Array]:
-    """The smallest and largest value the space allows, of each element of a leaf of constant size (C order)."""
+    """The smallest and largest value that the space allows for each element of a leaf of constant size (C order)."""
     space = leaf.space
     if isinstance(space, spaces.Box):
         return space.low.reshape(-1), space.high.reshape(-1)
@@ -115,6 +115,6 @@ def element_bounds(leaf: Leaf) -> tuple[Array, Array]:
         starts, counts = [int(space.start)], [int(space.n)]
     elif isinstance(space, spaces.MultiDiscrete):
         starts, counts = np.asarray(space.start).reshape(-1).tolist(), space.nvec.reshape(-1).tolist()
-    # As Python's integers: a file may claim choices beyond what int64 holds.
+    # Python's integers: a file may claim choices beyond int64.
     ends = [min(start + n - 1, _INT64_MAX) for start, n in zip(starts, counts, strict=True)]
     return np.array([min(start, _INT64_MAX) for start in starts], np.int64), np.array(ends, np.int64)

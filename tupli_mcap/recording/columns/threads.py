@@ -7,21 +7,21 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-_FEW = 4  # so many are done before a thread has started
+_FEW = 4  # up to this many tasks take less time than to start a thread
 
 
 def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
-    """Does all of the tasks, in `threads` threads, of which the calling one is the first.
+    """Runs all tasks on `threads` threads, the calling one included.
 
-    The first error of a task is raised when the tasks at work have ended; the others are left out.
+    After an error no further task begins; the first error is raised once running tasks have ended.
     """
-    # Not a future for each task: who waits for them wakes up at every one, and takes the interpreter from the workers.
+    # No future for each task: a thread that waits for them wakes up at every one, and takes the interpreter lock.
     left = deque(tasks)
     if threads < 2 or len(left) <= _FEW:
         _work(left, left.popleft)
         return
-    # From both ends: neighbouring tasks write to neighbouring pages, and threads that need a new one at once wait for
-    # each other.
+    # From both ends: neighbouring tasks write to neighbouring pages, and threads that touch new pages there at the same
+    # time wait for each other.
     ends = itertools.cycle((left.pop, left.popleft))
     with ThreadPoolExecutor(threads - 1) as pool:
         others = [
@@ -33,7 +33,7 @@ def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
 
 
 def _work(left: deque[Callable[[], None]], take: Callable[[], Callable[[], None]]) -> None:
-    """Takes one task after the other, as long as there are some."""
+    """Runs one task after the other until none is left."""
     try:
         while True:
             try:

@@ -1,14 +1,14 @@
-"""New recordings out of others.
+"""Makes new recordings of others.
 
-assemble                          the new file: writes chunks, or copies them as they are, index and summary
-copy_episodes                     episodes of a recording into it, under new numbers
-merge, split                      several recordings into one, numbered on; one into several
-stream                            a recording of some episodes, handed on while it is made
+assemble                          writes or copies the chunks of the new file, its index and summary
+copy_episodes                     copies episodes of a recording into it
+merge, split                      joins several recordings into one; splits one into several
+stream                            yields the bytes of a recording of some episodes while it is made
 rewrite                           a recording with fewer episodes
 relabel, trim                     a recording with other values of steps; with fewer steps of episodes
-made_of                           what a recording was made of
-attach, annotate                  adds attachments; says more about episodes and the run
-carry_runs                        what recordings say of runs and episodes, for one made of them
-repair                            a recording out of a damaged one
-replacing                         the new file takes the place of the old one
+made_of                           names the recordings that a recording was made of
+attach, annotate                  adds attachments; annotates episodes, and edits the run
+carry_runs                        runs and annotations of a recording that is made of others
+repair                            a recording made of a damaged one
+replacing                         puts a new file in the place of an old one
 """

@@ -1,4 +1,4 @@
-"""Says more about episodes, and about the run, of a finished recording. Its steps stay as they are, byte for byte."""
+"""Annotates episodes of a finished recording, and edits its run. All chunks stay unchanged, byte for byte."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
-_MOST_EDITS = 20  # that can be taken back
+_MOST_EDITS = 20  # edits that can be undone
 
 
 def annotate_episodes(
@@ -36,18 +36,18 @@ def annotate_episodes(
     *,
     dry_run: bool = False,
 ) -> list[int]:
-    """Gives episodes (their numbers; all by default) values that count more than the metadata that were recorded.
+    """Gives episodes (their numbers; all by default) values that take precedence over the recorded metadata.
 
-    A value of None takes a key away. Who said it and when is kept. A signature is left out: it is of what was there.
-    The end of the file is written anew, in one rename.
+    A value of None removes a key. The annotation keeps the user's name and the time. A signature is removed, since it
+    no longer fits. The file is replaced in one rename.
 
     Returns:
         The numbers of the episodes.
 
     Raises:
-        RecordingError: there are no such episodes, or no values; JSON cannot hold one; the recording is not finished,
-            or cannot be written.
-        FormatError: it is damaged.
+        RecordingError: there are no such episodes, or no values; JSON cannot hold a value; the recording is not
+            finished, or cannot be written.
+        FormatError: the recording is damaged.
     """
     with _changing(path, dry_run) as (recording, say):
         known = recording.index["episode"].tolist()
@@ -72,10 +72,10 @@ def annotate_episodes(
 
 
 def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> Annotation:
-    """Takes back what was said about episodes last, and returns it.
+    """Removes the last annotation, and returns it.
 
     Raises:
-        RecordingError: nothing was said; otherwise as `annotate_episodes`.
+        RecordingError: there is no annotation. Other errors are those of `annotate_episodes`.
     """
     with _changing(path, dry_run) as (recording, say):
         said = Annotations()
@@ -96,10 +96,10 @@ def edit_run(
     split: str | None = None,
     dry_run: bool = False,
 ) -> Run:
-    """Changes what a recording says of its run, and returns it; what is not given stays.
+    """Changes the given parts of a recording's run, and returns the new run.
 
-    `metadata` are added to those that there are; a value of None takes a key away. The recording keeps its identity,
-    and what was said before, for `undo_edit`.
+    `metadata` are added to the run's own; a value of None removes a key. The recording keeps its UUID, and the earlier
+    version of the run for `undo_edit`.
 
     Raises:
         RecordingError: as `annotate_episodes`; or the recording was made of several runs.
@@ -120,7 +120,7 @@ def edit_run(
 
 
 def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
-    """Takes back the last `edit_run`, and returns the run as it is then.
+    """Undoes the last `edit_run`, and returns the earlier run.
 
     Raises:
         RecordingError: as `edit_run`; or nothing was edited.
@@ -136,7 +136,7 @@ def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
 
 
 def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, Sequence[Run]]:
-    """The run of a recording, and what it was before it was edited."""
+    """The run of a recording, and its versions before edits."""
     if len(recording.runs) > 1:
         raise RecordingError(
             f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
@@ -149,10 +149,9 @@ def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, 
 def _changing(
     path: str | os.PathLike[str], dry_run: bool
 ) -> Iterator[tuple[Recording, Callable[[str, str, bytes], None]]]:
-    """A recording that nobody else writes to meanwhile, and a function that replaces an attachment of it.
+    """Locks a recording; yields it, and a function that replaces one of its attachments (name, media type, bytes).
 
-    The function takes name, media type and bytes; it warns of a signature that is left out. In a dry run it does no
-    more, and the recording is not kept.
+    The function warns if it removes a signature. In a dry run it does nothing else, and the recording is not locked.
     """
 
     with nullcontext(path) if dry_run else held(path) as place, Recording(place) as recording:

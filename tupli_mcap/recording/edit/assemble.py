@@ -1,4 +1,4 @@
-"""Puts a recording together from what others hold: every command that makes a file out of files writes through this."""
+"""Writes a recording made of parts of others. Every command that makes a recording of others uses it."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ _CHUNK = 256 * 1024
 
 
 class CopiedEpisode(NamedTuple):
-    """What a recording says of an episode beside its steps, numbered as it is to be.
+    """The records of an episode besides its steps, with its new numbers.
 
-    starts: (log_time, start) of the resets without a step before it, and of its own.
-    end: (log_time, end). end_row: the row of that in its source, which decides between ends of one time.
-    final: log_time of its final state, and what gives the body of that; None where it is not known.
+    Attributes:
+        starts: (log_time, start) of the resets without a step before it, and of its own.
+        end: (log_time, end).
+        end_row: row of the end in its source, which orders ends with equal times.
+        final: log_time of its final state, and a function that returns the message's body; None if it is not known.
     """
 
     starts: Sequence[tuple[int, EpisodeStart]]
@@ -40,15 +42,15 @@ class CopiedEpisode(NamedTuple):
 
 
 class Assembler:
-    """A recording that is put together: `begin`, then rows channel by channel, then `finish`.
+    """Writes a recording: call `begin`, then add rows channel by channel, then `finish`.
 
-    Rows are numbered in the order in which they come. Times of a channel never decrease, as a file must have them.
+    Rows get their numbers in the order in which they are added. Times that would decrease within a channel are raised.
 
     Attributes:
-        container: what it is written to.
+        container: the target.
         index: the episodes so far.
-        held: rows whose `log_time` was raised to that of the row ahead.
-        copied: chunks that were copied as they are.
+        held: number of rows whose `log_time` was raised to that of the row ahead.
+        copied: number of chunks that were copied unchanged.
     """
 
     def __init__(self, container: Container) -> None:
@@ -68,11 +70,11 @@ class Assembler:
             self.container.add_attachment(name, media_type, data, time_ns)
 
     def next_row(self, channel: int) -> int:
-        """How many rows a channel has."""
+        """The number of rows that a channel has, and so the number of its next one."""
         return self.container.counts[channel]
 
     def latest(self, channel: int) -> int:
-        """The time (ns) of a channel's last row, before which no other one may be."""
+        """The time (ns) of a channel's last row; later rows must not have an earlier one."""
         return self._latest.get(channel, 0)
 
     def copy_first(self, source: OpenFile, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
@@ -101,7 +103,7 @@ class Assembler:
             self._add_batch(channel, batch)
 
     def _add_batch(self, channel: int, batch: list[Array]) -> None:
-        # as bytes: concatenating arrays would drop what lies between their fields
+        # as bytes: NumPy may not copy the padding between fields
         data = bytearray().join(part.tobytes() for part in batch)
         rows: Array = np.frombuffer(data, batch[0].dtype)
         if not len(rows):
@@ -140,7 +142,7 @@ class Assembler:
         self._latest[rows.channel] = int(rows.times[-1])
 
     def add_episodes(self, episodes: Sequence[CopiedEpisode]) -> None:
-        """Adds starts, ends and final states in the order of their times, and the episodes to the index in theirs."""
+        """Adds starts, ends and final states in the order of their times, and the episodes to the index."""
         ids = {channel.topic: channel.id for channel in self.container.channels.values()}
         by_start = sorted(range(len(episodes)), key=lambda i: episodes[i].starts[-1][0])
         by_end = sorted(range(len(episodes)), key=lambda i: (episodes[i].end[0], episodes[i].end_row))
@@ -187,7 +189,7 @@ class Assembler:
 
 
 def _in_time(messages: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
-    """Times that never decrease."""
+    """The messages with times raised so that they never decrease."""
     times = itertools.accumulate((time_ns for time_ns, _ in messages), max)
     return [(time_ns, body) for time_ns, (_, body) in zip(times, messages, strict=True)]
 

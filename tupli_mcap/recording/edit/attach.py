@@ -1,4 +1,4 @@
-"""Attachments added to a finished recording; everything else in it stays as it is, byte for byte."""
+"""Adds attachments to a finished recording; everything else in it stays unchanged, byte for byte."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ def add_attachments(
 ) -> None:
     """Adds attachments (name -> media type, bytes) behind the chunks of a recording, or replaces those of their name.
 
-    Those that `without` names are left out.
-
-    The file is replaced in one rename: it is the old one or the new one, whatever happens to this process.
+    Attachments that `without` names are removed. The file is replaced in one rename, so that it is always the old one
+    or the new one.
 
     Raises:
         RecordingError: the recording is not finished, is being written, or cannot be written.
@@ -41,14 +40,14 @@ def add_attachments(
 
 @contextlib.contextmanager
 def held(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """The file at a path, where links have been followed; nobody else writes to it in the block.
+    """Locks the file at a path against other writers for the block; yields the path with symbolic links followed.
 
-    What is said of a recording depends on what was said before: read it in the block, then `attach` it.
+    If a new attachment depends on the old one, read the old one within the block, then `attach` the new one.
 
     Raises:
-        RecordingError: somebody else writes to it for longer than a moment.
+        RecordingError: another writer holds the lock for longer than a moment.
     """
-    place = Path(os.path.realpath(path))  # not a symbolic link is replaced, but what it names
+    place = Path(os.path.realpath(path))  # the file that a symbolic link names is replaced, not the link
     lock = FileLock(place, "a")
     try:
         yield place
@@ -91,7 +90,7 @@ def _write(
     restore_container(container, contents, source)
     gone = {*attachments, *without}
     kept = [index for index in container.attachment_indexes if index.name not in gone]
-    # the bytes of a replaced attachment are dropped where it is the last one; elsewhere they stay, unreferenced
+    # if a replaced attachment is the last one its bytes are dropped; otherwise they stay, unreferenced
     last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
     end = contents.data_end
     if last is not None and last not in kept and last.offset + last.length == end:

@@ -1,4 +1,4 @@
-"""What recordings say of their runs, and of episodes afterwards, for one that is made of them."""
+"""Runs and annotations of a recording that is made of others."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from tupli_mcap.recording.recording import Recording
 
 
 def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple[str, bytes]]:
-    """The attachments that say of each episode which run it is of, and what was said about it.
+    """The attachments `run.json` and `annotations.json` of a recording made of `parts`.
 
     Args:
-        parts: recordings in the order of their episodes in the new one: rows of their index, and what is added to the
-            numbers of these episodes.
+        parts: (recording, rows of its index, shift of their episode numbers), in the order of the episodes in the new
+            recording.
     """
     runs: list[Run] = []
     places: list[int] = []

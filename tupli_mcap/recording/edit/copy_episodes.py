@@ -1,4 +1,4 @@
-"""Copies episodes of recordings into another one: renumbers rows, and copies chunks in which nothing changes."""
+"""Copies episodes of recordings into another one: renumbers rows, and copies chunks whose rows stay the same."""
 
 from __future__ import annotations
 
@@ -20,30 +20,32 @@ from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
 
-_NUMBERS = struct.Struct("<II")  # an episode's, and a step's or a sub-environment's
+_NUMBERS = struct.Struct("<II")  # number of the episode, then of the step or the sub-environment
 
 
 class NewFrames(Protocol):
-    """Frames of some episodes, which take the place of those that a camera has of them."""
+    """New frames of a camera for some episodes, in place of the recorded ones."""
 
     camera: str
 
     def of(self, episode: int) -> Iterable[tuple[int, EncodedFrame]] | None:
-        """(step, frame) of an episode, in order; None: what the recording has of it stays."""
+        """(step, frame) of an episode, in order; None if the episode keeps its recorded frames."""
         ...
 
 
 class Column(Protocol):
-    """A value for each row of a channel: a list, or something that gives arrays."""
+    """A value for each row of a channel: a list, or an object that returns arrays."""
 
     def __getitem__(self, rows: Any, /) -> Any: ...
 
 
 class NewValues(NamedTuple):
-    """Values in place of those that were recorded.
+    """New values in place of the recorded ones.
 
-    columns: by channel and field of its messages, a value for each of the channel's rows. returns: of episodes, by
-    number. finals: final states, by number of the episode, as they follow `episode` and `env` in `/final_state`.
+    Attributes:
+        columns: by channel and field of its messages, a value for each row of the channel.
+        returns: by number of the episode.
+        finals: final states by number of the episode: what follows `episode` and `env` in `/final_state`.
     """
 
     columns: Mapping[int, Mapping[str, Column]]
@@ -52,9 +54,9 @@ class NewValues(NamedTuple):
 
 
 class Trim(NamedTuple):
-    """What stays of an episode: its steps from `start` to before `stop`, and their return.
+    """The part of an episode that stays: its steps `start:stop`, and their return.
 
-    `final` is the state after them, as it follows `episode` and `env` in `/final_state`; None where its end stays.
+    `final` is the state after them (what follows `episode` and `env` in `/final_state`); None if the end stays.
     """
 
     start: int
@@ -67,14 +69,14 @@ class EpisodeCopier:
     """Appends episodes of `source` to `target`.
 
     Args:
-        channels: the target's ids of the source's channels, where they differ.
+        channels: the target's ids of the source's channels, if they differ.
         shift: added to the numbers of the episodes.
-        first_env: the target's sub-environment that the source's first one becomes; None: each stays what it is.
+        first_env: the target's sub-environment that the source's first one becomes; None to keep all numbers.
         cameras: by camera, then by sub-environment, the ids of its channels.
-        frames: of a camera, in place of the source's.
-        values: of steps, in place of the source's.
-        trims: of episodes of which some steps stay, by number.
-        layout: of the target, where it is the source's `without` some fields.
+        frames: new frames of a camera, in place of the source's.
+        values: new values of steps, in place of the source's.
+        trims: by number, the steps that stay of an episode.
+        layout: of the target, if it differs: the source's `without` some fields.
     """
 
     def __init__(
@@ -101,17 +103,17 @@ class EpisodeCopier:
         self._cameras, self._new_frames = cameras, frames
         self._file = source.file
         self._store, self._topics = source.file.store, source.file.topics
-        # by channel, the time of the last new frame: times must not decrease, whatever the clock did
+        # by channel, the time of the last new frame: times must not decrease, even if the clock went back
         self._held: dict[int, int] = {}
 
     def run(self, rows: Array) -> None:
-        """Copies the episodes that `rows` of the source's index name."""
+        """Copies the episodes in `rows` of the source's index."""
         self._target.add_episodes(self.copy(rows))
 
     def copy(self, rows: Array) -> list[CopiedEpisode]:
-        """Copies the steps of episodes, with their images, frames and infos; returns what is to be said of them.
+        """Copies the steps of episodes with their images, frames and infos; returns their other records.
 
-        Infos are left to `infos` where the source's sub-environments become others.
+        If sub-environments get other numbers, it does not copy infos: the caller adds those of `infos`.
         """
         layout = self._source.layout
         infos = INFO in self._topics and self._to(self._topics[INFO]) in self._target.container.channels
@@ -134,7 +136,7 @@ class EpisodeCopier:
         return self._episodes(rows, firsts)
 
     def _trimmed(self, rows: Array) -> Array:
-        """The index's rows as they are of the steps that stay; `first_row` counts in the source."""
+        """The index rows of the steps that stay; `first_row` is the row in the source."""
         rows = rows.copy()
         for row in rows:
             trim = self._trims.get(int(row["episode"]))
@@ -156,7 +158,7 @@ class EpisodeCopier:
         return time_ns
 
     def _to(self, channel: int) -> int:
-        """The target's id of a channel."""
+        """The id of a channel in the target."""
         return self._channels.get(channel, channel)
 
     def _copy_first(self, channel: int, count: int, dtype: np.dtype[Any] | None) -> int:
@@ -167,7 +169,7 @@ class EpisodeCopier:
         return self._target.copy_first(self._file, channel, count, dtype)
 
     def _copy(self, channel: int, spans: list[tuple[int, int]], dtype: np.dtype[Any] | None) -> None:
-        """Rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
+        """Copies rows `spans` of a channel of steps or images, renumbered, in chunks of the usual size."""
         self._store.fetch(
             span.chunk for first, count in spans for span in self._store.spans(channel, first, count)
         )
@@ -214,7 +216,7 @@ class EpisodeCopier:
                 yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
 
     def _step_messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
-        """Those of a channel of steps that differ in size, with new values, or without some."""
+        """(log_time, body) of steps of variable size, with new values, or without some fields."""
         messages, new = self._messages(channel, first, count), self._values.columns.get(channel, {})
         if not new and self._is_whole:
             yield from messages
@@ -225,12 +227,12 @@ class EpisodeCopier:
             values = decoder.step(memoryview(body)) | {name: column[row] for name, column in new.items()}
             out = bytearray(body[:8])
             for leaf, encode in encoders:
-                if leaf.name in values:  # others are empty
+                if leaf.name in values:  # leaves without elements have no field
                     encode(values[leaf.name], out, 0)
             yield time_ns, bytes(out) + body[-2:]
 
     def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:
-        """The rows `places` (ascending) of a channel of single messages."""
+        """Copies the rows `places` (ascending) of a channel as single messages."""
         moved = np.flatnonzero(places != np.arange(len(places)))
         same = int(moved[0]) if len(moved) else len(places)
         done = 0 if numbered and self._trims else self._copy_first(channel, same, None)
@@ -239,7 +241,7 @@ class EpisodeCopier:
         self._write(channel, messages, numbered=numbered)
 
     def _write(self, channel: int, messages: Iterable[tuple[int, bytes]], *, numbered: bool = False) -> None:
-        """Adds messages of a channel (log_time, body); `numbered` ones begin with those of an episode and a step."""
+        """Adds messages (log_time, body) of a channel; `numbered` ones begin with `episode` and `step`."""
         if numbered and (self._shift or self._trims):
             messages = ((time_ns, self._renumbered(body)) for time_ns, body in messages)
         self._target.add_messages(self._to(channel), messages)
@@ -250,7 +252,7 @@ class EpisodeCopier:
         return _NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
 
     def _episodes(self, rows: Array, firsts: Array) -> list[CopiedEpisode]:
-        """What is said of each episode, with the numbers it has in the target."""
+        """The other records of each episode, with its numbers in the target."""
         found, env = [], self._first_env or 0
         for row, first, starts in zip(rows, firsts.tolist(), self._starts(rows), strict=True):
             number = int(row["episode"])
@@ -276,7 +278,7 @@ class EpisodeCopier:
         return found
 
     def _final(self, row: Any, numbers: bytes) -> tuple[int, Callable[[], bytes]] | None:
-        """log_time of a final state, and what gives its body, with its new numbers; None where it is not known."""
+        """log_time of a final state, and a function that returns its body with new numbers; None if it is not known."""
         trim = self._trims.get(int(row["episode"]))
         if trim is not None and trim.final is not None:
             return int(row["end_time"]), partial(bytes, numbers + trim.final)
@@ -320,7 +322,7 @@ class EpisodeCopier:
         return found
 
     def _frames(self, rows: Array) -> None:
-        """The frames of episodes: pictures, and what they show row by row."""
+        """Copies the frames of episodes: `/camera` and `/frame`."""
         source, new = self._source, self._new_frames
         for camera, channels in self._cameras.items():
             for env, (pictures, pairs) in enumerate(channels):
@@ -338,7 +340,7 @@ class EpisodeCopier:
                     self._copy_places(theirs[1], joined, numbered=True)
 
     def _frame_rows(self, camera: str, row: Any) -> Array:
-        """Which rows of its channels show an episode."""
+        """The rows of a camera that show an episode."""
         number, length = int(row["episode"]), int(row["length"])
         start = self._trims[number].start if number in self._trims else 0
         places, steps, _ = self._file.cameras.rows(camera, int(row["env"]), number, start + length)
@@ -347,7 +349,7 @@ class EpisodeCopier:
     def _frames_of(
         self, new: NewFrames, row: Any, channel: int, pictures: bool
     ) -> Iterator[tuple[int, bytes]]:
-        """(log_time, body) of the messages of an episode's frames: new ones, or those that stay."""
+        """(log_time, body) of the messages of an episode's frames, new or recorded ones."""
         number = int(row["episode"])
         drawn = new.of(number)
         if drawn is not None:
@@ -360,7 +362,7 @@ class EpisodeCopier:
                 yield from self._messages(channel, place, 1)
 
     def _infos(self, rows: Array) -> Array:
-        """Which rows of `/info` are of the episodes, and of steps that stay."""
+        """The rows of `/info` that belong to the episodes and to steps that stay."""
         channel = self._topics[INFO]
         messages = self._messages(channel, 0, self._store.count(channel))
         numbers = np.array([_NUMBERS.unpack_from(body) for _, body in messages], np.int64).reshape(-1, 2)
@@ -381,7 +383,7 @@ class EpisodeCopier:
 
 
 def _narrowed(rows: Array, dtype: np.dtype[Any]) -> Array:
-    """Rows of constant size with the fields of another such layout, which has only some of theirs."""
+    """Rows of constant size with only the fields of `dtype`."""
     found = np.zeros(len(rows), dtype)
     for name in dtype.names or ():
         found[name] = rows[name]

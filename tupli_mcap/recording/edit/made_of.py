@@ -1,4 +1,4 @@
-"""What a recording was made of: kept as `made_of.json` by whoever makes one out of others."""
+"""The recordings that a recording was made of, and how: `made_of.json`, which every command that edits writes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
 
     Args:
         how: "merge", "filter", "map", "trim".
-        facts: what else was decided: the query, the function's name, the steps.
+        facts: other facts: the query, the function's name, the steps.
     """
     sources = list(sources)
     document = {
@@ -30,7 +30,7 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
             {
                 "name": file_name(
                     recording.name
-                ),  # folders, and what a URL says besides, are nobody else's business
+                ),  # without the folder, or the rest of a URL, which are private
                 "uuid": recording.uuid,
                 "episodes": len(recording),
                 "sha256": hashlib.sha256(
@@ -50,7 +50,7 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
 def _said(recording: Recording) -> dict[str, Any] | None:
     try:
         return made_of(recording)
-    except FormatError:  # damaged, which says nothing of the steps
+    except FormatError:  # damage of this attachment does not concern the steps
         return None
 
 

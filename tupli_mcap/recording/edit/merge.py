@@ -1,4 +1,4 @@
-"""Several recordings as one."""
+"""Merges several recordings into one."""
 
 from __future__ import annotations
 
@@ -40,11 +40,13 @@ _SPACES = ("observation_space", "action_space", "reward_space")
 
 
 class MergeReport(NamedTuple):
-    """What a merge wrote, or would write.
+    """The result of a merge, or of a dry run.
 
-    held: rows whose time was changed: it was before that of the row ahead, which a file does not allow. Only frames
-        that were rendered after the end of their episode can be among them.
-    copied: chunks that were copied as they are. size: bytes; 0 where nothing was written.
+    Attributes:
+        held: number of rows whose time was raised to that of the row ahead. Only frames that were rendered after the
+            end of their episode can need it.
+        copied: number of chunks that were copied unchanged.
+        size: of the file (bytes); 0 if nothing was written.
     """
 
     path: Path
@@ -57,11 +59,11 @@ class MergeReport(NamedTuple):
 
 
 class UnmergeableError(RecordingError):
-    """Recordings that do not go into one."""
+    """The recordings cannot be merged."""
 
 
 class Excerpt(NamedTuple):
-    """Some episodes of a recording: rows of its index, in their order."""
+    """Some episodes of a recording: rows of its index, in order."""
 
     recording: Recording
     rows: Array
@@ -75,18 +77,17 @@ def merge_recordings(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> MergeReport:
-    """Writes one recording, with a UUID of its own, of the episodes of several, in the order of their times.
+    """Writes one recording, with a new UUID, of the episodes of several, in the order of their times.
 
-    Everything comes along: infos, frames, images, final states, metadata, runs, attachments; but no signature and no
-    certificate, which would not hold. Episodes are numbered anew, times stay as they are. Recordings that were made at
-    the same time, or of different numbers of sub-environments, become sub-environments of one; their episodes are
-    numbered one recording after the other, and their runs tell them apart. The environment and the labels are the
-    first one's.
+    It keeps infos, frames, images, final states, metadata, runs and attachments, but no signature and no certificate,
+    which would not fit. Episodes get new numbers, times stay. Recordings that were made at the same time, or that have
+    different numbers of sub-environments, become different sub-environments; their episodes are numbered one recording
+    after the other, and their runs tell them apart. The environment and the labels are those of the first recording.
 
     Raises:
         SpaceError: they have different spaces or dtypes.
-        RecordingError: one cannot be read, holds episodes of another one again, or belongs to another benchmark;
-            attachments of one name differ; the target exists (and not `overwrite`) or cannot be written.
+        RecordingError: one cannot be read, has an episode that another one has, or belongs to another benchmark;
+            attachments of one name differ; the target exists (without `overwrite`) or cannot be written.
         FormatError: one is damaged.
     """
     target = Path(target)
@@ -113,9 +114,9 @@ def merge_recordings(
 def merge_excerpts(
     excerpts: Sequence[Excerpt], container: Container, without: Collection[str] = ()
 ) -> Assembler:
-    """Writes a recording of episodes of several, as `merge_recordings` does. There must be one.
+    """Writes a recording of at least one excerpt, as `merge_recordings` does.
 
-    without: fields that are left out: "states", "actions", "infos", "frames".
+    `without` names fields to leave out: "states", "actions", "infos", "frames".
 
     Raises:
         SpaceError: they have different spaces or dtypes.
@@ -163,7 +164,7 @@ def merge_excerpts(
     target.finish(now)
     if target.held:
         warnings.warn(
-            f"{target.held:,} merged rows have the time of the row ahead of them, which was later than theirs",
+            f"the times of {target.held:,} merged rows were raised to that of the row ahead, which was later",
             UserWarning,
             stacklevel=3,
         )
@@ -173,19 +174,19 @@ def merge_excerpts(
 def check_mergeable(
     excerpts: Sequence[Excerpt], without: Collection[str] = ()
 ) -> tuple[list[Excerpt], dict[str, tuple[str, bytes]]]:
-    """Those with episodes, in the order of their times, and their attachments. Raises as `merge_excerpts`."""
+    """The excerpts with episodes, in the order of their times, and the attachments. Raises as `merge_excerpts` does."""
     sources = sorted((e for e in excerpts if len(e.rows)), key=lambda e: int(e.rows["start_time"].min()))
     _check_alike(sources, without)
     return sources, _attachments([source.recording for source in sources])
 
 
 def _lanes(sources: Sequence[Excerpt], turns: int) -> list[int] | None:
-    """The sub-environment that the first one of each source becomes; None where each stays what it is.
+    """The sub-environment that the first one of each source becomes; None if all keep their numbers.
 
     A channel holds one episode after the other, in the order of their times. So episodes that were recorded at the same
-    time need channels of their own: recordings that overlap become different sub-environments, and one that begins
-    when another one has ended takes its place. Recordings that take too many turns do so, too: every turn costs a look
-    at all infos of its recording, and ends a chunk.
+    time need different channels: recordings that overlap become different sub-environments, and one that begins
+    when another one has ended takes its place. So do recordings that alternate too often: each turn of a recording
+    ends a chunk and reads all of its infos.
     """
     alike = len({(recording.is_vector, recording.num_envs) for recording, _ in sources}) == 1
     if alike and turns < max(_MOST_TURNS, len(sources) + 1) and not _overlap(sources):
@@ -203,7 +204,7 @@ def _lanes(sources: Sequence[Excerpt], turns: int) -> list[int] | None:
 
 
 def _overlap(sources: Sequence[Excerpt]) -> bool:
-    """Whether episodes of two recordings were recorded at the same time."""
+    """Whether two recordings have episodes that were recorded at the same time."""
     which = np.repeat(np.arange(len(sources)), [len(source.rows) for source in sources])
     start, end = (np.concatenate([s.rows[name] for s in sources]) for name in ("start_time", "end_time"))
     order = np.lexsort((end, start))
@@ -227,7 +228,7 @@ def _channels(source: Recording, container: Container, lane: int | None) -> dict
 
 
 def _turns(sources: Sequence[Excerpt]) -> list[tuple[int, np.ndarray]]:
-    """Whose turn it is, and which of its rows it brings then, in the order of their times."""
+    """(source, index rows) in the order of times: the episodes of a source up to the next one of another source."""
     which = np.repeat(np.arange(len(sources)), [len(source.rows) for source in sources])
     place = np.concatenate([np.arange(len(source.rows)) for source in sources])
     start = np.concatenate([source.rows["start_time"] for source in sources])
@@ -239,7 +240,7 @@ def _turns(sources: Sequence[Excerpt]) -> list[tuple[int, np.ndarray]]:
 def _numbered(
     sources: Sequence[Excerpt], turns: Sequence[tuple[int, np.ndarray]]
 ) -> tuple[list[tuple[Recording, np.ndarray, int]], int]:
-    """(recording, rows of its index, what is added to its episodes' numbers) by turn, and the next free number."""
+    """(recording, rows of its index, shift of its episodes' numbers) for each turn, and the next free number."""
     last = {i: turn for turn, (i, _) in enumerate(turns)}
     numbered = []
     free, begun = 0, set()
@@ -257,7 +258,7 @@ def _numbered(
 def _define_missing(
     source: Recording, container: Container, envs: int | None, without: Collection[str]
 ) -> None:
-    """Adds the channels that earlier sources do not have; `envs` is None for those of a single environment."""
+    """Adds the channels that earlier sources do not have; `envs` is None for a single environment."""
     info = None
     contents, topics = source.file.contents, source.file.topics
     if INFO in topics and "infos" not in without:
@@ -317,7 +318,7 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
 
 
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
-    """The attachments of all recordings, without statements that no longer hold."""
+    """The attachments of all recordings, without statements that do not fit the merged one."""
     attachments: dict[str, tuple[str, bytes]] = {}
     carried = [recording for recording in sources if _ENVIRONMENT[0] in recording.attachments]
     other = next((r for r in carried if not _is_same(carried[0].benchmark.record, r.benchmark.record)), None)
@@ -338,8 +339,8 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
             data = recording.read_attachment(name)
             if attachments.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
                 raise UnmergeableError(
-                    f"{recording.name}: its attachment {name!r} differs from that of a recording before; a merged "
-                    "recording can have one of a name only"
+                    f"{recording.name}: its attachment {name!r} differs from that of an earlier recording; a merged "
+                    "recording can have only one of a name"
                 )
     return attachments
 

@@ -1,4 +1,4 @@
-"""A recording with other rewards, actions or states: everything else of it is kept."""
+"""Writes a recording with new rewards, actions or states; everything else stays."""
 
 from __future__ import annotations
 
@@ -42,19 +42,21 @@ def relabel_recording(
 ) -> None:
     """Writes `target` (replaced in one rename) with new values of some fields.
 
-    All else of the steps, infos, frames, times, seeds, metadata, runs and the environment stay; returns follow the
-    rewards. The recording has a UUID of its own, and no signature.
+    The other fields of steps, infos, frames, times, seeds, metadata, runs and the environment stay; returns are
+    computed from the new rewards. The recording has a new UUID and no signature.
 
     Args:
-        function: from an episode to its new column; with several fields, to a dict of columns by field. A column has a
-            value for each step, nested as the space is, which the recording's dtype holds exactly.
-            Of the states it has one more where the final state is known, as `Episode.all_states` has.
+        source: the recording to read.
+        target: path of the new one.
+        function: takes an episode and returns its new column; with several fields, a dict of columns by field. A column
+            has a value for each step, nested as the space is, which the recording's dtype holds exactly. A column of
+            states has one more value if the final state is known, like `Episode.all_states`.
         fields: some of "rewards", "actions" and "states".
-        sources: what the recording is made of, where that is not `source`.
+        sources: the recordings that `made_of.json` names, if that is not `source`.
 
     Raises:
-        RecordingError: another field; the function returns something else.
-        StepError: a value of variable size is none of its space.
+        RecordingError: there is no such field, or the function returns something else.
+        StepError: a value of variable size does not fit its space.
     """
     fields = field_names(fields, _FIELDS)
     name = (
@@ -97,9 +99,9 @@ def _new_values(
 
 
 class _NewColumns:
-    """The columns of `NewValues`, episode by episode; those of constant size lie in files of the directory `spool`.
+    """Collects the columns of `NewValues`, episode by episode; columns of constant size are in files in `spool`.
 
-    As a context manager it closes them.
+    As a context manager it closes these files.
     """
 
     def __init__(self, source: Recording, fields: Sequence[str], spool: Path) -> None:
@@ -117,7 +119,7 @@ class _NewColumns:
         self._open.close()
 
     def put(self, episode: Episode, row: Any, field: str, made: Any) -> None:
-        """Takes the values of a field. One more of the states than there are steps is the final state."""
+        """Adds the values of a field. If there is one more state than steps, it is the final state."""
         first, channel, steps = int(row["first_row"]), self._file.steps[int(row["env"])], len(episode)
         has_final = field == "states" and row["final_row"] >= 0
         lasts = []
@@ -150,7 +152,7 @@ class _NewColumns:
 
 
 class _Spool:
-    """Values of one dtype and shape in a file, written and read by their numbers."""
+    """An array in a file: values of one dtype and shape, written and read by their numbers."""
 
     def __init__(self, path: Path, dtype: DType, shape: tuple[int, ...]) -> None:
         self._file = os.fdopen(files.create(path), "w+b")
@@ -176,9 +178,9 @@ class _Spool:
 
 
 def _checked(made: Any, leaf: Leaf, layout: StepLayout, count: int, where: str) -> Any:
-    """`count` values of a leaf, as they are stored."""
+    """`count` values of a leaf, checked, as they are stored."""
     try:
-        if leaf.kind == "variable":  # its values are looked at when they are encoded
+        if leaf.kind == "variable":  # its values are checked when they are encoded
             values: Sequence[Any] = leaf.get(made)
             if len(values) != count:
                 raise RecordingError(f"expected {count} {where}, found {len(values)}{_hint(where)}")

@@ -1,4 +1,4 @@
-"""Files that take the place of another one, or of none, once they are whole."""
+"""Writes files that replace another one, if there is one, only when they are whole."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from tupli_mcap.errors import RecordingError, os_reason
 
 @contextlib.contextmanager
 def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]]:
-    """A descriptor and the path of a file that becomes `goal`, synced, when the block ends without an error.
+    """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
 
-    Directories that are missing are made.
+    Missing directories are made.
 
     Raises:
-        RecordingError: the system refuses, here or in the block; `goal` is as it was.
+        RecordingError: the system refuses, here or in the block; `goal` is unchanged.
     """
     try:
         goal.parent.mkdir(parents=True, exist_ok=True)
@@ -33,6 +33,6 @@ def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]
 
 
 def tidy(directory: Path) -> None:
-    """Removes what killed processes have left in a directory that is about to be written to."""
-    with contextlib.suppress(OSError):  # whoever writes there will say it
+    """Removes files that killed processes left in a directory."""
+    with contextlib.suppress(OSError):  # writing there will raise it
         files.remove_left(files.left_in(directory))

@@ -1,4 +1,4 @@
-"""A recording written anew: fewer episodes, other attachments. Episode numbers, times and values stay."""
+"""Rewrites a recording with fewer episodes or other attachments. Episode numbers, times and values stay."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def rewrite_recording(
         episodes: numbers of the episodes to keep (all by default).
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
-        frames: of a camera that may be a new one.
+        frames: new frames of a camera, which may be a new one.
 
-    Chunks before the first row that is left out are copied as they are, where they are compressed so already.
-    A signature stays if nothing it covers is changed, and is left out otherwise.
+    Chunks before the first row that is left out are copied unchanged, if their compression is the wanted one. A
+    signature stays if nothing it covers changes, and is left out otherwise.
 
     Raises:
         RecordingError: the target cannot be written.
@@ -60,7 +60,7 @@ def rewrite_recording(
 
 
 def kept_metadata(source: Recording) -> dict[str, str]:
-    """The metadata of a recording that is written anew."""
+    """The metadata of a rewritten recording, which keeps its UUID."""
     metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}
     metadata["next_episode"] = str(source.file.contents.next_episode)
     metadata["rewritten"] = uuid.uuid4().hex
@@ -68,7 +68,7 @@ def kept_metadata(source: Recording) -> dict[str, str]:
 
 
 def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str, str]:
-    """The metadata of a recording of its own that is made of `source`; episodes are numbered on as there by default."""
+    """The metadata of a recording with a new UUID made of `source`; `next_episode` is the source's by default."""
     free = source.file.contents.next_episode if next_episode is None else next_episode
     return {
         "uuid": uuid.uuid4().hex,
@@ -81,7 +81,7 @@ def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str
 
 
 def return_of(layout: StepLayout, rewards: Any, steps: int) -> float:
-    """The return of a column of rewards, added up in the order in which a recorder does."""
+    """The return of a column of rewards, added in the order in which a recorder adds them."""
     reward = reward_getter(layout.reward_space, rewards)
     total = 0.0
     for i in range(steps):
@@ -102,12 +102,12 @@ def write(
     values: NewValues | None = None,
     trims: Mapping[int, Trim] | None = None,
 ) -> int:
-    """Writes some of a source's episodes, and its attachments but those `left_out`, to a new recording.
+    """Writes some of a source's episodes, and its attachments but those in `left_out`, to a new recording.
 
-    `signed`: the episodes are still those that were signed; a signature is kept then, if the attachments allow it.
+    `signed` says that the episodes are those that were signed: then a signature stays if the attachments allow it.
 
     Returns:
-        How many chunks were copied as they are.
+        The number of chunks that were copied unchanged.
     """
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}
     if not (signed and stays_signed(source.attachments, attachments)):
@@ -133,7 +133,7 @@ def write(
 
 
 def define(source: Recording, target: Assembler) -> None:
-    """The source's channels and schemas, with the ids that they have there."""
+    """Adds the source's channels and schemas with the same ids."""
     container, contents = target.container, source.file.contents
     container.schemas, container.channels = dict(contents.schemas), dict(contents.channels)
     container.codecs = image_codecs(source.layout, contents.channels) if source.file.steps else {}

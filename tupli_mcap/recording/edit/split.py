@@ -1,4 +1,4 @@
-"""One recording as several."""
+"""Splits a recording into several."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Part", "split_recording"]
 
 
 class Part(NamedTuple):
-    """A file of a recording that was split, or would be: `first` to `last` are numbers of episodes."""
+    """One of the files that a recording is split into; it has the episodes with the numbers `first` to `last`."""
 
     path: Path
     episodes: int
@@ -40,13 +40,15 @@ def split_recording(
     compression: str = "zstd",
     dry_run: bool = False,
 ) -> list[Part]:
-    """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a UUID of its own.
+    """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a new UUID.
 
-    Episodes keep their numbers, and everything comes along but signature and certificate, which would not hold.
+    Episodes keep their numbers and everything else but signature and certificate, which would not fit.
 
     Args:
-        episodes: in each file.
-        max_bytes: of each file, as far as steps take as many bytes as on average; one episode at least.
+        source: the recording.
+        target: path of the first file.
+        episodes: number of episodes in each file.
+        max_bytes: size of each file, assuming that all steps take the same number of bytes; at least one episode.
 
     Raises:
         RecordingError: neither limit is given, or both; the source cannot be read; a target exists or cannot be
@@ -56,7 +58,7 @@ def split_recording(
     limit = episodes if max_bytes is None else max_bytes
     if (episodes is None) == (max_bytes is None) or not isinstance(limit, int | np.integer) or limit < 1:
         raise RecordingError(
-            "expected how many episodes or how many bytes go into a file, at least 1 of either, found "
+            "expected either a number of episodes or of bytes for each file, at least 1, found "
             f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
         )
     target = Path(target)

@@ -1,4 +1,4 @@
-"""Episodes of recordings as a recording that is handed on while it is made."""
+"""Yields the bytes of a recording of some episodes while it is made."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from tupli_mcap.recording.edit.rewrite import kept_metadata, write
 
 __all__ = ["stream_excerpts"]
 
-_PIECE = 1 << 16  # what a pipe holds
+_PIECE = 1 << 16  # bytes that a pipe holds
 
 
 def stream_excerpts(
     opening: AbstractContextManager[Sequence[Excerpt]], without: Collection[str] = ()
 ) -> Generator[bytes]:
-    """The bytes of a recording of these episodes, no faster than they are taken; each excerpt has some.
+    """The bytes of a recording of these episodes, made as fast as the caller takes them; no excerpt may be empty.
 
-    Of one recording they keep their numbers, and the recording its UUID. Several are merged, as `merge_recordings`
-    does, and so are those `without` some fields ("states", "actions", "infos", "frames"). A thread of its own opens the
-    recordings, writes, and closes them; it gives up once the iterator is closed.
+    Episodes of one recording keep their numbers, and the recording its UUID. Excerpts of several recordings, or
+    `without` some fields ("states", "actions", "infos", "frames"), are merged as by `merge_recordings`. A separate
+    thread opens the recordings, writes, and closes them; it ends when the iterator is closed.
 
     Raises:
-        SpaceError, RecordingError: they cannot be merged.
-        FormatError: one is damaged.
+        SpaceError, RecordingError: the recordings cannot be merged.
+        FormatError: a recording is damaged.
     """
 
     def write(fd: int) -> None:
@@ -51,7 +51,7 @@ def _write(excerpts: Sequence[Excerpt], fd: int, without: Collection[str]) -> No
 
 
 def _through_a_pipe(write: Callable[[int], None]) -> Generator[bytes]:
-    """What `write` writes to a descriptor, by a thread of its own; its errors are raised here."""
+    """The bytes that `write` writes to a descriptor on a separate thread; its errors are raised here."""
     reading, writing = os.pipe()
     failed: list[BaseException] = []
 
@@ -69,7 +69,7 @@ def _through_a_pipe(write: Callable[[int], None]) -> Generator[bytes]:
         while piece := os.read(reading, _PIECE):
             yield piece
     finally:
-        os.close(reading)  # whoever still writes is told so
+        os.close(reading)  # a thread that still writes gets an error
     thread.join()
     if failed:
         raise failed[0]

@@ -1,4 +1,4 @@
-"""A recording whose episodes begin later or end earlier: everything else of them is kept."""
+"""Writes a recording whose episodes begin later or end earlier; everything else stays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tupli_mcap.recording.write.rows.variable import final_encoder
 
 
 class TrimReport(NamedTuple):
-    """What trimming wrote, or would write; `left_out` counts steps, `size` bytes, 0 where nothing was written."""
+    """The result of a trim, or of a dry run: `left_out` steps; `size` of the file (bytes), 0 if none was written."""
 
     path: Path
     episodes: int
@@ -39,14 +39,16 @@ def trim_recording(
 ) -> TrimReport:
     """Writes `target` with only some consecutive steps of some episodes.
 
-    An episode that loses its end ends as interrupted, and the state that followed is its final state. One that loses
-    its beginning has no seed, no options and no reset info, because no reset leads to its first state. Steps are
-    counted anew, and returns are those of the steps that stay; metadata and annotations stay. The recording has a UUID
-    of its own, and no signature.
+    An episode that loses its end ends as interrupted, and the state that followed is its final state. An episode that
+    loses its beginning has no seed, no options and no reset info, because no reset leads to its first state. Steps
+    are numbered from 0, returns are those of the steps that stay; metadata and annotations stay. The recording has a
+    new UUID and no signature.
 
     Args:
-        steps: by number of the episode, which steps stay; other episodes stay whole.
-        sources: what the recording is made of, where that is not `source`.
+        source: the recording to read.
+        target: path of the new one.
+        steps: by number of the episode, the steps that stay; other episodes stay whole.
+        sources: the recordings that `made_of.json` names, if that is not `source`.
 
     Raises:
         RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
@@ -79,7 +81,7 @@ def trim_recording(
 
 
 def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
-    """None where all steps stay."""
+    """The trim of an episode; None if all steps stay."""
     start, stop, stride = kept.indices(len(episode))
     if stride != 1:
         raise RecordingError(f"expected consecutive steps, found a stride of {stride}")

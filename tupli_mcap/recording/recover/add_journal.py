@@ -1,4 +1,4 @@
-"""What the journal of an unfinished recording adds to what is good in the file."""
+"""Adds the rows of an unfinished recording's journal to those in the file."""
 
 from __future__ import annotations
 
@@ -36,11 +36,14 @@ _Taken = TypeVar("_Taken", Array, Rows)
 
 
 def add_journal(evidence: Evidence) -> None:
-    """Reads the journal of an unfinished recording, and takes the rows that the file does not have."""
+    """Reads the journal of an unfinished recording and takes the rows that the file lacks.
+
+    Raises nothing for a missing or damaged journal: `evidence.journal` and `evidence.notes` say it.
+    """
     if evidence.tail.finished or evidence.source.path is None:
         return
     path = evidence.source.path
-    # a journal is made before the channels
+    # a writer makes the journal before the channels
     no_step = not evidence.channels and not evidence.damages
     try:
         path = recorded_journal(path, evidence.metadata or {})
@@ -72,7 +75,7 @@ def add_journal(evidence: Evidence) -> None:
 
 
 def _belongs(evidence: Evidence, journal: JournalContents) -> bool:
-    """Whether the journal has the recording's uuid, or, where that is lost, one that the damaged bytes hold."""
+    """Whether the journal has the recording's uuid, or, if that is lost, one that the damaged bytes hold."""
     uuid = str(journal.info.get("uuid"))
     if evidence.metadata is not None:
         return belongs(journal.info, evidence.metadata)
@@ -85,12 +88,12 @@ def _belongs(evidence: Evidence, journal: JournalContents) -> bool:
 
 
 def take_journal(evidence: Evidence, journal: JournalContents) -> None:
-    """Takes the rows that the file does not have, and what runs, out of its journal.
+    """Takes rows that the file lacks, and the running states, from its journal.
 
-    With `evidence.strict`, rows that go on with those in the file (`rows_of`); else all that are missing.
+    With `evidence.strict` it takes the rows that continue those in the file (`rows_of`), else all that are missing.
 
     Raises:
-        FormatError: the journal has not what it must have.
+        FormatError: the journal is damaged, or lacks an area.
     """
     define(evidence, journal)
     steps = step_channels(evidence.channels, evidence.source.name)
@@ -102,25 +105,25 @@ def take_journal(evidence: Evidence, journal: JournalContents) -> None:
 def take_rows(
     evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: RecordedChannels
 ) -> None:
-    """The same of a journal whose channels are known; takes the steps of `channels`, which may be those of the first
-    sub-environments."""
+    """As `take_journal`, when the channels are known; takes the steps of `channels`, which may be those of the first
+    sub-environments only."""
     in_file = {channel: evidence.stop(channel) for channel in evidence.pieces} if evidence.strict else {}
     for name in journal.areas:
         if name in EVENT_AREAS or name.startswith(FRAMES_AREA):
             _take_log(evidence, journal, name, in_file)
-    # under same-step autoreset; and it is not known what else of that step was lost
+    # Under same-step autoreset the state may be the next episode's, and a power loss may have taken the final state.
     evidence.final_lost = journal.torn and bool(journal.info.get("vector"))
     taking = _Steps(evidence, journal, layout, channels)
     for env in range(len(channels.steps)):
         taking.take(env)
     if size_behind(journal) > evidence.good_end:
-        evidence.states.clear()  # an end may be missing, and what runs be the episode after it
+        evidence.states.clear()  # ends may be missing: a running state may belong to a later episode
 
 
 def define(evidence: Evidence, journal: JournalContents) -> None:
     """Adds the schemas and channels that the journal defines to those known.
 
-    What the journal defines is under its checksum, what the file defines outside of chunks is not.
+    The journal's definitions replace those of the file: they have a checksum, definitions outside of chunks have none.
     """
     where = f"{evidence.source.name}: journal"
     try:
@@ -140,7 +143,7 @@ def define(evidence: Evidence, journal: JournalContents) -> None:
 def _missing(
     evidence: Evidence, channel: int, committed: Committed[_Taken], stop: int | None = None
 ) -> list[_Taken]:
-    """The committed rows before `stop` that are to be taken, in runs of consecutive ones."""
+    """The committed rows before `stop` to take, in runs of consecutive ones."""
     if evidence.strict:
         rows = rows_of(committed, evidence.stop(channel), stop)
         return [] if rows is None else [rows]
@@ -151,7 +154,7 @@ def _missing(
 def _take_log(
     evidence: Evidence, journal: JournalContents, name: str, in_file: Mapping[int, int]
 ) -> dict[int, int]:
-    """Takes the records of a log, but for as many as are known to be `in_file`; returns the row after its last one, by
+    """Takes the records of a log, without the first `in_file` of each channel; returns the row after its last one, by
     channel."""
     logs = committed_records(journal, name, in_file)
     for channel, committed in logs.items():
@@ -160,7 +163,7 @@ def _take_log(
 
 
 def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> None:
-    """Takes rows of constant size, completed."""
+    """Completes rows of constant size and takes them."""
     completed = [
         even_rows(channel, int(rows["#sequence"][0]), rows.view(np.uint8).tobytes(), rows) for rows in tables
     ]
@@ -168,7 +171,7 @@ def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> N
 
 
 class _Steps:
-    """Takes the steps of a journal with their images, and the states of the running ones."""
+    """Takes the steps of a journal with their images, and the running states."""
 
     def __init__(
         self, evidence: Evidence, journal: JournalContents, layout: StepLayout, channels: RecordedChannels
@@ -179,7 +182,7 @@ class _Steps:
         self._starts = {} if evidence.strict else _starts(self._store, self._channels)
 
     def take(self, env: int) -> None:
-        """Takes those of a sub-environment."""
+        """Takes the steps of a sub-environment."""
         channel = self._channels.steps[env]
         take = self._take_constant if self._layout.constant else self._take_variable
         state, known = take(env, channel)
@@ -204,14 +207,14 @@ class _Steps:
             if first_row is not None and first_row <= first:
                 same = int(np.argmin(np.append(rows["episode"] == rows["episode"][0], False)))
                 rows["step"][:same] = first - first_row + np.arange(same)
-            # rows of this episode behind a gap go on counting from its first row, also where its start is lost
+            # rows of this episode behind a gap count from its first row, even if its start is lost
             first_row = int(rows["#sequence"][-1]) - int(rows["step"][-1])
             self._starts.setdefault((env, int(rows["episode"][-1])), first_row)
         _take_tables(evidence, channel, tables)
         stop = evidence.stop(channel)
         finals = {(env, hole.row): hole for hole in committed.finals(layout.state_end) if hole.row <= stop}
         evidence.finals |= finals
-        if layout.images and (env, stop) in finals:  # the image that is running is the next state's
+        if layout.images and (env, stop) in finals:  # the running image belongs to the next episode
             return None, committed.end
         return committed.following(stop - 1, layout.state_end), committed.end
 
@@ -224,7 +227,7 @@ class _Steps:
         return state, known if state is None else max(known, stop)
 
     def _row_before(self, channel: int, first: int) -> tuple[int, int, int]:
-        """Episode, step and time (ns) of the row before one, where it is in the file."""
+        """Episode, step and time (ns) of the row before `first`; -1, -1, 0 if the file lacks it."""
         if not first or self._evidence.lacks(channel, np.array([first - 1]))[0]:
             return -1, -1, 0
         (span,) = self._store.spans(channel, self._store.packed(channel, first - 1), 1)
@@ -232,10 +235,10 @@ class _Steps:
         return int(row["episode"]), int(row["step"]), int(row["#log_time"])
 
     def _take_images(self, leaf: Leaf, env: int, steps: int, known: int) -> bytes | None:
-        """Takes the images of steps before `steps`; returns the running state's.
+        """Takes the images of steps before `steps`; returns the running state's image.
 
-        Where the journal does not know a step as committed (`known` is the row after those), its image may be another
-        one: in a journal that was read or copied before the file, a reset has written over it since.
+        `known` is the row after the last step that the journal holds as committed. Images from there on are not taken:
+        the journal was read or copied before the file, and a reset may have written over them in the meantime.
         """
         evidence, channel = self._evidence, self._channels.images[leaf.name][env]
         if channel is None:
@@ -245,14 +248,14 @@ class _Steps:
                 )
             return None
         dtype = self._layout.image_messages[leaf.name].dtype
-        # resets write over them
+        # resets write over committed images
         committed = CommittedRows(self._journal, f"{leaf.name}/{env}", 0, dtype, channel, rewritten=True)
         tables = _missing(evidence, channel, committed, min(steps, known))
         for rows in tables:
             rows["#publish_time"] = rows["#log_time"]
         in_file = evidence.stop(channel)
         _take_tables(evidence, channel, tables)
-        # where the file is ahead, a live writer may have been writing over that row while it was read
+        # if the file is ahead, a live writer may have written over that row while it was read
         running = committed.row(steps) if known >= steps >= in_file else None
         if running is None:
             return None

@@ -1,4 +1,4 @@
-"""What is good in the file of a damaged recording: chunks, definitions and attachments wherever they lie."""
+"""Collects what is good in a damaged recording's file: chunks, definitions and attachments, anywhere."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk
 from tupli_mcap.recording.recover.file_end import Tail
 
-_HEAD = 4096  # the recording's metadata record begins within so many bytes
+_HEAD = 4096  # the recording's metadata record begins within this many bytes
 
 
 def gather(source: Source, tail: Tail) -> Evidence:
-    """Reads the whole file once, its journal not yet; raises nothing for what is damaged.
+    """Reads the whole file once, without its journal; raises nothing for damage.
 
     Raises:
         NewerVersionError: the recording's format is not known.
@@ -39,7 +39,7 @@ def gather(source: Source, tail: Tail) -> Evidence:
     if tail.summary is not None:
         evidence.schemas, evidence.channels = dict(tail.summary.schemas), dict(tail.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
-    indexed: ChunkRecords | None = None  # of the last chunk, whose message index comes next
+    indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
     for item in Walk(source, known=tail.known_chunks(), end=tail.data_end):
         if isinstance(item, Damage):
             evidence.damages.append(item)
@@ -61,7 +61,7 @@ class _FoundChunk(NamedTuple):
     offset: int
     length: int
     piece: Piece
-    repaired: str  # what is wrong with its header
+    repaired: str  # what is wrong in its header
 
 
 def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> None:
@@ -71,7 +71,7 @@ def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> No
 
 
 def _add_damage(evidence: Evidence, record: Found, why: str) -> None:
-    """Notes as damage what a whole record says wrongly."""
+    """Notes damage of a whole record whose content is wrong."""
     evidence.damages.append(Damage(record.offset, record.offset + record.length, why, record.opcode))
 
 
@@ -107,7 +107,7 @@ def _take_metadata(evidence: Evidence, values: dict[str, str], record: Found) ->
 
 
 def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
-    """Whether a channel's metadata have the checksum they say."""
+    """Whether a channel's metadata have the right `crc`."""
     try:
         if is_ours(channel.topic):
             check_crc(channel.metadata, CHANNEL_KEYS, f"the metadata of channel {channel.topic!r:.80}")
@@ -120,7 +120,7 @@ def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
 def _take_chunk(
     evidence: Evidence, record: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
 ) -> ChunkRecords | None:
-    """Adds a chunk to those of its channel; returns what is in it, None if that is no good."""
+    """Adds a chunk to those of its channel; returns its records, None if they are damaged."""
     try:
         content = chunk_records(chunk.data, "the chunk", chunk.packed)
         if not chunk.crc:
@@ -128,7 +128,7 @@ def _take_chunk(
     except FormatError as err:
         _add_damage(evidence, record, str(err))
         return None
-    if evidence.tail.summary is None:  # these have a CRC, those outside of chunks have none
+    if evidence.tail.summary is None:  # definitions in chunks have a CRC, those outside have none
         evidence.schemas |= {schema.id: schema for schema in content.schemas}
         evidence.channels |= {channel.id: channel for channel in content.channels}
     channel, count, size = content.channel, len(content.headers), len(chunk.data)
@@ -153,7 +153,7 @@ def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> N
 
 
 def may_be_recording(source: Source, tail: Tail) -> bool:
-    """Whether the file may be one of ours: False if it says that it is something else."""
+    """Whether the file may be a recording of this package: False if it names another profile."""
     if tail.index is not None or source.size < len(MAGIC) + 9:
         return True
     if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
@@ -168,6 +168,6 @@ def may_be_recording(source: Source, tail: Tail) -> bool:
 
 
 def is_recording(evidence: Evidence) -> bool:
-    """Whether anything in the file shows that it is one of ours."""
+    """Whether anything in the file shows that it is a recording of this package."""
     known = evidence.profile == PROFILE or evidence.metadata is not None or evidence.tail.index is not None
     return known or any("observation_space" in channel.metadata for channel in evidence.channels.values())

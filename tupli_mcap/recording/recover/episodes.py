@@ -1,7 +1,7 @@
-"""Which episodes there are, from all that is left of them: runs of steps, starts, ends, final states, the index.
+"""Derives episodes from what is left of them: runs of steps, starts, ends, final states, the index.
 
-An episode whose steps are all here is one. Where rows are missing in between, each run of consecutive steps becomes an
-episode: the first keeps the number, only that with the old last step ends as the old one did.
+If all steps of an episode were found, it stays one episode. If rows are missing in between, each run of consecutive
+steps becomes an episode: the first run keeps the number, and only the run with the old last step keeps the end.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from tupli_mcap.recording.index import HAS_SEED, EpisodeIndex
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
-_END = 1 << 64  # beyond any row number
-RUNNING, IN_A_HOLE = -1, -2  # instead of the row of a final state: where in the journal it is
+_END = 1 << 64  # above any row number
+RUNNING, IN_A_HOLE = -1, -2  # in place of the row of a final state: it is in the journal
 
 
 class Start(NamedTuple):
-    """The start of an episode, and its time (ns); `row` is its place in `/episode_start`, None if it is to be made."""
+    """The start of an episode and its time (ns); `row` is its row in `/episode_start`, None if it has to be made."""
 
     time: int
     start: EpisodeStart
@@ -31,7 +31,7 @@ class Start(NamedTuple):
 
 
 class End(NamedTuple):
-    """The end of an episode, in the same way."""
+    """The end of an episode and its time (ns); `row` as in `Start`."""
 
     time: int
     end: EpisodeEnd
@@ -40,25 +40,32 @@ class End(NamedTuple):
 
 @dataclass
 class EpisodeRecords:
-    """What the messages of the episode channels and the index say, by episode.
+    """The messages of the episode channels and the entries of the index, by episode.
 
-    `resets` are those before an episode that no step followed. `ignored` are ends whose steps are not all left.
+    `resets` are resets before an episode that no step followed. `ignored` are ends whose steps are not all left.
     """
 
     starts: dict[int, Start] = field(default_factory=dict)
     resets: dict[int, list[Start]] = field(default_factory=dict)
     ends: dict[int, End] = field(default_factory=dict)
     finals: dict[int, int] = field(default_factory=dict)  # rows of `/final_state`
-    index: dict[int, int] = field(default_factory=dict)  # places in the index
+    index: dict[int, int] = field(default_factory=dict)  # positions in the index
     ignored: list[int] = field(default_factory=list)
 
 
 class PlannedEpisode(NamedTuple):
-    """An episode of the recovered recording. `whole`: all of the old one is left.
+    """An episode of the recovered recording, made of a run of an old episode's steps.
 
-    `head`, `tail`: its first step was the old one's first, its last one the old one's last. `length`: of the old
-    episode, None if not known. `final`: its row in `/final_state` (as packed), RUNNING, IN_A_HOLE, or None if there is
-    none. `orphan`: metadata of the old episode, whose last step is lost. `resets`: those before it without a step.
+    Attributes:
+        number: of the new episode.
+        run: its steps.
+        whole: it has all steps of the old one.
+        head, tail: it has the old one's first, last step.
+        length: of the old episode; None if not known.
+        start, end: of the new episode.
+        final: row of its final state in `/final_state` (as packed), RUNNING, IN_A_HOLE, or None if there is none.
+        orphan: metadata of the old episode, if the run lacks its last step.
+        resets: resets without a step before it.
     """
 
     number: int
@@ -76,9 +83,9 @@ class PlannedEpisode(NamedTuple):
 
 @dataclass
 class Plan:
-    """The episodes in the order of their rows, and what had to be made.
+    """The episodes in the order of their rows, and the numbers of episodes whose starts, ends, final states are lost.
 
-    `kept`, `totals`: rows that are kept, and how many there were, by sub-environment.
+    `kept` are the rows that are kept, `totals` the numbers of rows that there were, by sub-environment.
     """
 
     records: EpisodeRecords
@@ -100,9 +107,9 @@ class NewPlaces:
             self._of.setdefault(episode.run.episode, []).append(episode)
 
     def find(self, number: int, step: int, *, state: bool = False) -> tuple[int, int] | None:
-        """Which step of which new episode a step of an old one is now; None if it is in none.
+        """The new episode and step of an old episode's step; None if it is in none.
 
-        With `state` it is the number of a state: that after an episode's last step belongs to it.
+        With `state`, `step` is the number of a state: the one after an episode's last step belongs to the episode.
         """
         parts = self._of.get(number, [])
         at = bisect.bisect_right(parts, step, key=lambda part: part.run.step) - 1
@@ -112,7 +119,7 @@ class NewPlaces:
 
 
 def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
-    """The message of a final state that is RUNNING or IN_A_HOLE, with the episode's number."""
+    """The CDR body of a final state that is RUNNING or IN_A_HOLE, with the episode's number."""
     run = episode.run
     is_hole = episode.final == IN_A_HOLE
     state = evidence.finals[run.env, run.stop].state if is_hole else evidence.states[run.env]
@@ -137,11 +144,11 @@ def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channe
     return _Planner(evidence, plan, runs, channels, images=bool(layout.images)).run()
 
 
-# ---- what is recorded of them
+# ---- records
 
 
 def _read_records(evidence: Evidence, store: PackedStore, channels: RecordedChannels) -> EpisodeRecords:
-    """Starts, ends and final states that are here; in repair, messages that cannot be decoded are passed over."""
+    """Reads starts, ends and final states; in repair, it skips messages that cannot be decoded."""
     records = EpisodeRecords()
     for row, time, body in store.all_messages(channels.start):
         try:
@@ -167,7 +174,7 @@ def _read_records(evidence: Evidence, store: PackedStore, channels: RecordedChan
 
 
 def _ignore_ends(records: EpisodeRecords, kept: dict[int, Ranges]) -> None:
-    """Forgets the ends whose steps are not all here, or whose first row is not their start's."""
+    """Removes ends whose steps were not all found, or whose first row is not their start's."""
     for number, (_, end, _) in list(records.ends.items()):
         rows = kept.get(end.env, [])
         start = records.starts[number].start if number in records.starts else end
@@ -178,7 +185,7 @@ def _ignore_ends(records: EpisodeRecords, kept: dict[int, Ranges]) -> None:
 
 
 def _add_index(records: EpisodeRecords, index: EpisodeIndex | None) -> None:
-    """Takes the ends that only the index has."""
+    """Adds the ends that only the index has."""
     if index is None:
         return
     for i, row in enumerate(index.episodes):
@@ -197,7 +204,7 @@ def _add_index(records: EpisodeRecords, index: EpisodeIndex | None) -> None:
 
 
 def _totals(evidence: Evidence, channels: RecordedChannels, records: EpisodeRecords) -> list[int]:
-    """Rows that each sub-environment had, as far as the file shows."""
+    """The number of rows that each sub-environment had, as far as the file shows."""
     totals = [evidence.stop(channel) for channel in channels.steps]
     statistics = evidence.tail.statistics
     for env, channel in enumerate(channels.steps):
@@ -229,7 +236,7 @@ class _Planner:
         starts = [] if channels.start is None else evidence.ranges(channels.start)
         self._starts_whole = all(first == 0 for first, _ in starts)  # none is missing before or between them
         self._taken: set[int] = set()
-        # whether there can be no row after the last one that is known
+        # whether no rows can be missing after the last known one
         self._knows_totals = not evidence.tail.finished or evidence.tail.statistics is not None
 
     def run(self) -> Plan:
@@ -239,7 +246,7 @@ class _Planner:
         return self._plan
 
     def _length(self, run: StepRun) -> int | None:
-        """The steps of the old episode, if that is known."""
+        """The number of steps of the old episode; None if it is not known."""
         old = self._records.ends.get(run.episode)
         if old is None or old.end.env != run.env:
             return None
@@ -267,7 +274,7 @@ class _Planner:
         )  # fmt: skip
 
     def _final(self, run: StepRun, *, last: bool) -> int | None:
-        """Where the final state of an episode is, whose last step is here; a lost one is noted."""
+        """The final state of an episode whose last step was found; a lost one is noted."""
         old_end = self._records.ends.get(run.episode)
         if old_end is not None and not old_end.end.has_final_state:
             return None
@@ -277,7 +284,7 @@ class _Planner:
         if run.episode in self._records.finals and not unfinished:
             return self._records.finals[run.episode]
         if ended and not self._images and (run.env, run.stop) in self._evidence.finals:
-            return IN_A_HOLE  # with images, the next ones have been written over them
+            return IN_A_HOLE  # not with images: the next episode's were written over them
         is_running = last and old_end is None and run.env in self._evidence.states
         if is_running and not (ended and self._evidence.final_lost):
             return RUNNING
@@ -320,7 +327,7 @@ class _Planner:
 
 
 class Losses(NamedTuple):
-    """`steps` maps episodes to ranges of steps (None: to an unknown end); `rows` counts those known to have been."""
+    """Lost steps: `steps` maps episodes to ranges of steps (None: unknown end), `rows` is their known number."""
 
     steps: dict[int, list[tuple[int, int | None]]]
     rows: int
@@ -357,7 +364,7 @@ def _of_episode(plan: Plan, number: int, runs: list[StepRun], *, ended: bool) ->
 
 
 def _is_in_a_hole(plan: Plan, number: int) -> bool:
-    """Whether an episode whose start alone is left had steps."""
+    """Whether an episode of which only the start is left had steps."""
     start = plan.records.starts[number].start
     kept = plan.kept.get(start.env, [])
     after = bisect.bisect_right(kept, (start.first_row, _END))

@@ -1,4 +1,4 @@
-"""Everything good of a recording, in its file and its journal: rows by channel and row number, wherever they lie."""
+"""The good parts of a recording, in its file and its journal: rows by channel and row number."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.recover.file_end import Tail
 
 _CACHE = 64 << 20
-_HEADERS = 16  # chunks whose headers are kept: a message at a time is taken from them
+_HEADERS = 16  # chunks whose headers are cached, for reading single messages
 
 
 class Piece(NamedTuple):
-    """`rows` consecutive rows of a channel from `first` on; `entry` (CHUNK_ROWS) says where they are, of a chunk or in
-    memory."""
+    """`rows` consecutive rows of a channel from `first` on; `entry` (CHUNK_ROWS) is their chunk or place in memory."""
 
     first: int
     rows: int
@@ -42,7 +41,7 @@ class Piece(NamedTuple):
 
 
 class RepairedChunk(NamedTuple):
-    """A chunk whose header is damaged: what it must have said, and how many bytes come before its rows."""
+    """A chunk whose header is damaged: the right content of the header, and the number of bytes before its rows."""
 
     offset: int
     claim: ChunkClaim
@@ -50,7 +49,7 @@ class RepairedChunk(NamedTuple):
 
 
 class _Loaded(Sequence[bytes]):
-    """Rows that are in no good chunk: of the journal, or of a chunk with a damaged header, read when asked for."""
+    """Rows that are in no good chunk: of the journal, or of a chunk with a damaged header, which is read on access."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -77,24 +76,29 @@ class _Loaded(Sequence[bytes]):
 
 
 def memory_entry(number: int, channel: int, first: int, rows: int, size: int) -> tuple[int, ...]:
-    """What CHUNK_ROWS says of rows in memory: the `number`-th there, of `size` bytes."""
+    """A row of CHUNK_ROWS for rows in memory: the `number`-th there, of `size` bytes."""
     return IN_MEMORY + number, 0, size, first, rows, 0, 0, channel, 0, 0
 
 
 @dataclass
 class Evidence:
-    """`pieces` of a channel are in order and do not overlap; `damages` are in the order of the file.
+    """Everything that was found of a recording.
 
     Attributes:
-        strict: only what a reader takes: the file up to its first damage, and rows of the journal that go on with it
-            without a gap. Repair also takes what lies behind damage and gaps.
-        good_end: where the good part of the file ends that has no damage in it.
-        metadata: of the recording; None where they are lost.
-        metadata_indexes: with `strict`: where the file has metadata of any kind.
-        states: those of the running steps, by sub-environment.
-        finals: what follows the last steps of episodes, by sub-environment and the row after.
-        final_lost: after a power loss: a state may be the one after a final state that is not here.
-        left_out, beyond: how many steps in the journal may be torn, or come after missing ones, by channel.
+        strict: it holds only what a reader takes: the file up to its first damage, and rows of the journal that
+            continue it without a gap. Repair also takes what lies beyond damage and gaps.
+        good_end: offset where the undamaged start of the file ends.
+        metadata: of the recording; None if they are lost.
+        metadata_indexes: with `strict`, the places of all metadata records.
+        pieces: by channel, in the order of rows, without overlap.
+        damages: in the order of the file.
+        states: the running states, by sub-environment.
+        finals: final holes, by sub-environment and the row after the episode's last one.
+        final_lost: after a power loss, a running state may belong to the episode after a lost final state.
+        left_out: number of steps in the journal that may be torn, by channel.
+        beyond: number of steps in the journal that come after missing ones, by channel.
+        journal: "none", "used", "missing", "damaged" or "stale".
+        notes: sentences for people.
     """
 
     source: Source
@@ -121,9 +125,9 @@ class Evidence:
         self.loaded = _Loaded(self.source)
 
     def add(self, channel: int, pieces: Iterable[Piece]) -> list[Piece]:
-        """Takes rows, and returns the pieces that are not taken: one that begins earlier holds a row of theirs.
+        """Takes pieces; returns those that it leaves out because a piece that begins earlier has one of their rows.
 
-        Where two begin with the same row, the first in the file is taken, and none from memory.
+        Of two pieces that begin with the same row it takes the one earlier in the file; the file comes before memory.
         """
         kept, left = [], []
         stop = 0
@@ -145,13 +149,13 @@ class Evidence:
         )
 
     def load(self, place: Rows | RepairedChunk, channel: int, first: int, rows: int, size: int) -> Piece:
-        """The piece for rows that are in no good chunk, of `size` bytes; `add` takes it."""
+        """A piece of rows that are in no good chunk, of `size` bytes, for `add`."""
         entry = memory_entry(len(self.loaded), channel, first, rows, size)
         self.loaded.places.append(place)
         return Piece(first, rows, entry)
 
     def lacks(self, channel: int, rows: Array) -> Array:
-        """Which of some row numbers (int64) are missing, as a mask."""
+        """A mask of the row numbers (int64) that are missing."""
         ranges = np.array([(-1, -1), *self.ranges(channel)], np.int64)
         stops: Array = ranges[np.searchsorted(ranges[:, 0], rows, side="right") - 1, 1]
         return rows >= stops
@@ -162,7 +166,7 @@ class Evidence:
         return pieces[-1].stop if pieces else 0
 
     def store(self) -> PackedStore:
-        """The rows, numbered without gaps."""
+        """A store of the rows, numbered without gaps."""
         return PackedStore(self)
 
     def ranges(self, channel: int) -> list[tuple[int, int]]:
@@ -177,7 +181,7 @@ class Evidence:
 
 
 class RecordedChannels(NamedTuple):
-    """Ids of channels: by sub-environment, and by image leaf then sub-environment; None: not known."""
+    """Ids of channels: `steps` by sub-environment, `images` by leaf, then sub-environment; None if not known."""
 
     steps: list[int]
     images: dict[str, list[int | None]]
@@ -200,7 +204,7 @@ class RecordedChannels(NamedTuple):
 
 
 class PackedStore(ChunkStore):
-    """The rows that are left, numbered without gaps; `packed` gives the new number of a row."""
+    """The rows that were found, numbered without gaps; `packed` gives the new number of a row."""
 
     def __init__(self, evidence: Evidence) -> None:
         table: list[tuple[int, ...]] = []
@@ -213,10 +217,10 @@ class PackedStore(ChunkStore):
                 for piece, first in zip(pieces, counts[:-1], strict=True)
             ]
         super().__init__(evidence.source, np.array(table, CHUNK_ROWS), evidence.loaded, _CACHE)
-        self._headers: dict[int, Array] = {}  # of the chunks that were last asked for
+        self._headers: dict[int, Array] = {}  # of the chunks used last
 
     def packed(self, channel: int, row: int) -> int:
-        """The number in this store of a row that is left."""
+        """The number that a found row has in this store."""
         firsts, counts = self._firsts[channel]
         at = bisect.bisect_right(firsts, row) - 1
         return counts[at] + row - firsts[at]

@@ -1,4 +1,4 @@
-"""Reads the summary and the episode index at the end of a file, each by itself: either may be missing or damaged."""
+"""Reads the summary and the episode index at the end of a file; either may be missing or damaged."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _WINDOW = 1 << 20
 
 @dataclass
 class Tail:
-    """`summary` and `index` are None where they are missing or damaged: then `why` says so, one sentence each.
+    """The end of a file: `summary` and `index` are None if missing or damaged, and `why` has a sentence for each.
 
-    `finished`: a footer is there, or an index. `data_end` is the offset of DataEnd, where the summary says it.
+    `finished` says that there is a footer or an index.
     """
 
     finished: bool = False
@@ -45,7 +45,7 @@ class Tail:
         return None if self.summary is None else self.summary.start
 
     def known_chunks(self) -> dict[int, ChunkClaim]:
-        """What the index says of the chunks, by offset."""
+        """The chunks in the index, by offset."""
         if self.index is None:
             return {}
         return {
@@ -61,7 +61,7 @@ class Tail:
 
 
 def read_tail(source: Source) -> Tail:
-    """Reads both; raises nothing for what is missing or damaged."""
+    """Reads summary and index; raises nothing if they are missing or damaged."""
     tail = Tail(finished=has_summary(source))
     if tail.finished:
         try:
@@ -92,10 +92,10 @@ def _statistics(source: Source, summary: Summary) -> Statistics | None:
 
 
 def _find_index(source: Source) -> AttachmentIndex | None:
-    """The last attachment with the index's name and a good CRC, looked for from the end.
+    """The last attachment with the index's name and a right CRC; the search goes backwards from the end.
 
-    Those that turn out to be damaged have together no more bytes than the file: attachments do not overlap. Where more
-    is claimed, the search ends, so that not each of many claims takes a checksum over all of the file.
+    Attachments do not overlap, so damaged ones have no more bytes together than the file. If they claim more, the
+    search ends; otherwise each of many claims could take a checksum over the whole file.
     """
     end = budget = source.size
     while end > 0:
@@ -117,7 +117,7 @@ def _find_index(source: Source) -> AttachmentIndex | None:
 
 
 def _length_at(source: Source, place: int) -> int:
-    """The length of the record at a place whose header is that of an episode index; 0 where there is none."""
+    """The length of the record at an offset if its header is that of an episode index, else 0."""
     if place < 0:
         return 0
     length = int.from_bytes(source.read(place + 1, 8), "little")

@@ -1,4 +1,4 @@
-"""The journal of an unfinished recording: where it is, whether it is its own, and reading it beside a live writer."""
+"""Finds the journal of an unfinished recording, checks that it is its own, and reads it beside a live writer."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ATTEMPTS = 100
 
 
 def find_journal(source: Source) -> JournalContents | Exception | None:
-    """The journal of an unfinished recording, or why it is of no use; None where there can be none.
+    """The journal of an unfinished recording, or the error that makes it useless; None if there can be none.
 
-    Its events are as they were when the file had the size that `source` knows of afterwards: rows that a live writer
-    has moved to the file since the journal was read have their episodes.
+    Its logs are those of a moment at which the file had the size that `source` has afterwards. So every row that a live
+    writer moved to the file up to then has its episode's start.
 
     Raises:
-        RecordingError: it is there and the system refuses to give it: without it steps would be missing.
-        FormatError: it is there and cannot be read; or the writer was too fast.
+        RecordingError: it is there and the system refuses to read it: steps would be missing.
+        FormatError: it is there and cannot be read; or the writer kept changing the file.
     """
     if source.path is None:
         return None
@@ -71,8 +71,8 @@ def _read(source: Source, path: Path, only: Collection[str] | None = None) -> Jo
 def _unreadable(name: str, err: FormatError) -> FormatError:
     """The error for an unfinished recording whose journal is there and cannot be read: damaged, or of a later version.
 
-    It is never taken for a missing one: it may hold steps that are nowhere else, and a later version of this package,
-    or a copy of it, may read them.
+    Such a journal must not count as missing: it may hold steps that are nowhere else, and a later version of this
+    package may read it, or the user may have a copy.
     """
     return FormatError(
         f"{name} was not finished, and its journal cannot be read ({err}): {STEPS_IN_JOURNAL}; {KEEP_JOURNAL}"
@@ -80,18 +80,15 @@ def _unreadable(name: str, err: FormatError) -> FormatError:
 
 
 def belongs(info: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:
-    """Whether a journal, by what it says of itself, is that of a recording with these rows.
+    """Whether the journal with this `info` belongs to the recording with these metadata.
 
-    A rewritten recording keeps its UUID, but not its row numbers.
+    `rewritten` must agree too: a rewritten recording keeps its UUID, but not its row numbers.
     """
     return all(info.get(key, "") == metadata.get(key, "") for key in ("uuid", "rewritten"))
 
 
 def misplaced_journal(path: Path, metadata: Mapping[str, str]) -> Path | None:
-    """The journal of a recording that lies beside it under another name: the recording was renamed without it.
-
-    None if it is in its place, or not to be found.
-    """
+    """The journal beside a recording that was renamed without it; None if it is in its place, or cannot be found."""
     expected = recorded_journal(path, metadata)
     for candidate in (expected, *sorted(Path(os.path.realpath(path)).parent.glob("*.journal"))):
         with contextlib.suppress(OSError, FormatError):

@@ -1,4 +1,4 @@
-"""The valid prefix of a recording without a summary: whole records, chunks with good CRCs and their message indexes."""
+"""Reads the valid prefix of a recording without a summary: whole records, and chunks with CRC and message index."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from tupli_mcap.recording.recover.file_end import Tail
 
 
 def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
-    """What a reader takes of a file: its records until it ends, is damaged, or its data section ends.
+    """Reads records until the file or its data section ends, or a record is damaged.
 
-    The rows of a last chunk without its message index are taken, too, but `good_end` is before it. With
-    `only_metadata`, the records before the first chunk.
+    The rows of a last chunk without its message index are taken, but `good_end` is before that chunk. With
+    `only_metadata`, it reads only the records before the first chunk.
 
     Raises:
-        FormatError: the chunks of a channel do not hold its rows without gaps. Nothing is raised for a damaged end.
+        FormatError: the chunks of a channel do not hold its rows without gaps. A damaged end raises nothing.
     """
     evidence, walk = Evidence(source, Tail(), strict=True, good_end=len(MAGIC)), Walk(source)
     waiting: tuple[tuple[int, ...], Rows] | None = None  # a chunk whose message index comes next
@@ -42,7 +42,7 @@ def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
             waiting = None
         elif waiting is not None or (opcode == Opcode.CHUNK and only_metadata):
             break
-        elif opcode == Opcode.HEADER:  # nothing of the recording depends on it
+        elif opcode == Opcode.HEADER:  # the contents do not depend on it
             evidence.profile = _profile(source, position, length)
         else:
             record = walk.at(position)
@@ -73,7 +73,7 @@ def _profile(source: Source, position: int, length: int) -> str:
 
 
 def _take(evidence: Evidence, record: Found) -> bool:
-    """Takes a record outside of chunks; False where the data ends."""
+    """Takes a record outside of chunks; returns False at the end of the data section."""
     if record.attachment is not None:
         if record.attachment.name == INDEX_NAME:
             return False
@@ -94,9 +94,9 @@ def _take(evidence: Evidence, record: Found) -> bool:
 
 
 def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, ...], Rows] | None:
-    """A chunk's row of the chunk table, and its rows; None if they are no good.
+    """A chunk's row of the chunk table, and its rows; None if they are damaged.
 
-    Takes the definitions in it: they are under the chunk's CRC, which those outside of chunks have not.
+    Takes the definitions in the chunk: its CRC covers them, while those outside of chunks have none.
     """
     try:
         content = chunk_records(chunk.data, evidence.source.name, chunk.packed)
@@ -111,7 +111,7 @@ def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, 
 
 
 def head(source: Source) -> dict[str, str]:
-    """The metadata of a recording, from its first records. Raises FormatError if they are missing or not ours."""
+    """The metadata of a recording, from its first records; raises FormatError if they are missing or foreign."""
     evidence = prefix(source, only_metadata=True)
     if evidence.metadata is None:
         if evidence.profile in (PROFILE, ""):
@@ -123,6 +123,6 @@ def head(source: Source) -> dict[str, str]:
 
 
 def metadata_at(path: Path) -> dict[str, str]:
-    """The same of the file at a path. Raises RecordingError too: it cannot be opened."""
+    """The same for the file at a path; raises RecordingError if it cannot be opened."""
     with contextlib.closing(PathSource(path)) as source:
         return head(source)

@@ -1,4 +1,4 @@
-"""What the rows of a step channel say of their episodes, as arrays, a batch of rows at a time."""
+"""Reads numbers, flags and rewards from the rows of a step channel, and finds runs of consecutive steps in them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
 
 class StepFacts(NamedTuple):
-    """One entry a row: episode and step number, sum of the reward, flags (bytes as stored), times (ns).
+    """Arrays with one entry for each row: episode, step, sum of the reward, flags (bytes as stored), time (ns).
 
-    `bad` maps the rows that are no step of the layout to why.
+    `bad` maps rows that are no step of the layout to the reason.
     """
 
     episode: Array
@@ -38,10 +38,10 @@ class StepFacts(NamedTuple):
 def step_facts(
     store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int, *, keep: bool = False
 ) -> Iterator[StepFacts]:
-    """The facts of rows `first:first + count`, a chunk at a time; chunks are cached with `keep`.
+    """The facts of rows `first:first + count`, for one chunk after the other; with `keep`, chunks are cached.
 
     Raises:
-        FormatError: a chunk is damaged, or holds rows of another size, or with times that no index can hold.
+        FormatError: a chunk is damaged, or has rows of another size, or times that the index cannot hold.
     """
     for span in store.spans(channel, first, count):
         if layout.constant:
@@ -59,9 +59,9 @@ def step_facts(
 
 
 class StepRun(NamedTuple):
-    """Consecutive rows that are here, of consecutive steps of one episode, up to a flag; times in ns.
+    """Consecutive rows with consecutive steps of one episode, up to a flag; times in ns.
 
-    `closed`: the row after it is here and another episode's.
+    `closed` says that the row after it was found and belongs to another episode.
     """
 
     env: int
@@ -86,7 +86,7 @@ Ranges = list[tuple[int, int]]
 
 
 def intersection(a: Ranges, b: Ranges) -> Ranges:
-    """What two lists of ranges have in common."""
+    """The intersection of two lists of ranges."""
     common: Ranges = []
     i = j = 0
     while i < len(a) and j < len(b):
@@ -103,7 +103,7 @@ def intersection(a: Ranges, b: Ranges) -> Ranges:
 def step_runs(
     evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels
 ) -> Iterator[StepRun]:
-    """The runs of all sub-environments, in the order of their rows; of steps whose images are all here.
+    """The runs of all sub-environments in the order of their rows; a step without all of its images is left out.
 
     Raises:
         FormatError: as `step_facts`; with `evidence.strict`, a row is no step of the layout.
@@ -116,7 +116,7 @@ def step_runs(
         for first, stop in ranges:
             last: StepRun | None = None
             row, at = first, store.packed(channel, first)
-            # a chunk may hold many of the ranges
+            # with `keep`, since a chunk may hold many of the ranges
             for facts in step_facts(store, layout, channel, at, stop - first, keep=not evidence.strict):
                 if facts.bad and evidence.strict:
                     raise FormatError(next(iter(facts.bad.values())))
@@ -130,7 +130,7 @@ def step_runs(
 
 
 def runs_in(facts: StepFacts, env: int, row: int, last: StepRun | None) -> Iterator[StepRun]:
-    """The runs of one batch of rows, which starts at `row`; the first one may go on with the last one before."""
+    """The runs of one batch of rows, which starts at `row`; the first one may continue `last`, the one before."""
     episode, step = facts.episode.astype(np.int64), facts.step.astype(np.int64)
     flagged = (facts.terminal != 0) | (facts.timeout != 0)
     breaks = (episode[1:] != episode[:-1]) | (step[1:] != step[:-1] + 1) | flagged[:-1]
@@ -153,14 +153,14 @@ def runs_in(facts: StepFacts, env: int, row: int, last: StepRun | None) -> Itera
 
 
 def _goes_on(run: StepRun, following: StepRun) -> bool:
-    """Whether the first row of one run is the next step of another one."""
+    """Whether `following` begins with the next step of `run`."""
     next_one = run.stop, run.episode, run.step + run.steps
     together = next_one == (following.row, following.episode, following.step)
     return together and not (run.terminal or run.timeout)
 
 
 def sum_up(rewards: Array, total: float) -> float:
-    """`total` and the rewards, added one after another as a recorder does."""
+    """`total` plus the rewards, added in order, as a recorder adds them."""
     with np.errstate(invalid="ignore", over="ignore"):
         return float(np.cumsum(np.concatenate(((total,), rewards)))[-1])
 

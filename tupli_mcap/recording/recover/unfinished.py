@@ -1,6 +1,6 @@
-"""Recovery in memory: the journal first, then the file's valid prefix; what the writer could not finish is derived.
+"""Recovers an unfinished recording in memory: reads the journal, then the file's valid prefix, and derives the rest.
 
-Nothing is written. Repeating it changes nothing.
+Nothing is written, and to do it again gives the same.
 """
 
 from __future__ import annotations
@@ -36,25 +36,27 @@ from tupli_mcap.recording.recover.prefix import head, prefix
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
     """The contents of a recording that has no summary.
 
-    `journal` is what `find_journal` found. It must be read before the chunks are: a live writer moves rows from there
-    to here.
+    Args:
+        source: the file.
+        journal: the result of `find_journal`, which must come first: a live writer moves rows from the journal to the
+            file.
 
     Raises:
-        FormatError: it is no recording of ours, or its first records are damaged.
+        FormatError: it is no recording of this package, or its first records are damaged.
     """
     metadata = head(source)
     evidence = prefix(source)
     evidence.metadata = metadata
     defined = set(evidence.channels)
     if isinstance(journal, Exception):
-        if defined:  # defined when the journal is there: without them no step has been taken
+        if defined:  # without channels there is no step, and no journal
             _check_unchanged(source)
             warnings.warn(_missing(source, metadata, journal), UserWarning, stacklevel=6)
         journal = None
     elif journal is not None and not belongs(journal.info, metadata):
         if defined:
             warnings.warn(_foreign_journal(source, metadata), UserWarning, stacklevel=6)
-        journal = None  # a stale journal of another recording with this name is not ours to merge
+        journal = None  # stale: of another recording with this name
     if journal is not None:
         take_journal(evidence, journal)
     contents = Contents(
@@ -115,7 +117,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
 
 
 class _Made:
-    """Messages that the writer did not come to write; they follow the others of their channels."""
+    """Messages that the writer did not write; they follow the others of their channels."""
 
     def __init__(self, store: PackedStore) -> None:
         self._store = store
@@ -123,9 +125,9 @@ class _Made:
         self._records: dict[int, list[bytes]] = {}
 
     def add(self, channel: int, time: int, body: bytes) -> tuple[int, int]:
-        """The row of a message, and its time: that asked for, or the latest of its channel.
+        """Adds a message; returns its row, and its time: `time`, or the latest of its channel if that is later.
 
-        Each channel by itself: how far an earlier recovery came with the others must change nothing.
+        Channels do not affect each other, so that the result is the same after an earlier recovery was cut short.
         """
         if channel not in self._next:
             count, latest = self._store.count(channel), 0
@@ -139,12 +141,12 @@ class _Made:
         return row, time
 
     def rows(self) -> list[Rows]:
-        """All of them."""
+        """All messages."""
         return [rows for made in self._records.values() for rows in group_records(memoryview(b"".join(made)))]
 
 
 def _beyond_frames(evidence: Evidence, store: PackedStore) -> int:
-    """A number beyond those of the episodes that frames show: the steps of some may be lost."""
+    """A number above those of the episodes that frames show: the steps of some may be lost."""
     beyond = 0
     for channel in evidence.channels.values():
         if (place := parse(channel.topic)) is not None and place.kind == "frame":
@@ -172,7 +174,7 @@ def _index(
 
 
 def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedChannels) -> Iterator[str]:
-    """Warnings: how many steps and which events are not here, and why."""
+    """Warnings that say how many steps and which records are missing, and why."""
     source = evidence.source
     for channel, steps in evidence.beyond.items():
         if steps and not journal.torn:
@@ -192,7 +194,7 @@ def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedCh
 
 
 def _check_unchanged(source: Source) -> None:
-    """Raises FormatError if the writer has made the journal since it was looked for, or finished the file."""
+    """Raises FormatError if a writer has made the journal or finished the file in the meantime."""
     source.refresh()
     if has_summary(source) or isinstance(find_journal(source), JournalContents):
         raise FormatError(f"{source.name} was changed while it was read; read it again")
@@ -225,21 +227,21 @@ def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
 
 def _older(source: Source, missing: int) -> str:
     return (
-        f"{source.name} ends {missing} bytes before what its journal has left to it: ends of episodes and final states "
-        "are missing. A copy of a recording that is being made needs the journal first, and then the file"
+        f"{source.name} ends {missing} bytes before the place where its journal goes on: ends of episodes and final "
+        "states are missing; while a recording is made, copy first its journal, then the file"
     )
 
 
 def _gap(source: Source, topic: str, steps: int) -> str:
     return (
-        f"{source.name}: of the last {steps} step(s) of {topic} the first are missing, and all are left out: the file "
-        "is damaged, or was copied before its journal (of a recording that is being made, copy the journal first)"
+        f"{source.name}: the last {steps} step(s) of {topic} are left out, because steps before them are missing: the "
+        "file is damaged, or was copied before its journal (while a recording is made, copy the journal first)"
     )
 
 
 def _torn(source: Source, steps: int) -> str:
     return (
-        f"{source.name}: the machine that recorded it has been started anew since, or this is another one: {steps} "
+        f"{source.name}: the machine that recorded it was restarted afterwards, or this is another machine: {steps} "
         "step(s) in its journal cannot be shown to be whole and are left out; on the machine and boot that recorded "
         'it, they can be read: finish the recording there, with "tupli-mcap recover" or by appending to it'
     )

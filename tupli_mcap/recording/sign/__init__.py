@@ -1,5 +1,5 @@
-"""Who vouches for a recording.
+"""Signs recordings, and trusts the code in them.
 
-sign              signs a recording, and checks a signature
-carried_code      the code that a recording carries, and trusting it
+sign              signs a recording
+carried_code      describes the code that a recording carries, and trusts it
 """

@@ -1,4 +1,4 @@
-"""What a recording carries that needs trust: its environment's code, and options of resets that are more than data."""
+"""The parts of a recording that need trust: its environment's code, and options of resets that are more than data."""
 
 from __future__ import annotations
 
@@ -32,8 +32,11 @@ _MAX_OPTIONS = 20  # that are shown
 
 
 class EntryPoint(NamedTuple):
-    """Code that a spec names: `name` is `module:attribute`. here: what this machine has registered under the
-    environment's id (None: nothing, or a wrapper, which is not registered)."""
+    """Code that a spec names as `module:attribute`.
+
+    `here` is the entry point that this machine has registered under the environment's id; None if there is none, or for
+    a wrapper, which is not registered.
+    """
 
     of: Literal["environment", "wrapper"]
     name: str
@@ -41,17 +44,18 @@ class EntryPoint(NamedTuple):
 
 
 class CarriedCode(NamedTuple):
-    """An environment in a recording, as the file describes it (`name`, `classes` and `versions` are claims).
+    """The environment in a recording, as the file describes it; `name`, `classes` and `versions` are claims.
 
-    kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, whose
-        instructions name `imports`; it may import and run anything) or "names" (nothing that rebuilds it).
-    foreign: what would run that this machine does not know; empty if building it needs no trust.
-    options: what options of its resets hold that is more than data, which replaying would hand to the environment.
-    needs_trust: whether it is built, and given all options, only where somebody trusts it. trusted: whether this user
-        trusts the digests, or the key that signed it.
-    options_digest: of the environment and those options; None if there are none.
-    signed_by: the fingerprint of the key that the file says has signed it; None if it is not signed.
-    signer: what this user calls that key, if it is trusted here and has signed this very environment.
+    Attributes:
+        kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, whose
+            instructions name `imports`; it may import and run anything) or "names" (nothing can rebuild it).
+        foreign: the code that would run and that this machine does not know; empty if building it needs no trust.
+        options: the parts of its resets' options that are more than data; replaying would pass them to the environment.
+        needs_trust: it is built, or given all options, only if the user trusts it.
+        trusted: this user trusts the digests, or the key that signed it.
+        options_digest: of the environment and those options; None if there are none.
+        signed_by: the fingerprint of the key that the signature names, unchecked; None if it is not signed.
+        signer: the name this user gave that key, if it is trusted here and signed this very environment.
     """
 
     name: str
@@ -73,7 +77,7 @@ class CarriedCode(NamedTuple):
 
 
 def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
-    """What rebuilding a recording's environment would run, and be given; nothing is run.
+    """Describes what rebuilding a recording's environment would run, and the options it would get; runs nothing.
 
     Raises:
         RecordingError: the recording carries no environment.
@@ -120,8 +124,8 @@ def _entry_points(spec: dict[str, Any]) -> list[EntryPoint]:
 
 
 def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
-    """Trusts the environment of a recording, and the options of its resets, on this machine, or no longer; returns what
-    it is about.
+    """Trusts the environment of a recording, and the options of its resets, on this machine, or withdraws that trust;
+    returns their description.
 
     Raises:
         RecordingError: the recording carries no environment.
@@ -135,13 +139,13 @@ def set_trust(path: str | os.PathLike[str], *, trusted: bool) -> CarriedCode:
 
 
 def untrust(what: str) -> tuple[str, bool]:
-    """Trusts an environment no longer, given as a recording or as a digest (its first 8 digits or more will do).
+    """Withdraws the trust in an environment, given as a recording or as a digest (its first 8 digits or more).
 
     Returns:
         The digest, and whether it was trusted.
 
     Raises:
-        NotFoundError: no trusted environment, or several, have a digest that starts so.
+        NotFoundError: no trusted environment, or several, have a digest that starts like this.
         RecordingError, FormatError: as `carried_code`.
     """
     if Path(what).exists() or not re.fullmatch(r"[0-9a-f]{8,64}", what):
@@ -163,15 +167,15 @@ def untrust(what: str) -> tuple[str, bool]:
 
 
 def foreign_options(text: str) -> str:
-    """What in the options of a reset (exact JSON, empty for none) is more than data, as for arguments of a spec."""
+    """The part of a reset's options (exact JSON, empty for none) that is more than data, as for arguments of a spec."""
     return more_than_data(jsonvalue.loads(text)) if text else ""
 
 
 def options_are_trusted(recording: Recording) -> bool:
-    """Whether this user trusts what is more than data in the options of a recording's resets: these very options, with
-    this environment, or the key that signed the whole recording.
+    """Whether this user trusts the options of a recording's resets: exactly these with this environment, or the key
+    that signed the whole recording.
 
-    Trust in the environment alone is not enough: others may have recorded the same one, with other options.
+    Trust in the environment alone is not enough: a stranger may record the same environment with other options.
     """
     carried = "benchmark.json" in recording.attachments
     digest = recording.benchmark.record.digest if carried else ""
@@ -186,7 +190,7 @@ def options_are_trusted(recording: Recording) -> bool:
 
 
 def _foreign_options(recording: Recording) -> dict[str, str]:
-    """The texts of options that hold more than data, and what that is."""
+    """The options (texts) that hold more than data, each with that part."""
     foreign: dict[str, str] = {}
     seen = {""}
     for position in range(len(recording)):

@@ -26,10 +26,10 @@ from tupli_mcap.recording.signature_file import (
 
 
 def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Signature:
-    """Adds the signature of a key to a finished recording, instead of one that is there; it is replaced in one rename.
+    """Adds the signature of a key to a finished recording, or replaces its signature; the file changes in one rename.
 
     Raises:
-        SignatureError: the recording is not finished, or not every reader would see the same in it.
+        SignatureError: the recording is not finished, or readers may see different contents in it.
         RecordingError, FormatError: it cannot be read or written.
     """
     with Recording(path) as recording:
@@ -46,9 +46,9 @@ def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Sig
 
 
 def episodes_alike(first: Recording, second: Recording, numbers: Sequence[int], directory: Path) -> bool:
-    """Whether the episodes of these numbers are the same in two recordings: steps, events, images, frames, times.
+    """Whether the episodes with these numbers are equal in two recordings: steps, records, images, frames, times.
 
-    directory: where to write them anew meanwhile, for other episodes may lie between them, in other chunks.
+    `directory` is for temporary files: the episodes are written anew, since other episodes may lie between them.
 
     Raises:
         FormatError: one of the recordings is damaged.

@@ -1,6 +1,6 @@
-"""A new recording out of a damaged one.
+"""Makes a new recording of a damaged one.
 
 recover   `recover_recording`, `finish_recording`: find what is left, decide what to keep, and report
 write     writes it, renumbered
-frames    the frames of what is kept
+frames    the frames of steps that are kept
 """

@@ -1,4 +1,4 @@
-"""The frames of a damaged recording: those of kept steps of which both the picture and its row are left."""
+"""The frames of a damaged recording that are kept: their step is kept, and both picture and row were found."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tupli_mcap.recording.recover.step_runs import intersection
 
 
 class KeptFrame(NamedTuple):
-    """A picture's message, and the message of its row with the new numbers; `time_ns` is that of both."""
+    """A picture's message and its renumbered `/frame` row; `time_ns` is the time of both."""
 
     time_ns: int
     picture: bytes
@@ -31,14 +31,14 @@ class KeptFrame(NamedTuple):
 
 
 class OldCameras(NamedTuple):
-    """`ids[i]` are those of `/camera/<name>` and `/frame/<name>` of camera `names[i]`, by sub-environment."""
+    """The cameras; `ids[i]` are the ids of `/camera` and `/frame` of camera `names[i]`, by sub-environment."""
 
     names: tuple[str, ...]
     ids: tuple[tuple[tuple[int, int], ...], ...]
 
     @classmethod
     def of(cls, evidence: Evidence, num_envs: int, vector: bool) -> OldCameras:
-        """The cameras of which all channels are known, with the schemas they must have."""
+        """The cameras whose channels are all known and have the right schemas."""
         topics = {channel.topic: channel for channel in evidence.channels.values()}
         cameras: dict[str, tuple[tuple[int, int], ...]] = {}
         for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
@@ -59,7 +59,7 @@ def _fits(evidence: Evidence, camera: Channel | None, frame: Channel | None) -> 
 def kept_frames(
     evidence: Evidence, store: PackedStore, ids: tuple[int, int], episodes: Sequence[PlannedEpisode]
 ) -> Iterator[KeptFrame]:
-    """The frames of a sub-environment's episodes, with the numbers that these have now."""
+    """The frames of a sub-environment's episodes, with the new numbers of these."""
     camera, frame = ids
     pieces = NewPlaces(episodes)
     for first, stop in intersection(evidence.ranges(camera), evidence.ranges(frame)):
@@ -77,7 +77,7 @@ def kept_frames(
 
 
 def frames_lost(evidence: Evidence, cameras: OldCameras) -> int:
-    """How many frames are known to have been recorded, and are not left whole."""
+    """The number of frames that are known to have been recorded and are not whole."""
     lost = 0
     for pair in (pair for ids in cameras.ids for pair in ids):
         whole = intersection(*(evidence.ranges(channel) for channel in pair))

@@ -1,4 +1,4 @@
-"""`recover_recording`: saves everything good in a damaged recording in a new one, and says what was lost."""
+"""`recover_recording` writes everything good in a damaged recording to a new one, and reports what was lost."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tupli_mcap.recording.write.writer import finish_in_place
 
 
 class DamagedPlace(NamedTuple):
-    """`size` bytes from `offset` on that could not be read, and why."""
+    """`size` bytes from `offset` on that are damaged, and why."""
 
     offset: int
     size: int
@@ -43,7 +43,7 @@ class DamagedPlace(NamedTuple):
 
 
 class LostSteps(NamedTuple):
-    """Steps `first:stop` of an episode, as numbered in the damaged file; `stop` None: to its end, wherever that was."""
+    """Steps `first:stop` of an episode, as numbered in the damaged file; `stop` is None if its length is not known."""
 
     episode: int
     first: int
@@ -51,7 +51,7 @@ class LostSteps(NamedTuple):
 
 
 class CutEpisode(NamedTuple):
-    """What is left of an episode that lost steps: `steps` from `first_step` on are episode `becomes` now."""
+    """A part of an episode that lost steps: `steps` from `first_step` on are episode `becomes` in the new file."""
 
     episode: int
     first_step: int
@@ -61,11 +61,14 @@ class CutEpisode(NamedTuple):
 
 @dataclass
 class RecoveryReport:
-    """What was found in a file, what was saved of it, and what was lost.
+    """What was found in a file, what was saved, and what was lost.
 
-    target: the new file, None if none was written.
-    finished: the file has its end; journal: "none", "used", "missing", "damaged" or "stale".
-    lost_steps counts rows that are known to have been there; lost names their episodes.
+    Attributes:
+        target: the new file; None if none was written.
+        finished: the file has its end.
+        journal: "none", "used", "missing", "damaged" or "stale".
+        lost_steps: number of lost steps that are known to have been there.
+        lost: their episodes.
     """
 
     source: str
@@ -91,12 +94,12 @@ class RecoveryReport:
 
     @property
     def bytes_skipped(self) -> int:
-        """Bytes of the file that nothing could be read from."""
+        """Number of damaged bytes in the file."""
         return sum(place.size for place in self.damaged)
 
     @property
     def saved(self) -> bool:
-        """Whether anything could be saved: of a damaged recording, whether a step was."""
+        """Whether anything could be saved; of a damaged recording, at least one step."""
         journal_lost = self.journal not in ("none", "used")
         if self.steps_lost or self.lost or self.damaged or journal_lost:
             return self.steps > 0
@@ -108,7 +111,7 @@ class RecoveryReport:
         return self.finished and not (self.damaged or self.notes or self.lost or self.steps_lost)
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON has it."""
+        """The report as a JSON value."""
         plain = asdict(self)
         for name in ("lost", "cut", "damaged"):
             plain[name] = [item._asdict() for item in getattr(self, name)]
@@ -117,7 +120,7 @@ class RecoveryReport:
 
 
 def recovered_path(source: Path) -> Path:
-    """Where a repaired file is written by default: `<name>.recovered.mcap` beside the damaged one."""
+    """The default path of a repaired file: `<name>.recovered.mcap` beside the damaged one."""
     return source.with_name(f"{source.name.removesuffix('.mcap')}.recovered.mcap")
 
 
@@ -131,17 +134,18 @@ def recover_recording(
 ) -> RecoveryReport:
     """Writes everything good in a recording into a new one. The source is only read.
 
-    Alignment is kept by construction: an episode with a hole becomes several, of consecutive steps each
-    (`schemas/README.md`, Repair). Nothing in the file is executed.
+    An episode that lost steps in between becomes several episodes of consecutive steps (`schemas/README.md`, Repair).
+    Nothing in the file is executed.
 
     Args:
+        source: the damaged recording.
         target: `<name>.recovered.mcap` beside the source by default.
         overwrite: whether an existing target may be replaced (in one rename).
         dry_run: only reports.
 
     Raises:
-        RecordingError: the source cannot be opened, a writer is at work on it, the target exists or cannot be
-            written. FormatError: the source is no recording, or nothing at all can be read from it.
+        RecordingError: the source cannot be opened, a writer works on it, or the target exists or cannot be written.
+        FormatError: the source is no recording, or nothing can be read from it.
     """
     path = Path(source)
     goal = recovered_path(path) if target is None else Path(target)
@@ -161,7 +165,7 @@ def recover_recording(
                 os.ftruncate(fd, 0)
                 report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
                 report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
-                report.notes.append("its signature is left out: it is not of what could be saved")
+                report.notes.append("its signature is left out: it does not fit what could be saved")
             if not (report.saved or report.attachments):
                 raise _NothingSavedError(report)
         report.target = str(goal)
@@ -200,7 +204,7 @@ def _nowhere() -> Iterator[int]:
 
 
 def _signature_fits(path: Path) -> bool:
-    """Whether what was written is still what its signature is of; True if it is not signed."""
+    """Whether the signature fits the written file; True if it is not signed."""
     with Recording(path) as recording:
         if SIGNATURE_NAME not in recording.attachments:
             return True
@@ -212,19 +216,18 @@ def _signature_fits(path: Path) -> bool:
 
 
 def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> RecoveryReport:
-    """Finishes a recording that its writer did not finish, in its place, as appending to it would.
+    """Finishes a recording that its writer did not finish, in place, as a writer that appends would.
 
-    Nothing is done to one that is finished, nor to one of which something is lost: that is left to
-    `recover_recording`, which keeps the file as it is.
+    A finished recording stays as it is. So does one that lost something: use `recover_recording` for it.
 
     Raises:
-        RecordingError: something of it is lost or damaged, a writer is at work on it, or it cannot be written.
+        RecordingError: something in it is lost or damaged, a writer works on it, or it cannot be written.
         FormatError: it is no recording.
     """
     report = recover_recording(path, dry_run=True)
     if report.lost or report.damaged or report.notes or report.journal not in ("none", "used"):
         raise RecordingError(
-            f"{path}: something of it is lost or damaged; it is not changed, save what is good in a new file"
+            f"{path}: something in it is lost or damaged, so it is not changed; recover it into a new file"
         )
     if not dry_run:
         if not report.finished:
@@ -313,7 +316,7 @@ def _report_plan(report: RecoveryReport, plan: Plan) -> None:
 
 
 def _infos_lost(evidence: Evidence, channels: RecordedChannels) -> int:
-    """Rows missing in `/info`, as far as can be told."""
+    """Number of rows missing in `/info`, as far as the file shows."""
     if channels.info is None:
         return 0
     ranges = evidence.ranges(channels.info)
@@ -333,7 +336,7 @@ def _attachments_lost(evidence: Evidence) -> list[str]:
 
 
 def _ends(evidence: Evidence) -> list[DamagedPlace]:
-    """Damage of the first and the last bytes of the file, from which nothing is taken."""
+    """Damage of the magic at the start and of the end of the file, which hold no data."""
     source, tail = evidence.source, evidence.tail
     places = []
     if source.read(0, min(len(MAGIC), source.size)) != MAGIC:

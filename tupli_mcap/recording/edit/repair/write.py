@@ -1,4 +1,4 @@
-"""A repaired recording: what the plan keeps, renumbered so that rows and steps count without gaps again."""
+"""Writes a repaired recording: the episodes of the plan, with rows and steps renumbered without gaps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tupli_mcap.recording.edit.repair.frames import OldCameras, kept_frames
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
-RECOVERED = "recovered"  # key of the episode metadata that says where the steps of a piece were
+RECOVERED = "recovered"  # key of the episode metadata that says which steps of which old episode these are
 _METADATA = {
     "uuid": re.compile("[0-9a-f]{32}"),
     "format_version": re.compile("[12]"),
@@ -48,7 +48,7 @@ class RepairWriter:
         self.metadata_lost: list[str] = []
 
     def begin(self, next_episode: int | None) -> None:
-        """Magic, header, metadata and the attachments that are good. No later episode gets a number that was lost."""
+        """Writes magic, header, metadata and the good attachments; no later episode gets a number that was lost."""
         container, evidence = self._container, self._evidence
         metadata = self._metadata_of_recording()
         if next_episode is not None:
@@ -64,7 +64,7 @@ class RepairWriter:
             container.attachment_indexes.append(moved)
 
     def _metadata_of_recording(self) -> dict[str, str]:
-        """The recording's metadata; what is lost or damaged of it is made anew."""
+        """The recording's metadata; lost or damaged parts are made anew."""
         old = dict(self._evidence.metadata or {})
         for key in ("journal", "replaced"):
             old.pop(key, None)
@@ -78,11 +78,11 @@ class RepairWriter:
         kept = {key: old[key] for key in made if key in old and _METADATA[key].fullmatch(old[key])}
         self.metadata_lost = [key for key in made if key not in kept]
         others = {key: value for key, value in old.items() if key not in made}
-        # Rows have other numbers now: a journal of the damaged file must not merge into this one.
+        # Rows get other numbers: the journal of the damaged file must not merge into this one.
         return {**others, **made, **kept, "rewritten": uuid.uuid4().hex}
 
     def steps(self, layout: StepLayout, old: RecordedChannels, plan: Plan, store: PackedStore) -> None:
-        """Every message of the episodes that are kept."""
+        """Writes every message of the episodes that are kept."""
         channels = self._evidence.channels
         vector = Topics.of_step(channels[old.steps[0]].topic).is_vector
         info = None
@@ -133,13 +133,13 @@ class RepairWriter:
     def _frames(
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
     ) -> None:
-        """The frames of one camera, which keep their times."""
+        """Writes the frames of one camera; they keep their times."""
         frames = partial(kept_frames, self._evidence, store, old, episodes)
         self._target.add_messages(new[0], ((frame.time_ns, frame.picture) for frame in frames()))
         self._target.add_messages(new[1], ((frame.time_ns, frame.pair) for frame in frames()))
 
     def finish(self) -> None:
-        """The index, the summary and the footer."""
+        """Writes the index, the summary and the footer."""
         self._target.finish(self._now)
 
     # ---- rows
@@ -154,7 +154,7 @@ class RepairWriter:
         *,
         patch: bool,
     ) -> None:
-        """The rows of `episodes`; with `patch` they get the episodes' numbers, and steps from 0."""
+        """Copies the rows of `episodes`; with `patch` they get the episodes' numbers, and steps from 0."""
         if dtype is None:
             self._target.add_messages(new, self._variable(store, old, episodes))
         else:
@@ -233,7 +233,7 @@ class RepairWriter:
         )
 
     def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
-        """The metadata of the old episode where its end is here, and where the steps of a piece were."""
+        """The metadata of the old episode if its end was found, and for a part of it the key `recovered`."""
         text = episode.end.end.metadata
         if episode.whole:
             return text
@@ -262,7 +262,7 @@ class RepairWriter:
         return b"".join(n.to_bytes(4, "little") for n in numbers) + body[8:]
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
-        """The infos of steps that are kept, with the numbers these have now."""
+        """The infos of steps that are kept, with the new numbers of these."""
         pieces = NewPlaces(plan.episodes)
         for _, log_time, body in store.all_messages(channel):
             number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
