@@ -1,5 +1,5 @@
-"""`Tap`: a wrapper between an environment and its recorder, so that a recorder can be put on after a reset, and taken
-off again."""
+"""`Tap`: a wrapper between an environment and its recorder, so that a recorder can be added after a reset, and removed
+again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["PendingReset", "Retyped", "Tap"]
 
 
 class PendingReset(NamedTuple):
-    """A reset that no recorder has seen, and no step has followed."""
+    """A reset without a step that no recorder has seen."""
 
     result: tuple[Any, dict[str, Any]]
     seed: int | None
@@ -22,8 +22,7 @@ class PendingReset(NamedTuple):
 
 
 class Tap(gym.Wrapper[Any, Any, Any, Any]):
-    """Hands a recorder a reset that has already happened, and outlives the recorder: closing it closes
-    nothing."""
+    """Passes an earlier reset to a recorder, and outlives the recorder: closing it closes nothing."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)

@@ -1,4 +1,4 @@
-"""`TupliEnvWrapper`: an environment with a place in a storage, where it and its episodes are kept."""
+"""`TupliEnvWrapper` stores an environment as a benchmark, and records its episodes into the storage."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ _RECORDING_OPTIONS = (
 
 
 class DeletedBenchmark(NamedTuple):
-    """What `TupliEnvWrapper.delete` did.
+    """The result of `TupliEnvWrapper.delete`.
 
-    kept maps each artifact that stays, although it should have gone, to the benchmarks that need it.
+    `kept` maps each artifact that was not deleted to the benchmarks that need it.
     """
 
     id: str
@@ -119,14 +119,14 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._recorder: RecordEpisodes | None = None
         self._path: Path | None = None
         self._benchmark: Benchmark | None = (
-            None  # as it is stored: recording does not ask the storage for it again
+            None  # as it is stored, so that recording need not ask the storage again
         )
-        # resets that no step followed, each going on from the one before
+        # resets without a step, in order: a later one goes on with the random stream of the one before
         self._pending: list[PendingReset] = []
 
     @property
     def storage(self) -> TupliStorage:
-        """Where the benchmark is kept; StorageError if there is no storage."""
+        """The storage of the benchmark; raises StorageError if there is none."""
         if self._storage is None:
             raise StorageError("this environment has no storage; wrap it with TupliEnvWrapper(env, storage)")
         return self._storage
@@ -183,7 +183,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
                 "this environment is not stored yet, so its steps cannot be recorded: call store(name=...) "
                 "first, or deactivate_recording()"
             )
-        if not self._pending:  # in the middle of an episode that began unrecorded; the next one is recorded
+        if not self._pending:  # within an episode that began unrecorded: recording begins with the next one
             return self.env.step(action)
         recorder = self._open()
         self._hand_over(recorder)
@@ -209,7 +209,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def recording_path(self) -> Path | None:
-        """The file that is, or was last, recorded to; None before the first step."""
+        """The file that is being recorded to, or was last; None before the first step."""
         return self._path if self._recorder is None else self._recorder.path
 
     def close(self) -> None:
@@ -220,7 +220,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             super().close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy, in this process or another one, records to a file of its own."""
+        """A copy, in this process or another one, records to another file."""
         if self._recorder is not None:
             raise RecordingError(
                 f"a wrapper that records to {self._path} cannot be pickled or copied; close() it first, or call "
@@ -238,7 +238,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return recorder
 
     def _ingest(self, path: Path) -> None:
-        """Lists the episodes of a file that was left; the rollout goes on where that cannot be done now."""
+        """Lists the episodes of a finished file; if this fails it warns, and the rollout goes on."""
         try:
             self.storage.ingest(path)
         except TupliError as err:
@@ -251,7 +251,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         options = replace(self._options, metadata_callback=callback, benchmark_id=benchmark_id)
         if self._path is not None and self._path.exists():
             going_on = replace(options, mode="a", attachments={})
-            # Where the file cannot go on (somebody else writes to it), another one is begun.
+            # If the file cannot be appended to (somebody else writes to it), begin another one.
             with contextlib.suppress(RecordingError):
                 return RecordEpisodes(self._tap, self._path, **vars(going_on))
         benchmark = self._benchmark
@@ -333,7 +333,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             NotFoundError: There is no such benchmark.
-            UntrustedError: It would run code that neither this user nor `trust=True` vouches for.
+            UntrustedError: It would run code that this user has not trusted, without `trust=True`.
         """
         if benchmark_id is None:
             raise NotFoundError(
@@ -349,18 +349,18 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return loaded
 
     def publish(self, publish_in: str = "global") -> None:
-        """Let a group see the benchmark."""
+        """Make the benchmark visible to a group."""
         self.storage.publish_benchmark(self._stored_id(), publish_in)
 
     def delete(self, delete_artifacts: bool = False, delete_episodes: bool = True) -> DeletedBenchmark:
-        """Delete the benchmark from the storage, with its episodes, and its artifacts where nobody else
-        needs them.
+        """Delete the benchmark from the storage, with its episodes, and with the artifacts that no other benchmark
+        needs.
 
-        The environment goes on to work, unrecorded until it is stored again.
+        The environment still works, and is not recorded until it is stored again.
 
         Raises:
             NotFoundError: The benchmark is not stored.
-            StorageError: Its episodes are to be deleted while somebody else records more; nothing is deleted.
+            StorageError: Its episodes shall be deleted while somebody else records more; nothing is deleted.
         """
         uri = self._stored_id()
         artifacts = unpack(self.storage.load_benchmark(uri).serialized).artifacts
@@ -388,7 +388,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     # --- environments as text ---
 
     def serialize_env(self, env: gym.Env[Any, Any], *, by_reference: bool = False) -> str:
-        """An environment as text. `self.env` is taken as it was when it was wrapped; neither is changed."""
+        """An environment as text. `self.env` is serialized as it was when it was wrapped; no environment is changed."""
         snapshot = self._snapshot if env is self.env else Snapshot(env, copies=self._changes_copies)
         if not self._changes_copies:
             return pack(snapshot.record(by_reference=by_reference), [], facts_about(env))
@@ -405,19 +405,19 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     def deserialize_env(
         cls, serialized_env: str, storage: TupliStorage, *, trust: bool = False
     ) -> gym.Env[Any, Any]:
-        """The environment that `serialize_env` made a text of. Raises as `load` does."""
+        """The environment in a text of `serialize_env`. Raises as `load` does."""
         return cls._deserialize(build(unpack(serialized_env).record, trust=trust), storage)
 
     @property
     def _changes_copies(self) -> bool:
-        """Whether `_serialize` is somebody's own, who is to be given a copy."""
+        """Whether a subclass overrides `_serialize`, which then gets a copy."""
         return getattr(self._serialize, "__func__", None) is not TupliEnvWrapper._serialize
 
     def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
-        """To be overridden: move data out of an environment before it is stored.
+        """Override it to move data out of an environment before it is stored.
 
         Args:
-            env: a copy of the environment, to be changed at will (`env.unwrapped.data = artifact.id`).
+            env: a copy of the environment, which may be changed (`env.unwrapped.data = artifact.id`).
 
         Returns:
             The environment to store, and the ids of the artifacts it needs.
@@ -426,6 +426,6 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @classmethod
     def _deserialize(cls, env: gym.Env[Any, Any], storage: TupliStorage) -> gym.Env[Any, Any]:
-        """To be overridden: put the data back (`env.unwrapped.data =
+        """Override it to put the data back (`env.unwrapped.data =
         storage.load_artifact(env.unwrapped.data)`)."""
         return env

@@ -1,4 +1,4 @@
-"""Finds what in the arguments of a spec, and in the options of a reset, is more than data and so needs trust."""
+"""Finds the parts of a spec's arguments, and of a reset's options, that are more than data and so need trust."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ from typing import Any, Final
 import gymnasium as gym
 import numpy as np
 
-# Such a text can name no file, URL, module or attribute.
+# A text like this cannot name a file, URL, module or attribute.
 _PLAIN_WORD = re.compile(r"[A-Za-z0-9_ +=,;()\[\]<>#-]{0,256}\Z")
 _LARGEST: Final = 1 << 20
 
 
 def more_than_data(value: object) -> str:
-    """Why a value from a file needs trust: the part of it that some code may take for more than data, and for what.
+    """Why a value from a file needs trust: its first part that may be more than data, and what it may be; else empty.
 
-    Empty if it is data only.
-
-    Some environments hand texts to `open` or `gymnasium.make`, and allocate as many things as a number says. Flags,
-    plain words, fractions and whole numbers up to 2^20 are data; several of those may still cost much memory.
+    Some environments pass texts to `open` or `gymnasium.make`, and allocate as many things as a number says. Flags,
+    plain words, fractions and whole numbers up to 2^20 are data; several such numbers may still cost much memory.
     """
     for item in _atoms(value):
         if isinstance(item, int):
@@ -33,7 +31,7 @@ def more_than_data(value: object) -> str:
 
 
 def foreign_arguments(spec: Mapping[str, Any]) -> list[str]:
-    """Arguments in a spec that are `more_than_data`, such as `xml_file="../x.xml"`, unless they are registered so."""
+    """Arguments in a spec that are `more_than_data`, such as `xml_file="../x.xml"`, and that are not registered."""
     kwargs = spec.get("kwargs", {})
     registered = gym.registry.get(str(spec.get("id")))
     usual = {} if registered is None else registered.kwargs
@@ -61,8 +59,7 @@ def _same(usual: object, value: object) -> bool:
 
 
 def _atoms(value: object) -> Iterator[str | int]:
-    """All texts and whole numbers in a value from a file, keys included; of an array of numbers, the least and the
-    largest."""
+    """All texts and whole numbers in a value from a file, keys included; of an array, the smallest and the largest."""
     rest = [value]
     while rest:
         item = rest.pop()

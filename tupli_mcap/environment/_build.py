@@ -1,4 +1,4 @@
-"""From an `EnvironmentRecord` back to a live environment, without running anybody's code unasked."""
+"""Rebuilds a live environment from an `EnvironmentRecord`; code from a file runs only if the user trusts it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
 from tupli_mcap.errors import TupliError, UntrustedError
 
-# What these render opens no window.
+# These render modes open no window.
 _PICTURES = frozenset(
     {"rgb_array", "rgb_array_list", "depth_array", "depth_array_list", "rgbd_tuple", "ansi", "ansi_list"}
 )
@@ -95,7 +95,7 @@ def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> g
     """`gymnasium.make` of a spec given as JSON-able object; runs its entry points."""
     fields = copy.deepcopy(dict(spec))
     known = gym.registry.get(fields["id"])
-    # Of no account to a single environment: this machine's own.
+    # It does not matter for a single environment; take this machine's own.
     fields["vector_entry_point"] = None if known is None else known.vector_entry_point
     if known is not None and fields.get("entry_point") == entry_point_name(known.entry_point):
         fields["entry_point"] = known.entry_point
@@ -105,7 +105,7 @@ def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> g
 
 
 def entry_point_name(entry_point: Any) -> Any:
-    """What a spec in a file calls an entry point: `module:name` of a class or function that was registered itself."""
+    """An entry point as a spec in a file names it: `module:name`, also of a class or function."""
     if not callable(entry_point):
         return entry_point
     named = entry_point if hasattr(entry_point, "__qualname__") else type(entry_point)
@@ -113,9 +113,9 @@ def entry_point_name(entry_point: Any) -> Any:
 
 
 def foreign_code(spec: Mapping[str, Any]) -> list[str]:
-    """What building a spec would run that this machine does not know; empty if it may be built without trust.
+    """The code that building a spec would run and that this machine does not know; empty if it needs no trust.
 
-    Wrappers are resolved without importing anything: a file must not choose what is imported.
+    Wrappers are resolved without an import: a file must not choose what is imported.
     """
     name = spec.get("id")
     known = gym.registry.get(name) if isinstance(name, str) else None
@@ -156,7 +156,7 @@ def _is_known_wrapper(entry_point: object, package: str) -> bool:
     return (
         isinstance(wrapper, type)
         and issubclass(wrapper, gym.Wrapper)
-        # These write to the folder they are told, and open a window.
+        # These write to the folder that an argument names, or open a window.
         and not issubclass(wrapper, gym.wrappers.RecordVideo | gym.wrappers.HumanRendering)
     )
 
@@ -166,7 +166,7 @@ def _top_level(entry_point: object) -> str:
 
 
 def reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
-    """What rebuilding an environment would run that this machine does not know; empty if it needs no trust."""
+    """The code that rebuilding would run and that this machine does not know; empty if it needs no trust."""
     if record.spec is not None:
         return [*foreign_code(record.spec), *foreign_arguments(record.spec)]
     if record.pickle is None:

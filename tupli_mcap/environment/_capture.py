@@ -1,4 +1,4 @@
-"""From a live environment to an `EnvironmentRecord`. No other environment is made, stepped, reset or closed."""
+"""Captures a live environment as an `EnvironmentRecord`. No other environment is made, stepped, reset or closed."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ from tupli_mcap.environment._pickling import InProcessCopy, dump
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
 from tupli_mcap.errors import TupliError, brief
 
-# Python 3.11 and 3.12 keep attributes outside a dict until somebody asks for one, and reach them slower from then on.
+# Python 3.11 and 3.12 store attributes without a dict until code reads `__dict__`; from then on they are slower.
 _HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
 _ID_IN_TEXT = re.compile(r"<\w+<([^<>]+)>>+$")  # as Gymnasium writes an environment: <Wrapper<Class<id>>>
 _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  # among a spec's arguments
 
 
 def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> EnvironmentRecord:
-    """What an environment says of itself: its EnvSpec, where JSON has a form for it, and the names of its classes.
+    """Notes an environment's own EnvSpec, if JSON has a form for it, and the names of its classes.
 
-    The spec may not rebuild the environment as it is now. Of a vector environment, the first sub-environment is noted
-    if it lives in this process; else the spec that `gymnasium.make_vec` was given, if `gymnasium.make` takes it, or the
-    id.
+    The spec may not rebuild the environment as it is. Of a vector environment, the first sub-environment is noted if it
+    lives in this process; else the spec given to `gymnasium.make_vec`, if `gymnasium.make` takes it, or the id.
     """
     if not isinstance(env, gym.vector.VectorEnv):
         return _noted(env, *_told(env))
@@ -47,9 +46,7 @@ def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Enviro
 
 
 def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str:
-    """The Gymnasium id of an environment, of several that of the first sub-environment, wherever it lives; where there
-    is none, the name of its class.
-    """
+    """The Gymnasium id of an environment, or of the first sub-environment; the name of its class if it has no id."""
     base: Any = env.unwrapped
     name = getattr(getattr(base, "spec", None), "id", None)
     if isinstance(name, str):
@@ -58,7 +55,7 @@ def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str
     if inner and isinstance(inner[0], gym.Env):
         return name_of(inner[0])
     if type(base) is gym.vector.AsyncVectorEnv:
-        # a text, as a spec may be nothing that another process can send
+        # a text: a spec may not be picklable
         with contextlib.suppress(Exception):
             if found := _ID_IN_TEXT.search(base.call("__str__")[0]):
                 return found[1]
@@ -68,13 +65,12 @@ def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str
 def capture(
     env: gym.Env[Any, Any], *, by_reference: bool = False, pickled: bool = False
 ) -> EnvironmentRecord:
-    """What is needed to rebuild an environment as it is now; `env` is not changed.
+    """A record that rebuilds an environment as it is; `env` is not changed.
 
-    That is its EnvSpec if its id is registered here, its arguments are plain data, its wrappers are Gymnasium's or
-    of its own package, it has not been reset, and nothing in it has been changed as far as `is_changed` tells. Else,
-    or if `pickled`, it is the pickle. Classes from the user's own files (`__main__`, notebooks, tests, scripts) are
-    pickled by value, so that the record works where those files are missing, and need no spec then; `by_reference=True`
-    keeps that code out of it.
+    It is the EnvSpec if the id is registered here, the arguments are plain data, the wrappers are Gymnasium's or
+    of the environment's own package, it has not been reset, and `is_changed` finds no change. Else, or if `pickled`, it
+    is the pickle. Classes from the user's own files (`__main__`, notebooks, tests, scripts) are pickled by value, so
+    that the record works without those files; `by_reference=True` keeps that code out of it.
 
     Raises:
         TupliError: The environment cannot be pickled.
@@ -98,7 +94,7 @@ def capture(
 
 
 def fingerprint(env: gym.Env[Any, Any]) -> bytes | None:
-    """Bytes that change when an environment does; None if it cannot be told."""
+    """Bytes that change when an environment changes; None if there are no such bytes."""
     try:
         return dump(env, by_reference=True)
     except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
@@ -113,9 +109,9 @@ def resets_itself(env: gym.Env[Any, Any]) -> bool:
 class Snapshot:
     """An environment at one moment, captured both by value and by reference.
 
-    Taking one costs about as much as pickling the environment, and changes nothing in it. An environment that cannot be
-    pickled is only complained about when the snapshot is used. `copies` makes `copy` possible: objects that
-    cannot be pickled (open files, windows) are then shared with the copies.
+    To take one is to pickle the environment, which changes nothing in it. If it cannot be pickled, using the snapshot
+    raises the error. `copies` makes `copy` possible: objects that cannot be pickled (open files, windows) are then
+    shared with the copies.
     """
 
     def __init__(self, env: gym.Env[Any, Any], *, copies: bool = False) -> None:
@@ -142,7 +138,7 @@ class Snapshot:
         return found
 
     def copy(self) -> gym.Env[Any, Any]:
-        """A new environment of the same classes in the captured state; nobody closes it, as that may close what the
+        """A new environment of the same classes in the captured state. Do not close it: this may close what the
         original uses.
 
         Raises:
@@ -186,7 +182,7 @@ def _told(env: gym.Env[Any, Any]) -> tuple[str | None, dict[str, Any] | None]:
     wrappers = [layer for layer in _layers(env) if isinstance(layer, gym.Wrapper)]
     before = [getattr(wrapper, "_cached_spec", None) for wrapper in wrappers]
     try:
-        # First: reading the spec of a wrapper copies the arguments of those below it, whatever they are.
+        # First, since reading the spec of a wrapper copies the arguments of all wrappers below it.
         canonical_json([base.kwargs, [getattr(wrapper, "_saved_kwargs", None) for wrapper in wrappers]])
         with _quiet():
             return name, _plain_spec(env.spec)
@@ -194,7 +190,7 @@ def _told(env: gym.Env[Any, Any]) -> tuple[str | None, dict[str, Any] | None]:
         return name, None
     finally:
         for wrapper, cached in zip(wrappers, before, strict=True):
-            # that somebody has read the spec is no part of an environment's state
+            # a cached spec is no part of an environment's state
             wrapper._cached_spec = cached
 
 
@@ -217,7 +213,9 @@ def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:
 def _plain_spec(spec: Any) -> dict[str, Any]:
     """Raises ValueError or TypeError where JSON has no form for it."""
     names = [field.name for field in dataclasses.fields(spec) if field.init]
-    names.remove("vector_entry_point")  # how others are made, and changing with gymnasium's versions
+    names.remove(
+        "vector_entry_point"
+    )  # is for vector environments, and differs between versions of gymnasium
     fields = {name: getattr(spec, name) for name in names}
     fields["entry_point"] = entry_point_name(spec.entry_point)
     fields["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
@@ -226,7 +224,7 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
 
 
 def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
-    """Whether `gymnasium.make` of a spec gives such an environment, as far as can be told without doing it."""
+    """Whether `gymnasium.make` of a spec returns such an environment, as far as can be told without making one."""
     *wrappers, base = _layers(env)
     if not isinstance(base.spec.entry_point, str):
         return False  # several functions may have the same name
@@ -267,7 +265,7 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _renew_attributes(env: gym.Env[Any, Any]) -> None:
-    """An equal new dict makes attributes quicker to reach, where the old one has been asked for."""
+    """Replaces the attributes' dict by an equal one, which makes attributes fast again after `__dict__` was read."""
     if not _HAS_LAZY_DICTS:
         return
     for layer in _layers(env):
@@ -291,7 +289,7 @@ def _versions(modules: frozenset[str]) -> tuple[tuple[str, str], ...]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Constructors of environments may warn and draw from the global random generators: undo both."""
+    """Hides warnings of constructors in the block, and restores the global random generators after it."""
     random_state, numpy_state = random.getstate(), np.random.get_state()
     try:
         with warnings.catch_warnings():

@@ -1,8 +1,8 @@
 """Tells from the code of its classes whether an environment is still as its constructors left it.
 
-No other environment is made to compare it with. The code of a class says which attributes it assigns, and which of them
-only ever get constants or arguments of the constructor. An object is changed if it has another attribute, or another
-value in one of those. Values that the constructor computes are not judged, nor is what lies inside of an attribute.
+No other environment is made for comparison. The code of a class shows which attributes it assigns, and which of these
+get only constants or arguments of the constructor. An object is changed if it has another attribute, or another value
+in one of those. Values that the constructor computes are not compared, nor are the contents of attributes.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ class _Argument(NamedTuple):
 
 
 class _Computed:
-    """An attribute is given a value that the code does not tell."""
+    """An attribute is given a value that the code does not show."""
 
 
 _COMPUTED = _Computed()
 
 
 def is_changed(obj: Any, arguments: Mapping[str, Any]) -> bool:
-    """Whether somebody else has set an attribute of an object that was made with these arguments."""
+    """Whether an attribute of an object made with these arguments was set from outside of its classes."""
     cls: type = type(obj)
     assigned, given = _assigned(cls), _bound(cls, arguments)
     for name, value in vars(obj).items():
@@ -52,7 +52,7 @@ def _same(value: object, expected: object) -> bool:
 
 
 def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a constructor by name, defaults included; empty where they do not fit."""
+    """The arguments of a constructor by name, defaults included; empty if they do not fit."""
     try:
         bound = inspect.signature(cls.__init__).bind_partial(None, **arguments)  # type: ignore[misc]
     except (TypeError, ValueError):
@@ -63,7 +63,7 @@ def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=256)
 def _assigned(cls: type) -> Mapping[str, list[Any]]:
-    """What the code of a class and its bases gives to each attribute it assigns."""
+    """The values that the code of a class and its bases assigns to each attribute."""
     sources: dict[str, list[Any]] = {}
     for base in cls.__mro__:
         for name, member in vars(base).items():
@@ -101,7 +101,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _stores(code: CodeType) -> Iterator[tuple[str, Any]]:
-    """Each attribute that a function assigns, and what it is given."""
+    """Each attribute that a function assigns, and the assigned value."""
     instructions = [one for one in dis.get_instructions(code) if one.opname != "CACHE"]
     rebound = {one.argval for one in instructions if one.opname in ("STORE_FAST", "DELETE_FAST")}
     known = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]} - rebound
@@ -111,7 +111,7 @@ def _stores(code: CodeType) -> Iterator[tuple[str, Any]]:
 
 
 def _source(last: list[dis.Instruction], arguments: set[str]) -> Any:
-    """What a STORE_ATTR stores, from it and the instructions before it: a value, then the object, then the store."""
+    """The value that a STORE_ATTR stores, from the last instructions: load of the value, of the object, store."""
     target = last[-2] if len(last) > 1 else last[-1]
     if any(one.is_jump_target for one in last[-2:]) or not target.opname.startswith("LOAD_FAST"):
         return _COMPUTED  # one of several values, or of an object that is not a plain name

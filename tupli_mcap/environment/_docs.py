@@ -27,7 +27,7 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
     Gymnasium documents its environments this way: https://gymnasium.farama.org/environments/classic_control/cart_pole.
     """
     inner: Any = env.unwrapped
-    classes = type(inner).__mro__  # a subclass need not say it again
+    classes = type(inner).__mro__  # a subclass need not repeat its base's documentation
     kind = ""
     if isinstance(env, gym.vector.VectorEnv):
         state, action = env.single_observation_space, env.single_action_space
@@ -46,7 +46,7 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
         ("action", action, getattr(inner, f"{kind}action_space", None)),
     ):
         if not _same_dimensions(space, unwrapped):
-            continue  # a wrapper has made something else of it
+            continue  # a wrapper has changed the space
         heading = "observation space" if name == "state" else "action space"
         section = next(filter(None, (_section(text, heading) for text in texts)), "")
         if isinstance(space, spaces.Discrete):
@@ -61,7 +61,7 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
 
 
 def _registered(envs: Any) -> tuple[type, ...]:
-    """The classes of the single environment that a vector environment was made as, by `gym.make_vec`."""
+    """The classes of the single environment that is registered under a vector environment's id."""
     with contextlib.suppress(Exception):  # a module that cannot be imported any more, say
         made: Any = gym.spec(envs.spec.id).entry_point
         made = load_env_creator(made) if isinstance(made, str) else made
@@ -85,7 +85,7 @@ def _section(text: str, heading: str) -> str:
 
 
 def _names(section: str, count: int) -> tuple[str, ...]:
-    """A name for each number from 0 to count - 1; empty unless each is there exactly once."""
+    """A name for each number from 0 to count - 1; empty unless each occurs exactly once."""
     if not 0 < count <= _MOST:
         return ()
     for pattern in (_ROW, _ITEM):
@@ -97,14 +97,14 @@ def _names(section: str, count: int) -> tuple[str, ...]:
 
 def _meanings(env: Any, count: int) -> tuple[str, ...]:
     """The names that the Arcade Learning Environment gives its actions; empty for other environments."""
-    with contextlib.suppress(Exception):  # whatever it does
+    with contextlib.suppress(Exception):  # the environment's own code may raise anything
         names = tuple(_plain(str(name)) for name in env.get_action_meanings())
         return names if len(names) == count and all(names) else ()
     return ()
 
 
 def _plain(name: str) -> str:
-    """Without markup, on one line, not too long."""
+    """A name without markup, on one line, cut to the longest length."""
     plain = " ".join(_MARKUP.sub(r"\1", name).split())
     plain = "".join(c for c in plain if c.isprintable())
     return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"

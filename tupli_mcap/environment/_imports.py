@@ -1,7 +1,7 @@
 """The names that a pickle gives for import, listed without loading it.
 
-Nothing is decided by this list. What a pickle imports says little of what it does: functions that everybody imports
-call others that are named only in their arguments.
+No decision depends on this list. The imports of a pickle say little about what it does: harmless functions may call
+others that are named only in their arguments.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ _LEAVES_THE_STACK = frozenset({"PROTO", "FRAME"})
 
 
 class PickleImports(NamedTuple):
-    """What a pickle says it imports.
+    """The imports that a pickle names.
 
-    names: `module:name`, each once, in the order of their first use; at most 10,000, of at most 200 characters.
-    gaps: why it may import more than these, as far as its instructions tell. Without any, it may still.
+    Attributes:
+        names: `module:name`, each once, in the order of first use; at most 10,000, of at most 200 characters.
+        gaps: known reasons why it may import more than these. Without any, it may still import more.
     """
 
     names: tuple[str, ...]
@@ -39,10 +40,10 @@ class PickleImports(NamedTuple):
 
 
 def named_imports(data: bytes) -> PickleImports:
-    """Lists what the import instructions of a pickle name. Nothing is imported or run, and no pickle makes it fail.
+    """Lists the names in the import instructions of a pickle. Nothing is imported or run, and it never fails.
 
-    Pickles within it are not looked at. Time and memory are linear in the size of the pickle, of which the first
-    500,000 instructions are read.
+    It does not look into pickles within the pickle. Time and memory are linear in the size of the pickle, of which it
+    reads the first 500,000 instructions.
     """
     listing = _Listing(data)
     position: int | None = 0
@@ -59,8 +60,8 @@ def named_imports(data: bytes) -> PickleImports:
 
 
 class _Listing:
-    """The names so far, and what is needed to tell the next one: the memo's texts, and the two values on top of the
-    stack where the last instructions put texts there (None: anything else). Dicts stand for ordered sets."""
+    """The names so far, and the state for finding the next one: the memo's texts, and the top two values of the stack
+    if they are texts (else None). Dicts serve as ordered sets."""
 
     def __init__(self, data: bytes) -> None:
         self.names: dict[str, None] = {}

@@ -1,7 +1,7 @@
-"""Which imported modules are the user's own files, rather than something another machine could install.
+"""Tells which imported modules are the user's own files, which another machine cannot install.
 
-Classes of such modules (a script, a notebook, a test, a helper beside them) are pickled by value: whoever
-loads the environment has no other way to get at them.
+Classes of such modules (a script, a notebook, a test, a helper beside them) are pickled by value: otherwise nobody else
+could load the environment.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from types import ModuleType
 
 import cloudpickle
 
-# cloudpickle's registry of modules belongs to the process.
+# cloudpickle has one registry of modules for the whole process.
 _LOCK = threading.RLock()
 
 
 def is_local(module_name: str) -> bool:
-    """Whether a module can only be had from the user's own files.
+    """Whether a module exists only in the user's own files.
 
-    True for `__main__`, for test modules, and for modules that lie neither in the standard library nor in a
-    directory that pip installs to (nor are an editable install). False for what is not imported and for
-    compiled modules.
+    True for `__main__`, for test modules, and for modules that are not in the standard library, in a directory that pip
+    installs to, or in an editable install. False for modules that are not imported, and for compiled ones.
     """
     top = module_name.partition(".")[0]
     if top in ("__main__", "__mp_main__"):

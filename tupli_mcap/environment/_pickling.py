@@ -23,9 +23,9 @@ _MAX_PLAIN_DEPTH = 20
 class InProcessCopy:
     """An environment pickled for this process only.
 
-    Classes are kept as they are, by reference, so that any class can be copied (locally defined ones too)
-    and copies are instances of the very same classes. So are objects that cannot be pickled (open files), which copies
-    have in common with the original.
+    Classes are pickled by reference, so that any class can be copied (locally defined ones too) and copies are
+    instances of the very same classes. So are objects that cannot be pickled (open files): copies share them with the
+    original.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -58,9 +58,9 @@ def load(data: bytes) -> Any:
 def rebuild_ezpickled(
     cls: type, args: tuple[Any, ...], kwargs: dict[str, Any], attributes: dict[str, Any]
 ) -> Any:
-    """Construct an object from its constructor's arguments, then set the attributes that were changed since.
+    """Construct an object from its constructor's arguments, then set the attributes that were changed.
 
-    Named in pickles as `tupli_mcap.environment.rebuild_ezpickled`, which must go on to exist.
+    Pickles name it as `tupli_mcap.environment.rebuild_ezpickled`, which must not be renamed.
     """
     made = cls(*args, **kwargs)
     made.__dict__.update(attributes)
@@ -72,7 +72,7 @@ rebuild_ezpickled.__module__ = "tupli_mcap.environment"
 
 class _EnvPickler(cloudpickle.Pickler):  # type: ignore[misc]
     """cloudpickle, but objects that pickle as their constructor's arguments keep their plain attributes as
-    well: `env.unwrapped.gravity = 5` is part of the environment. That somebody has read a wrapper's spec is not."""
+    well: `env.unwrapped.gravity = 5` is part of the environment. A wrapper's cached spec is not."""
 
     def reducer_override(self, obj: Any) -> Any:
         if isinstance(obj, EzPickle) and type(obj).__getstate__ is EzPickle.__getstate__:
@@ -148,8 +148,8 @@ class _InProcessUnpickler(pickle.Unpickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """cloudpickle would redefine a live class of this process when it loads a pickled version of it;
-    instead, each load makes classes of its own, as it does in any other process."""
+    """Makes new classes at each load, as in another process; cloudpickle would redefine a live class of this process
+    when it loads a pickled version of it."""
 
     def find_class(self, module: str, name: str) -> Any:
         found = super().find_class(module, name)

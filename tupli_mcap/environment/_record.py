@@ -1,4 +1,4 @@
-"""`EnvironmentRecord`: what is kept of an environment, and its form in `benchmark.json`."""
+"""`EnvironmentRecord`: an environment as data, and its form in `benchmark.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tupli_mcap.errors import FormatError, TupliError
 
 _MAX_JSON_BYTES = 64 << 20
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
-# Fields of an EnvSpec at these values say nothing, so that a field which a later gymnasium adds changes no
+# Fields of an EnvSpec with these values are left out, so that a field which a later gymnasium adds changes no
 # digest.
 _SPEC_DEFAULTS: dict[str, Any] = {
     "entry_point": None,
@@ -71,14 +71,14 @@ class _Document(BaseModel):
 class EnvironmentRecord:
     """An environment as data. At most one of `spec` and `pickle` is set; without either it cannot be rebuilt.
 
-    name: the registered id, or the class as `module:Class` where there is none; for people.
-    spec: the gymnasium EnvSpec as JSON-able object. Of a recording it is what the environment said of itself; of a
-    benchmark, what rebuilds it.
-    pickle: the environment as cloudpickle bytes, which run code when loaded.
-    classes: the environment's classes as `module:Class`, outermost wrapper first; a claim, for messages only.
-    versions: of Python and of the packages that were at work; for messages only.
-    benchmark: the benchmark's own entry in `benchmark.json` (id, metadata, artifacts), None without a
-    benchmark.
+    Attributes:
+        name: the registered id, or the class as `module:Class` if there is none; for people.
+        spec: the gymnasium EnvSpec as JSON-able object. In a recording it is the environment's own; in a benchmark it
+            is the one that rebuilds the environment.
+        pickle: the environment as cloudpickle bytes, which run code when loaded.
+        classes: the environment's classes as `module:Class`, outermost wrapper first; a claim, for messages only.
+        versions: of Python and of the packages in use; for messages only.
+        benchmark: the benchmark's own entry in `benchmark.json` (id, metadata, artifacts); None without a benchmark.
     """
 
     name: str
@@ -94,8 +94,8 @@ class EnvironmentRecord:
 
     @functools.cached_property
     def digest(self) -> str:
-        """SHA-256 (64 hex digits) over what rebuilding executes: the spec, or the pickle; over the names where there is
-        neither. Computed, never believed."""
+        """SHA-256 (64 hex digits) of what rebuilding executes: the spec, or the pickle; of the names if there is
+        neither. It is always computed, never taken from a file."""
         if self.spec is not None:
             told = {k: v for k, v in self.spec.items() if k not in _SPEC_DEFAULTS or v != _SPEC_DEFAULTS[k]}
             return sha256(canonical_json({"spec": told}))
@@ -137,7 +137,7 @@ class EnvironmentRecord:
         """Read `benchmark.json` and the pickle beside it, executing nothing.
 
         Raises:
-            FormatError: The JSON is no such document, or says another digest than its contents have.
+            FormatError: The JSON is no such document, or names another digest than that of its contents.
         """
         if len(data) > _MAX_JSON_BYTES:
             raise FormatError(f"{where}: expected at most {_MAX_JSON_BYTES} bytes, found {len(data)}")

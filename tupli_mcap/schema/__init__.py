@@ -1,9 +1,9 @@
-"""What benchmarks, artifacts, episodes and people are described by, and the filters over them. No I/O.
+"""Models of benchmarks, artifacts, episodes and people, and filters over them. No I/O.
 
 models, people               benchmarks, artifacts, episodes; users, groups, roles
 filters, field, parse        filters; built with `F`, read from text
-keys, values, times          what a filter names, and how it compares
-facts                        whether a filter fits what it is asked of
+keys, values, times          keys, values and times in filters, and their comparison
+facts                        checks filters against a model
 predicate                    filters evaluated in memory"""
 
 from tupli_mcap.schema.facts import bound, check_keys, filter_keys

@@ -55,7 +55,8 @@ _WORDS: Final = {
 def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
     """The top-level keys that a filter over items of a model (or with these fields) may name, sorted.
 
-    An episode's `created_at`, `episode_return` and `n_tuples` go by `ended`, `return` and `steps`; both are understood.
+    An episode's `created_at`, `episode_return` and `n_tuples` are listed as `ended`, `return` and `steps`; both names
+    work.
     """
     if not isinstance(fields, type):
         return sorted(fields)
@@ -84,13 +85,13 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
 
 
 def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
-    """Raises FilterError if it is no filter, names a top-level key that is not among `fields`, or compares a field of a
-    model with what it can never be."""
+    """Raises FilterError if it is no filter, names a top-level key that is not among `fields`, or compares a model's
+    field with a value of a kind that the field never has."""
     bound(filter, fields)
 
 
 def bound(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
-    """A filter over items of a model, its times as nanoseconds in UTC: words such as "yesterday" are about now.
+    """A filter over items of a model with its times as nanoseconds in UTC; "yesterday" means the day before this call.
 
     Raises:
         FilterError: As `check_keys`.
@@ -149,7 +150,7 @@ def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
 
 
 def _may_be(kinds: frozenset[str], scalar: Scalar, ordered: bool) -> bool:
-    """Whether a field of these kinds may be a scalar; in order, whole numbers lie among all numbers."""
+    """Whether a field of these kinds may hold a scalar; with `ordered`, whether it may be ordered with it."""
     if scalar.kind == "number" and "whole" in kinds:
         return ordered or scalar.value % 1 == 0
     return scalar.kind in kinds
@@ -163,7 +164,7 @@ def _in_time(filter: BaseFilter, key: str, now: datetime.datetime) -> BaseFilter
 
     if filter.type is FilterType.CONTAINS:
         raise FilterError(
-            f"{filter.key!r} is a time, in which no text occurs: expected one of = != < <= > >= or in"
+            f"{filter.key!r} is a time, which contains no text: expected one of = != < <= > >= or in"
         )
     if filter.type is FilterType.IN:
         return FilterOR(filters=[within(_time(filter, value, now)) for value in filter.value])
@@ -191,7 +192,7 @@ def _time(filter: BaseFilter, value: object, now: datetime.datetime) -> TimeSpan
 
 @lru_cache(maxsize=256)
 def _kinds_of(model: type[BaseModel], name: str) -> frozenset[str]:
-    """The kinds of scalars that a field may hold, one or a list of them; none where it holds mappings."""
+    """The kinds of scalars that a field may hold, by itself or in a list; none if it holds mappings."""
     annotation = model.model_fields[name].annotation
     if typing.get_origin(annotation) is list:
         annotation = typing.get_args(annotation)[0]

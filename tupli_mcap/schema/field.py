@@ -1,4 +1,4 @@
-"""The sugar for filters: `F("metadata.score") > 3`."""
+"""`F` makes filters from comparisons: `F("metadata.score") > 3`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tupli_mcap.schema.keys import join_key, split_key
 class F:
     """A key to compare: `F("metadata.score") > 3` is `FilterGT(key="metadata.score", value=3)`.
 
-    Given several arguments, each is one segment as it stands: `F("metadata", "v1.0")`.
+    Each of several arguments is one segment, taken literally: `F("metadata", "v1.0")`.
     """
 
     __slots__ = ("key",)
@@ -58,12 +58,12 @@ class F:
         return FilterLEQ(key=self.key, value=value)
 
     def contains(self, text: str) -> FilterCONTAINS:
-        """True where the key's value is a text in which `text` occurs, whatever the case of A to Z; of a list of texts,
-        where it occurs in one of them."""
+        """True if the key's value is a text that contains `text`, ignoring the case of A to Z, or a list with such a
+        text."""
         return FilterCONTAINS(key=self.key, value=text)
 
     def isin(self, values: Iterable[object]) -> FilterIN:
-        """True where the key's value equals one of `values`."""
+        """True if the key's value equals one of `values`."""
         if isinstance(values, str) or not isinstance(values, Iterable):
             raise FilterError(f"isin on {self.key!r} takes a list of values, found {values!r:.80}")
         return FilterIN(key=self.key, value=list(values))
@@ -71,15 +71,13 @@ class F:
     def __and__(self, other: object) -> NoReturn:
         """`F("a") > 1 & F("b") < 3` binds `1 & F("b")` first."""
         raise FilterError(
-            f"{self!r} is compared with nothing, or its comparison needs parentheses: (F('a') > 1) & (F('b') < 3)"
+            f"{self!r} is not compared, or its comparison needs parentheses: (F('a') > 1) & (F('b') < 3)"
         )
 
     __rand__ = __or__ = __ror__ = __and__
 
     def __invert__(self) -> NoReturn:
-        raise FilterError(
-            f"{self!r} is compared with nothing, or its comparison needs parentheses: ~(F('a') > 1)"
-        )
+        raise FilterError(f"{self!r} is not compared, or its comparison needs parentheses: ~(F('a') > 1)")
 
     def __bool__(self) -> bool:
         raise FilterError(f"{self!r} has no truth value: compare it, {self!r} == True")

@@ -1,30 +1,31 @@
-"""Filters: one AST with one meaning, whatever evaluates it.
+"""Filters: one AST with one meaning, in memory and in every database.
 
-A filter is true or false of an item (nested mappings of JSON values), never unknown:
+A filter is true or false for an item (nested mappings of JSON values), never unknown:
 
-- A key is a dotted path through mappings (`metadata.score`); lists are not entered. A **missing** key makes
-  every comparison false, NE too. NOT is the complement: it is true wherever its filter is false.
-- Values are null, booleans, numbers, texts, lists and mappings. **EQ** is true of two values of one kind that
-  are equal; a boolean is no number. **NE** is true of every value that is there and not EQ.
-- Numbers compare exactly, int or float, whatever their size. **NaN** is equal to nothing and neither smaller
-  nor greater than anything, itself included; NE is true of it.
-- **GT, GEQ, LT, LEQ** compare numbers with numbers and texts with texts (by code point); every other pair is
-  false.
-- **null** (None) is a value: EQ None is true of a key that is there and null.
-- A **list** is EQ to each of its elements: `run.tags = "x"` is true where "x" is one of the tags, and NE where it is
-  none of them. GT, GEQ, LT and LEQ are false of lists.
-- A mapping, also one in a list, is EQ to nothing (and so NE to everything); a filter cannot ask for one, nor for a
+- A key is a dotted path through mappings (`metadata.score`); it does not go into lists. A **missing** key makes
+  every comparison false, NE too. NOT is the complement: it is true if its filter is false.
+- Values are null, booleans, numbers, texts, lists and mappings. **EQ** is true for two equal values of one kind; a
+  boolean is no number. **NE** is true if the key is there and EQ is false.
+- Numbers of any size, int or float, compare exactly. **NaN** equals nothing and is neither smaller nor greater than
+  anything, itself included; NE is true for it.
+- **GT, GEQ, LT, LEQ** compare numbers with numbers and texts with texts (by code point); they are false for every
+  other pair.
+- **null** (None) is a value: EQ None is true if the key is there and null.
+- A **list** is EQ to each of its elements: `run.tags = "x"` is true if "x" is one of the tags, and NE if it is
+  none of them. GT, GEQ, LT and LEQ are false for lists.
+- A mapping, also one in a list, is EQ to nothing, and so NE to everything. A filter cannot compare with a mapping or a
   list.
-- **CONTAINS** is true of a text in which its value, a text, occurs; A to Z count as a to z there. Of a list, it is
-  true where it is of one of its elements; of anything else it is false.
-- **IN** is true where EQ is true of any of its values. An empty **AND** is true; an empty **OR** or IN is
+- **CONTAINS** is true for a text that contains its value, a text; A to Z equal a to z there. It is true for a list if
+it
+  is true for one of its elements, and false for anything else.
+- **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is
   false.
 
-- **Times** (`created_at`, and `ended`, which is the same of an episode) compare as times, whatever their zones: see
+- **Times** (`created_at`, and an episode's `ended`, which is the same) compare as times of any zone: see
   `tupli_mcap.schema.times`.
 
-What has no meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
-anything but a number or a text, a fact compared with a value of a kind that it never has.
+A filter without a meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
+anything but a number or a text, a field compared with a value of a kind that it never has.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ COMBINING: Final = frozenset({FilterType.AND, FilterType.OR, FilterType.NOT})
 ORDERING: Final = frozenset({FilterType.GT, FilterType.GEQ, FilterType.LT, FilterType.LEQ})
 MAX_DEPTH: Final = 32
 _TIME_KEYS: Final = ("created_at", "ended")
-_MAX_INT_BITS: Final = 13_000  # Python neither writes nor reads decimal integers much longer
+_MAX_INT_BITS: Final = 13_000  # Python converts no decimal integers that are much longer
 
 _SYMBOL: Final[Mapping[FilterType, str]] = {
     FilterType.EQ: "==",
@@ -87,8 +88,8 @@ _SYMBOL: Final[Mapping[FilterType, str]] = {
 class BaseFilter(BaseModel):
     """A filter: a comparison (`key`, `value`) or a combination (`filters`), as `type` says.
 
-    Immutable and hashable; `filters` and the `value` of IN are tuples. Equality is of content, not of class,
-    so that a filter equals what its JSON is read back to.
+    Immutable and hashable; `filters` and the `value` of IN are tuples. Equality compares contents, not classes,
+    so that a filter equals the one that is read from its JSON.
 
     Raises:
         FilterError: The filter has no meaning. (Validation of data, `model_validate` and so on, raises
@@ -183,7 +184,7 @@ class BaseFilter(BaseModel):
 
     def _content(self) -> tuple[Any, ...]:
         values = self.value if isinstance(self.value, tuple) else (self.value,)
-        # NaN has no identity of its own here: two filters for NaN are the same filter.
+        # All NaNs are alike here: two filters for NaN are the same filter.
         scalars = tuple((s.kind, None if s.kind == "nan" else s.value) for s in map(classify, values))
         path = None if self.key is None else split_key(self.key)
         return (self.type, path, scalars, self.filters)
@@ -195,7 +196,7 @@ class BaseFilter(BaseModel):
         return _expression(self)
 
     def to_params_dict(self, params: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """The filter as JSON-able query parameters, added to `params` (which stays as it is)."""
+        """The filter as JSON-able query parameters, together with those in `params`, which is not changed."""
         own = self.model_dump(
             mode="json", exclude_none=True, exclude={"filters"} if not self.filters else None
         )
@@ -255,7 +256,7 @@ class FilterIN(BaseFilter):
 
 
 class FilterCONTAINS(BaseFilter):
-    """The key's value is a text in which `value` occurs, whatever the case of A to Z."""
+    """The key's value is a text that contains `value`, ignoring the case of A to Z."""
 
     type: Literal[FilterType.CONTAINS] = FilterType.CONTAINS
 
@@ -275,7 +276,7 @@ class FilterOR(BaseFilter):
 
     @classmethod
     def from_list(cls, items: Iterable[Any], on_key: str, from_key: str) -> FilterOR:
-        """True where `on_key` equals the attribute `from_key` of any item; without items never true."""
+        """True if `on_key` equals the attribute `from_key` of any item; without items never true."""
         return cls(filters=[FilterEQ(key=on_key, value=getattr(item, from_key)) for item in items])
 
 
@@ -287,7 +288,7 @@ class FilterNOT(BaseFilter):
 
 
 class EpisodesListRequest(BaseFilter):
-    """A filter over episodes and whether their tuples are wanted; without arguments, every episode."""
+    """A filter over episodes, and whether their tuples are requested; without arguments, every episode."""
 
     type: FilterType = FilterType.AND
     include_tuples: bool = False
@@ -353,7 +354,7 @@ def _check_value(type: FilterType, key: str, value: Any) -> None:
 
 
 def _sentence(name: str, err: ValidationError) -> str:
-    """Pydantic's first complaint as one sentence."""
+    """Pydantic's first error as one sentence."""
     first = err.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")

@@ -21,7 +21,7 @@ def split_key(key: str) -> tuple[str, ...]:
     """The segments of a dotted path.
 
     Raises:
-        FilterError: A segment is empty, or a quoted one is not a JSON string; says at which character.
+        FilterError: A segment is empty, or a quoted one is not a JSON string; the message names the character.
     """
     segments: list[str] = []
     position = 0

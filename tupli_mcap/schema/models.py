@@ -14,7 +14,7 @@ from tupli_mcap.errors import StorageError
 
 
 def _fresh(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields a new item gets unless the caller gives them: id, time (UTC), and who may see it."""
+    """The default fields of a new item: id, time (UTC), and who may see it."""
     created_by = data.get("created_by")
     fields = {
         "id": uuid.uuid4().hex,
@@ -25,7 +25,7 @@ def _fresh(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class DBItem(BaseModel):
-    """What every stored item has. `created_at` is ISO 8601; `published_in` names groups."""
+    """The fields of every stored item. `created_at` is ISO 8601; `published_in` names groups."""
 
     id: str
     created_by: str
@@ -39,7 +39,7 @@ class DBItem(BaseModel):
 
 
 class ArtifactMetadata(BaseModel):
-    """What a user says about an artifact; `benchmark_id` is None where it belongs to no single benchmark."""
+    """The metadata that a user gives an artifact; `benchmark_id` is None if it belongs to no single benchmark."""
 
     name: str
     description: str = ""
@@ -55,7 +55,7 @@ class ArtifactMetadataItem(DBItem, ArtifactMetadata):
 
 
 class BenchmarkMetadata(BaseModel):
-    """What a user says about a benchmark."""
+    """The metadata that a user gives a benchmark."""
 
     name: str
     description: str = ""
@@ -82,11 +82,11 @@ class BenchmarkHeader(DBItem):
 
     @property
     def stored_metadata(self) -> BenchmarkMetadata:
-        """The metadata that it was stored with, which its id is made of; `metadata` may have been edited since."""
+        """The metadata at the time of storing, which its id depends on; `metadata` may have been edited afterwards."""
         return self._stored_metadata or self.metadata
 
     def edited(self, changes: Mapping[str, Any]) -> Self:
-        """The same benchmark with other metadata, by name of the field."""
+        """The same benchmark with some metadata fields changed."""
         made = self.model_copy(update={"metadata": self.metadata.model_copy(update=dict(changes))})
         made._stored_metadata = self.stored_metadata
         return made
@@ -101,8 +101,8 @@ class Benchmark(BenchmarkHeader):
 class RLTuple(BaseModel):
     """One step: `state` is the observation that `action` was chosen on.
 
-    Values are kept as they are given: arrays stay arrays, of the same dtype. Two tuples are equal if their values are:
-    arrays where shapes and elements agree, a NaN where the other one has a NaN too.
+    Values are kept as they are given: arrays stay arrays, of the same dtype. Two tuples are equal if their values are
+    equal: arrays need equal shapes and elements, and a NaN equals a NaN.
     """
 
     state: Any
@@ -125,7 +125,7 @@ class RLTuple(BaseModel):
         truncated: bool,
         info: dict[Any, Any],
     ) -> Self:
-        """A tuple from what a step took and gave.
+        """A tuple made from the values of a step.
 
         `obs` is the observation the action was chosen on. Nothing is copied or converted (the flags become
         plain bools): the tuple holds the caller's objects. Override it to convert them.
@@ -142,7 +142,7 @@ class RLTuple(BaseModel):
 
 
 def _equal(a: Any, b: Any) -> bool:
-    """Whether two values are the same, through dicts and lists, where `==` of arrays would be an array."""
+    """Whether two values are equal, in dicts and lists too; `==` of arrays would be an array."""
     if a is b:
         return True
     if isinstance(a, dict) and isinstance(b, dict):
@@ -159,7 +159,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 class Episode(BaseModel):
-    """An episode built by hand, on its way into a storage."""
+    """An episode made from values, to be stored."""
 
     benchmark_id: str
     metadata: dict[str, Any]
@@ -169,10 +169,10 @@ class Episode(BaseModel):
 class EpisodeHeader(DBItem):
     """A stored episode without its tuples.
 
-    `end` is `terminal`, `timeout` or `interrupted` ("" where unknown); `episode_return` is the sum of its
-    rewards, None where they are no numbers; `env` counts sub-environments from 0 and `episode` the episodes
-    of one recording; `recording` is its path relative to the storage, with forward slashes. `run` is what the recording
-    says of its run: name, metadata, tags, split, environment, started and ended (ISO 8601 in UTC), and more.
+    `end` is `terminal`, `timeout` or `interrupted` ("" if unknown); `episode_return` is the sum of its rewards, None
+    if they are no numbers; `env` is the sub-environment, from 0, and `episode` the episode's number in its recording;
+    `recording` is a path relative to the storage, with forward slashes. `run` has facts about the run: name,
+    metadata, tags, split, environment, started and ended (ISO 8601 in UTC), and more.
     """
 
     benchmark_id: str
@@ -199,7 +199,9 @@ def unchecked_header(values: dict[str, Any]) -> EpisodeHeader:
     Built without validation, and without `model_construct`: they would cost more than the rest of listing episodes.
     """
     made = _NEW(EpisodeHeader)
-    _SET(made, "__pydantic_fields_set__", _HEADER_FIELDS)  # all of them are: nothing is ever added to it
+    _SET(
+        made, "__pydantic_fields_set__", _HEADER_FIELDS
+    )  # shared by all headers: nothing is ever added to it
     _SET(made, "__pydantic_extra__", None)
     _SET(made, "__pydantic_private__", None)
     _SET(made, "__dict__", values)
@@ -237,7 +239,7 @@ class EpisodeMetadataCallback(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget the episode that has just ended."""
+        """Begin a new episode: forget the one that has ended."""
 
     @abstractmethod
     def __call__(self, tuple: RLTuple) -> dict[str, Any]:

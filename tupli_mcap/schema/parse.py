@@ -9,12 +9,12 @@
                 | key
     value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
-A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true of lists that hold "x".
-`key ~ "x"` is true of texts in which "x" occurs. Words are case-insensitive (`none` is `null`), keys are not; a name in
+A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true for lists that hold "x".
+`key ~ "x"` is true for texts that contain "x". Words are case-insensitive (`none` is `null`), keys are not; a name in
 a key that is no word is quoted: `metadata."a b"`.
 
-The order of and, or, not and parentheses is Python's, so Python's parser finds it. It sees a key as `k`, a value as `0`
-and a sign as `<`, nothing else of the text, and nothing is evaluated.
+And, or, not and parentheses bind as in Python, so Python's parser finds the structure. It gets `k` for each key, `0`
+for each value and `<` for each sign, nothing else of the text; nothing is evaluated.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ _NEXT: Final[Mapping[str, Mapping[str, str]]] = {
     "value": {"value": "more"},
     "more": {"and": "key", "or": "key", ")": "more", "end": "more"},
 }
-"""What is expected -> the kinds of token that may come, and what is expected after each."""
+"""State of the parser -> the kinds of token that may come, and the state after each."""
 _PYTHON: Final = {"key": "k", "value": "0", "sign": "<", "end": ""}
 _WIDTH: Final = 4  # characters of Python for each token, so that a node's column says which token it is
 
@@ -135,7 +135,7 @@ def parse_filter(text: str) -> BaseFilter:
     """The filter that a text describes.
 
     Raises:
-        FilterError: The text is no filter, or a comparison in it has no meaning; names the character
+        FilterError: The text is no filter, or a comparison in it has no meaning; the message names the character
             (from 0) and what was expected there.
     """
     tokens = _checked_tokens(text)
@@ -147,7 +147,7 @@ def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilte
     """The filter that a text describes, `bound` to items of a model, or with these fields.
 
     Raises:
-        FilterError: as `parse_filter` and `bound`; it has the position, also of a key that there is not.
+        FilterError: as `parse_filter` and `bound`; it has the position, also for an unknown key.
     """
     parsed = parse_filter(text)
     try:
@@ -163,16 +163,16 @@ def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilte
 
 
 def format_filter(filter: BaseFilter) -> str:
-    """The text that `parse_filter` makes this filter of.
+    """The text of a filter, which `parse_filter` turns into the same filter.
 
     Raises:
-        FilterError: The filter has no such text: an empty AND or OR, or a key that starts with no word.
+        FilterError: The filter has no text: an empty AND or OR, or a key that starts with no word.
     """
     return _format(filter, outer=True)
 
 
 def _checked_tokens(text: str) -> list[_Token]:
-    """The tokens of a filter, each of which may come where it does."""
+    """The tokens of a filter; raises FilterError for one that is not allowed in its place."""
     tokens: list[_Token] = []
     expected, parentheses, negations = "key", 0, 0
     for token in _tokens(text):
@@ -250,7 +250,7 @@ def _filter(node: ast.expr, tokens: Sequence[_Token]) -> BaseFilter:
 
 
 def _unquoted(text: str, token: _Token) -> FilterError:
-    """What to say of a token that begins no value, perhaps a text or a time without quotes."""
+    """The error for a token that is no value: maybe a text or a time without quotes."""
     match = _UNQUOTED.match(text, token.position)
     if match is None:
         return _error(text, _A_VALUE, token)

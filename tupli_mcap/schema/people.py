@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 
 class Right(enum.StrEnum):
-    """What a role may allow."""
+    """A right that a role may give."""
 
     BENCHMARK_CREATE = "benchmark_create"
     BENCHMARK_READ = "benchmark_read"
@@ -43,7 +43,7 @@ class Membership(BaseModel):
 
 
 class UserOut(BaseModel):
-    """A user, and in which groups."""
+    """A user and their groups."""
 
     username: str
     memberships: list[Membership] = Field(default_factory=list)
@@ -72,22 +72,27 @@ class GroupMembership(BaseModel):
 
 
 class GroupMembershipQuery(BaseModel):
-    """Users who are to come into a group, or to leave it."""
+    """Users to add to a group, or to remove from it."""
 
     group_name: str
     members: list[GroupMembership]
 
 
 class GroupWithMembers(Group):
-    """A group and who is in it, as far as the caller may know; `roles` are those of each member."""
+    """A group and the members that the caller may see; `roles` are those of each member."""
 
     members: list[str] = Field(default_factory=list)
     roles: dict[str, list[str]] = Field(default_factory=dict)
 
 
 class ApiToken(BaseModel):
-    """A token for a machine. scope: `read` or `write`. created_at, expires: ISO 8601 in UTC; expires is None for one
-    that never does. token: what it is, known once, when it is made."""
+    """A token for a machine.
+
+    Attributes:
+        scope: `read` or `write`.
+        created_at, expires: ISO 8601 in UTC; `expires` is None for a token that never does.
+        token: the secret itself, only in the answer that makes it.
+    """
 
     id: str
     name: str

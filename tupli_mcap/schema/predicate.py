@@ -27,13 +27,14 @@ MISSING: Final = object()
 def compile_predicate(
     filter: BaseFilter | None, fields: type[BaseModel] | Iterable[str] | None = None
 ) -> Predicate:
-    """A function that tells whether a filter is true of an item: nested mappings, or a pydantic model.
+    """A function that tells whether a filter is true for an item: nested mappings, or a pydantic model.
 
-    No filter is true of everything. With `fields` (a model class, or names), only those top-level keys exist; with a
-    model class, times are compared as times.
+    None as the filter is true for every item. With `fields` (a model class, or names), only those top-level keys exist;
+    with a model class, times are compared as times.
 
     Raises:
-        FilterError: The filter names an unknown top-level key, or compares a field with what it can never be.
+        FilterError: The filter names an unknown top-level key, or compares a field with a value of a kind that it never
+            has.
     """
     if filter is None:
         return lambda item: True
@@ -42,7 +43,7 @@ def compile_predicate(
 
 
 def bound_predicate(filter: BaseFilter) -> Predicate:
-    """The same of a filter that is `bound` to a model already."""
+    """The same for a filter that is already `bound` to a model."""
     return _predicate(filter, timed=True)
 
 
@@ -71,7 +72,7 @@ def _predicate(filter: BaseFilter, *, timed: bool) -> Predicate:
 
 
 def _value_test(filter: BaseFilter) -> Callable[[object], bool]:
-    """What a comparison says of a value that is there: of a list, what it says of its elements."""
+    """The test of a comparison on a value that is there; a list is tested by its elements."""
     test = scalar_test(filter)
     if filter.type in ORDERING:
         return lambda found: test(classify(found))
@@ -96,7 +97,7 @@ def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
 
 
 def look_up(item: object, path: tuple[str, ...]) -> object:
-    """What nested mappings and models hold at a path; `MISSING` if there is nothing."""
+    """The value at a path in nested mappings and models; `MISSING` if there is none."""
     for segment in path:
         if isinstance(item, BaseModel):
             if segment not in type(item).model_fields:
@@ -110,7 +111,7 @@ def look_up(item: object, path: tuple[str, ...]) -> object:
 
 
 def evaluate_columns(filter: BaseFilter, columns: Mapping[str, Any]) -> Mask:
-    """Which steps a filter is true of.
+    """A mask of the steps for which a filter is true.
 
     Args:
         filter: Comparisons of step fields: `F("reward") > 0`, `F("state.0") < 1`, `F("state.pos.1") >= 2`.
@@ -122,7 +123,7 @@ def evaluate_columns(filter: BaseFilter, columns: Mapping[str, Any]) -> Mask:
         A bool array of shape `(n,)`.
 
     Raises:
-        FilterError: There is no such column, key or position, or the path names no single value per step.
+        FilterError: There is no such column, key or position, or the path names several values of a step.
     """
     if not columns:
         raise FilterError("a filter over steps needs at least one column")
@@ -179,7 +180,7 @@ def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> npt.ND
         column = choices[segment]
     if isinstance(column, Mapping | tuple):
         raise FilterError(
-            f"filter key {key!r} names several values a step; add one of their names or positions"
+            f"filter key {key!r} names several values of a step; add one of their names or positions"
         )
     return _inside(key, column, ())
 
@@ -201,7 +202,7 @@ def _inside(key: str, column: Any, path: tuple[str, ...]) -> npt.NDArray[Any] | 
 
 
 def _step_value(value: Any, path: tuple[str, ...]) -> Any:
-    """A value inside one step of a column of variable size; what is not there compares as nothing does."""
+    """A value inside one step of a column of variable size; every comparison is false for a missing one."""
     for segment in path:
         try:
             value = value[segment] if isinstance(value, Mapping) else value[int(segment)]
@@ -227,7 +228,7 @@ def _compare_array(operation: str, array: npt.NDArray[Any], wanted: Scalar) -> M
 
 
 def _compare_ints(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
-    # NumPy would compare int64 with a float in float64, where neighbours beyond 2**53 are one.
+    # NumPy would compare int64 with a float as float64, which cannot tell neighbours beyond 2**53 apart.
     limits = np.iinfo(array.dtype)
     if number > limits.max or number < limits.min:
         return np.full(len(array), operation in (("LT", "LEQ") if number > 0 else ("GT", "GEQ")))

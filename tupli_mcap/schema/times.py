@@ -1,9 +1,9 @@
-"""Times: facts are kept in UTC, shown in the local zone, and compared as times, to the microsecond.
+"""Times: stored in UTC, shown in the local zone, and compared as times, to the microsecond.
 
-A text means all of the time that it names: `2026-11-23` is a day, `2026-11-23 03:31` a minute, `2026-11-23 03:31:07`
-a second. So `==` is true within it, `>` after its end, `>=` from its beginning, `<` before it and `<=` up to its end:
-what a table shows is found by `==`. A text without a zone is about local time. A week begins on Monday. The calendar
-ends with the years 1 and 9999 in UTC: what lies beyond, in another zone, is its first or last microsecond.
+A text stands for the whole span that it names: `2026-11-23` is a day, `2026-11-23 03:31` a minute, `2026-11-23
+03:31:07` a second. So `==` is true within the span, `>` after its end, `>=` from its beginning, `<` before it and
+`<=` up to its end: a time as a table shows it can be found by `==`. A text without a zone is in local time. A week
+begins on Monday. Times before the year 1 or after 9999 in UTC count as the first or last microsecond of these years.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w) ago", re.ASCII | re.IGNORECASE
 _WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 _CALENDAR: Final = re.compile(r"(this|last) (week|month|year)")
 _UNITS: Final = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
-_EARLIEST_NS: Final = 10**17  # 1973: what is less is no time in nanoseconds, but in seconds or milliseconds
+_EARLIEST_NS: Final = 10**17  # 1973: a smaller number is not in nanoseconds, but in seconds or milliseconds
 
 
 class TimeSpan(NamedTuple):
@@ -46,7 +46,7 @@ class TimeSpan(NamedTuple):
 
 
 def span_of(value: object, now: datetime.datetime | None = None) -> TimeSpan:
-    """What a value in a filter names: an ISO 8601 text, a word, or nanoseconds; `now` (default: now) is for the words.
+    """The span that a value in a filter names: an ISO 8601 text, a word, or nanoseconds. Words are relative to `now`.
 
     Raises:
         ValueError: It names no time.
@@ -96,7 +96,7 @@ def _day(day: datetime.date) -> TimeSpan:
 
 
 def _calendar(today: datetime.date, unit: str, *, back: bool) -> TimeSpan:
-    """The week, month or year that today lies in, or the one before."""
+    """The week, month or year of `today`, or with `back` the one before."""
     first = _first_of(unit, today)
     if back:
         return _days(_first_of(unit, first - _DAY), first - _DAY)
@@ -104,14 +104,14 @@ def _calendar(today: datetime.date, unit: str, *, back: bool) -> TimeSpan:
 
 
 def _first_of(unit: str, day: datetime.date) -> datetime.date:
-    """The first day of the week, month or year that a day lies in."""
+    """The first day of the week, month or year of a day."""
     if unit == "week":
         return day - day.weekday() * _DAY
     return day.replace(day=1) if unit == "month" else day.replace(month=1, day=1)
 
 
 def _days(first: datetime.date, last: datetime.date) -> TimeSpan:
-    """Days in the local zone, each of 23 hours or 25 where the clocks are changed."""
+    """The span of days in the local zone; a day has 23 or 25 hours when the clocks change."""
     # the last microsecond, after the clocks are set back: the calendar's last day has no following midnight
     start = _ns(_utc(datetime.datetime.combine(first, datetime.time.min)))
     end = _ns(_utc(datetime.datetime.combine(last, datetime.time.max.replace(fold=1))))
@@ -124,9 +124,9 @@ def _span(start: datetime.datetime, length: datetime.timedelta) -> TimeSpan:
 
 
 def _utc(time: datetime.datetime) -> datetime.datetime:
-    """A time (local if it has no zone) in UTC; the first or last one there is if it lies beyond."""
+    """A time (local if it has no zone) in UTC; the first or last possible one if it lies beyond."""
     try:
-        # of the class itself: those of others (pandas) have other arguments
+        # the method of the class itself: those of subclasses (pandas) take other arguments
         return datetime.datetime.astimezone(time, datetime.UTC)
     except (OverflowError, ValueError):
         nearest = datetime.datetime.min if time.year == datetime.MINYEAR else datetime.datetime.max
@@ -145,7 +145,7 @@ def text_of(value: datetime.date) -> str:
 
 
 def time_ns(text: object) -> int | None:
-    """The time that a fact says (ISO 8601, in UTC where it has no zone); None if it says none."""
+    """The time (ns) of an ISO 8601 text, in UTC if it has no zone; None if it is no time."""
     try:
         found = datetime.datetime.fromisoformat(text)  # type: ignore[arg-type]
     except (ValueError, TypeError):
@@ -154,7 +154,7 @@ def time_ns(text: object) -> int | None:
 
 
 def iso_utc(time_ns: int) -> str:
-    """A time (ns) as a fact says it: ISO 8601 in UTC, to the microsecond."""
+    """A time (ns) as ISO 8601 in UTC, to the microsecond."""
     return (_EPOCH + time_ns // 1000 * _MICROSECOND).isoformat(timespec="microseconds")
 
 

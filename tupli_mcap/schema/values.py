@@ -36,10 +36,10 @@ _SMALL: Final = str.maketrans(string.ascii_uppercase, string.ascii_lowercase)
 
 
 def classify(value: object) -> Scalar:
-    """What a filter sees in a value.
+    """A value as filters see it.
 
-    NumPy scalars and 0-d arrays are the Python numbers they hold, `{"$float": "nan"}` is the float it stands
-    for (that is how strict JSON carries it), and everything that is no scalar is `other`.
+    NumPy scalars and 0-d arrays are the Python numbers they hold, `{"$float": "nan"}` is the float that strict JSON
+    writes like this, and everything that is no scalar is `other`.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
@@ -63,7 +63,7 @@ def classify(value: object) -> Scalar:
 
 
 def small_letters(text: str) -> str:
-    """The text with a to z in place of A to Z, as every database can do it; other letters stay what they are."""
+    """The text with A to Z replaced by a to z; other letters stay, as in every database."""
     return text.lower() if text.isascii() else text.translate(_SMALL)
 
 
@@ -82,9 +82,9 @@ def compare(operation: str, found: Scalar, wanted: Scalar) -> bool:
 
 
 def against_floats(operation: str, number: float) -> tuple[str, float] | None:
-    """A comparison with a number, as one with a float that says the same of every float; None if never true.
+    """A comparison with a float that gives the same result as one with `number` for every float; None if never true.
 
-    An int may lie between two neighbouring floats, or beyond them all.
+    An int may lie between two neighbouring floats, or beyond all of them.
     """
     try:
         nearest = float(number)

@@ -1,4 +1,4 @@
-"""Exactness: which dtype stores a leaf, and casts that lose nothing or refuse."""
+"""Decides which dtype stores a leaf, and casts values exactly or refuses."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
     """The dtype that stores a leaf for a whole recording, from its first values (reset's and the first step's).
 
     Python scalars take the declared dtype, but a Python float in a leaf narrower than float64 makes it float64, since
-    rounding it would lose what the environment returned. NumPy values widen, never narrow. One warning names a leaf
-    whose values stray from its declared dtype.
+    rounding would change what the environment returned. NumPy values widen the dtype and never narrow it. A warning
+    names each leaf whose values have another dtype than the declared one.
     """
     if leaf.dtype is None:
         raise StepError(f"{leaf.path}: a value of variable size has no dtype")
@@ -44,7 +44,7 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
     if dtype != leaf.dtype:
         warnings.warn(
             f"{leaf.path} is declared {leaf.dtype.name}, but the values are {dtype.name}; "
-            f"they are recorded as {dtype.name}, exactly as given; cast them where {leaf.dtype.name} is meant",
+            f"they are recorded as {dtype.name}, exactly as given; cast them if {leaf.dtype.name} is meant",
             UserWarning,
             stacklevel=2,
         )
@@ -59,10 +59,10 @@ def _widen(dtype: DType, value: Any) -> DType:
             return _widen(dtype, np.asarray(value)) if _has_float(value) else dtype
         return dtype
     if value.dtype.kind not in "biuf":
-        return dtype  # refused, with its path, when the value is stored
+        return dtype  # storing the value refuses it, and names its path
     wide = np.result_type(dtype, value.dtype)
     if wide.kind == "f" and dtype.kind in "biu" and value.dtype.kind in "biu":
-        # int64 and uint64 have no common integer: the values' own dtype is what the environment returns
+        # int64 and uint64 have no common integer dtype: take that of the values
         wide = value.dtype
     return np.dtype(wide.name)
 
@@ -87,23 +87,23 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
         raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}")
     if array.shape != shape:
         raise StepError(
-            f"{path}: expected shape {shape}, found shape {array.shape}; nothing is reshaped in silence"
+            f"{path}: expected shape {shape}, found shape {array.shape}; reshape it, or declare this shape in the space"
         )
     if array.dtype == dtype:
-        # one made by a view may hold any byte
+        # a bool made by a view may hold any byte
         return array if dtype.kind != "b" else array.view(np.uint8) != 0
     with np.errstate(all="ignore"):
         cast = array.astype(dtype)
     if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
         raise StepError(
             f"{path}: expected values that {dtype.name} holds exactly, found {array.dtype.name} {shorten(value)}; "
-            f"the first step has fixed what is recorded: cast the values, or declare {array.dtype.name} in the space"
+            f"the first step has fixed the dtypes: cast the values, or declare {array.dtype.name} in the space"
         )
     return cast
 
 
 def exact_flag(value: Any, name: str) -> bool:
-    """A flag of a step; StepError unless it is a bool or the number 0 or 1 (None or a text is a mistake)."""
+    """A flag of a step; raises StepError unless it is a bool or the number 0 or 1."""
     if value is True or value is False:
         return value
     with contextlib.suppress(ValueError, TypeError, RuntimeError):
@@ -121,9 +121,9 @@ def _always_exact(source: DType, target: DType) -> bool:
 
 
 def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
-    """Element-wise equality in Python's exact arithmetic (NumPy would round an int64 to compare it with a float64).
+    """Exact element-wise equality (NumPy would round an int64 to compare it with a float64).
 
-    A float must also come back from the cast bit for bit: -0.0 and the payload of a NaN do not survive every cast.
+    A float must also come back from the cast bit for bit: some casts lose -0.0 or the payload of a NaN.
     """
     if array.dtype.kind == "f":
         with np.errstate(all="ignore"):
@@ -150,7 +150,7 @@ def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
 
 
 def structure_check(space: gym.Space[Any], path: str) -> Callable[[Any], None]:
-    """`check_structure` of a space, quicker for plain dicts and tuples."""
+    """A function that does `check_structure` for a space, faster for plain dicts and tuples."""
     fits = _fits(space)
     if fits is None:
         return lambda _: None
@@ -163,7 +163,7 @@ def structure_check(space: gym.Space[Any], path: str) -> Callable[[Any], None]:
 
 
 def _fits(space: gym.Space[Any]) -> Callable[[Any], bool] | None:
-    """Tells that a value surely has the structure of a space; None where any value has."""
+    """A test that is true only of values with the structure of a space; None if every value has it."""
     if type(space) is spaces.Dict:
         keys = space.spaces.keys()
         inside = [(key, fits) for key, sub in space.spaces.items() if (fits := _fits(sub)) is not None]
@@ -182,7 +182,7 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool] | None:
 
 
 def leaf_value(value: Any, leaf: Leaf) -> Any:
-    """A leaf's value inside `value`; StepError names the place where the structure differs."""
+    """A leaf's value inside `value`; raises a StepError that names the place where the structure differs."""
     found = value
     try:
         for key in leaf.keys:

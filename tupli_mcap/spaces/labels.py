@@ -1,4 +1,4 @@
-"""What people call the dimensions and values of a recording, and how long a step takes; kept as `labels.json`."""
+"""Labels: names of dimensions and values for people, and the time that a step takes; kept as `labels.json`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LONGEST = 200  # characters of one label
 
 
 class Labels(NamedTuple):
-    """Names for what is in a recording; leaves without any are left out.
+    """Names of dimensions and values; leaves without names are left out.
 
     `dimensions`: leaf path (`state`, `state['arm']`, `action`) -> a name for each dimension of the flattened leaf.
     `values`: path of a Discrete leaf -> a name for each value, from the space's `start` on.
@@ -34,7 +34,7 @@ class Labels(NamedTuple):
 
     @classmethod
     def none(cls) -> Labels:
-        """Nothing is known."""
+        """Labels without any name."""
         return cls({}, {})
 
     def __bool__(self) -> bool:
@@ -45,10 +45,10 @@ class Labels(NamedTuple):
 
     @classmethod
     def from_json(cls, data: bytes, leaves: Sequence[Leaf], where: str) -> Labels:
-        """The labels of the leaves that there are.
+        """Parses `labels.json`; labels of other leaves than `leaves` are ignored.
 
         Raises:
-            FormatError: something else, or a number of labels that a leaf has no use for.
+            FormatError: `data` is something else, or a leaf has another number of labels than dimensions or values.
         """
         expected = f"{where}: expected labels as schemas/labels.schema.json has them"
         if len(data) > MAX_LABELS:
@@ -78,10 +78,10 @@ class Labels(NamedTuple):
 
 
 def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], known: Labels) -> Labels:
-    """`known`, with what somebody chose in its place: leaf path -> names of its dimensions, or of its values.
+    """`known`, replaced by `given` where it has names: leaf path -> names of its dimensions, or of its values.
 
     Raises:
-        SpaceError: a path that is no leaf's, or another number of names than the leaf has dimensions or values.
+        SpaceError: no leaf has the path, or the leaf has another number of dimensions or values.
     """
     by_path = {leaf.path: leaf for leaf in leaves}
     dimensions, values = dict(known.dimensions), dict(known.values)

@@ -1,4 +1,4 @@
-"""The leaves of a Gymnasium space: where each value lies in it, and how a message stores it.
+"""The leaves of a Gymnasium space: their places in it, and how a message stores them.
 
 A Dict or Tuple is only structure. Everything below it is a leaf: an array or scalar of constant size (Box, Discrete,
 MultiDiscrete, MultiBinary), an image, or a value of variable size (Text, Sequence, Graph, OneOf).
@@ -42,11 +42,16 @@ _MAX_DEPTH = 64
 
 @dataclass(frozen=True)
 class Leaf:
-    """One value of a space.
+    """One leaf of a space.
 
-    `keys` leads to it from the root value, `path` says so for people (`state['pos'][1]`), `name` is its ROS field.
-    `dtype` and `shape` are the declared ones of a constant leaf; a variable leaf has `dtype` None. `frames_last`: the
-    last axis of a stack holds its frames, not the first one.
+    Attributes:
+        keys: lead to it from the root value.
+        path: the same for people, `state['pos'][1]`.
+        name: its ROS field.
+        space: its own space.
+        kind: "scalar", "array", "image", "stack" or "variable".
+        dtype, shape: as declared; `dtype` is None for a variable leaf.
+        frames_last: the last axis of a stack holds its frames, not the first one.
     """
 
     keys: tuple[Any, ...]
@@ -70,16 +75,16 @@ class Leaf:
 
     @property
     def is_scalar(self) -> bool:
-        """True where Gymnasium's own samples are scalars: a Discrete, and a Box of shape () of integers or bools."""
+        """True if Gymnasium's own samples are scalars: a Discrete, and a Box of shape () of integers or bools."""
         return self.shape == () and self.dtype is not None and self.dtype.kind in "iub"
 
     @property
     def stored_shape(self) -> tuple[int, ...]:
-        """The shape of one value in the rows of its channel, where the frames of a stack come first."""
+        """The shape of one value in the rows of its channel; the frames of a stack come first."""
         return (self.shape[-1], *self.shape[:-1]) if self.frames_last else self.shape
 
     def as_values(self, stored: Any) -> Any:
-        """The view of an array of `stored_shape`, or of more such in one, that has the shape of values."""
+        """A view of stored values, (..., *stored_shape), with the shape of the leaf."""
         return np.moveaxis(stored, -len(self.shape), -1) if self.frames_last else stored
 
     def get(self, value: Any) -> Any:
@@ -90,14 +95,14 @@ class Leaf:
 
 
 class NameRegistry:
-    """Gives out ROS field names: sanitised, unique within one message."""
+    """Makes ROS field names that are valid and unique within one message."""
 
     def __init__(self, reserved: Sequence[str] = ()) -> None:
         self._taken = set(reserved)
-        self._counted: dict[tuple[str, tuple[str, ...]], int] = {}  # names are never given back
+        self._counted: dict[tuple[str, tuple[str, ...]], int] = {}  # last suffix of each name
 
     def take(self, text: str, prefixes: Sequence[str] = ("",)) -> str:
-        """A name like `text` that is free, with each of `prefixes` before it."""
+        """A name made of `text` that is free with each of `prefixes` before it."""
         base = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_") or "field"
         if not base[0].isalpha():
             base = f"f_{base}"
@@ -113,7 +118,7 @@ class NameRegistry:
 
 
 def camel(name: str) -> str:
-    """A field's name as a type is called: `arm_x` is `ArmX`."""
+    """A field's name as the name of a type: `arm_x` becomes `ArmX`."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 

@@ -1,4 +1,4 @@
-"""The fields of a space's JSON object: bounds, dtypes and shapes, written compactly and read with care."""
+"""The fields of a space's JSON object: bounds, dtypes and shapes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LARGE = 2**16  # elements
 
 
 class Fields:
-    """The fields of one object, each checked when it is taken."""
+    """Takes the fields of one object, and checks each of them."""
 
     def __init__(self, obj: Json, path: str) -> None:
         self._obj = obj
@@ -63,7 +63,7 @@ class Fields:
         return tuple(value)
 
     def array(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
-        """An array of `shape`, from one number or from as many as it has elements."""
+        """An array of `shape`, from one number or from one for each element."""
         value = self.take(name)
         if not isinstance(value, list):
             return np.full(shape, self._number(name, value, dtype), dtype)
@@ -75,9 +75,9 @@ class Fields:
         return array.reshape(shape)
 
     def built_shape(self, shape: tuple[int, ...], *names: str) -> tuple[int, ...]:
-        """`shape`, or one element of as many dimensions where a large space is the same everywhere.
+        """`shape`, or a shape of one element with as many dimensions if a large space has the same bounds everywhere.
 
-        Such a space takes a few bytes in a file, and it must take few in memory.
+        Such a space takes a few bytes in a file, and must take few in memory.
         """
         uniform = not any(isinstance(self._obj.get(name), list) for name in names)
         return (1,) * len(shape) if uniform and math.prod(shape) > _LARGE else shape

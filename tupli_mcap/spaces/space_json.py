@@ -1,8 +1,8 @@
-"""A Gymnasium space as a JSON object, and back: every bound, start, key and order, to the bit.
+"""A Gymnasium space as a JSON object, and back: every bound, start, key and order is exact.
 
-The object stays readable from other languages: dtypes by NumPy's names, arrays as one number where all
-elements are equal, else as the flat list of their elements in C order, infinities as `"inf"` and `"-inf"`.
-A Dict is a list of pairs, as its keys have an order and need not be strings.
+Dtypes have NumPy's names. An array is one number if all elements are equal, else the flat list of its elements in C
+order; infinities are `"inf"` and `"-inf"`. A Dict is a list of pairs, as its keys have an order and need not be
+strings.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_DEPTH = 64
 _MAX_ELEMENTS = (
     2**26
 )  # of all leaves together: a space holds its bounds in memory, and a file only claims its size
-_MAX_COPIED = 2**22  # of them, below a stacked Sequence or a Graph, where Gymnasium makes arrays of its own
+_MAX_COPIED = 2**22  # of those below a stacked Sequence or a Graph, where Gymnasium makes its own arrays
 _MAX_SPACES = 2**16
 _FLAGS = ("bounded_below", "bounded_above")
 
@@ -59,20 +59,20 @@ class _Budget:
 def space_to_json(space: gym.Space[Any], name: str = "space") -> Json:
     """Return an object of `str`, `int`, `float`, `bool`, `list` and `dict` only, which describes `space`.
 
-    The state of its random generator is no part of it.
+    The state of the space's random generator is left out.
 
     Raises:
-        SpaceError: a space that is no part of Gymnasium (a subclass too), a dtype that no message can hold,
-            or a key that has no JSON form; the message starts with the path of the leaf: `name['a'][1]`.
+        SpaceError: a space is not Gymnasium's own (or is a subclass), no message can hold a dtype, or a key has no JSON
+            form; the message starts with the path of the leaf: `name['a'][1]`.
     """
     return _write(space, name, 0, 1, _Budget())
 
 
 def space_from_json(obj: Any) -> gym.Space[Any]:
-    """Return the space an object of `space_to_json` describes; sizes are checked before allocating.
+    """Return the space that an object of `space_to_json` describes; sizes are checked before anything is allocated.
 
     Raises:
-        FormatError: any defect, with its path.
+        FormatError: the object has a defect; the message has its path.
     """
     return _read(obj, "space", 0, 1, _Budget())
 
@@ -131,7 +131,7 @@ WriteSub = Callable[..., Json]
 ReadSub = Callable[..., "gym.Space[Any]"]
 
 
-# One writer and one reader a space, side by side, the same fields in the same order.
+# A writer and a reader for each space, side by side, with the same fields in the same order.
 
 
 def _write_box(space: Any, path: str, _: WriteSub) -> Json:
@@ -143,7 +143,7 @@ def _write_box(space: Any, path: str, _: WriteSub) -> Json:
                 f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {short(bound)}"
             )
         obj[name] = numbers(bound)
-    if space.dtype.kind == "i":  # of a float the bound itself says whether there is one
+    if space.dtype.kind == "i":  # an infinite bound of a float says that there is none
         obj["bounded_below"] = numbers(space.bounded_below)
         obj["bounded_above"] = numbers(space.bounded_above)
     return obj
@@ -165,7 +165,7 @@ def _read_box(fields: Fields, _: ReadSub) -> gym.Space[Any]:
 
 
 def _spread(space: Any, shape: tuple[int, ...], *names: str) -> gym.Space[Any]:
-    """A space of one element made one of many: its arrays take no memory for them, and cannot be written to."""
+    """Turns a space of one element into one of `shape`: its arrays repeat the element without memory, read-only."""
     for name in names:
         setattr(space, name, np.broadcast_to(getattr(space, name), shape))
     space._shape = shape
@@ -210,7 +210,7 @@ def _read_multi_binary(fields: Fields, _: ReadSub) -> gym.Space[Any]:
 
 
 def _write_text(space: Any, _path: str, _: WriteSub) -> Json:
-    # As code points where there are surrogates: two in a row become one other character in JSON.
+    # Code points if there are surrogates: JSON would join two of them into one character.
     characters = "".join(_characters(space))
     try:
         characters.encode()
@@ -220,10 +220,10 @@ def _write_text(space: Any, _path: str, _: WriteSub) -> Json:
 
 
 def _characters(space: Any) -> list[str]:
-    """Those of a Text, in their order; sorted where that is a set's, as Gymnasium 1.0 leaves it (the default's
-    too): it differs from process to process, and one space would be described in many ways."""
+    """The characters of a Text in their order. If the order is that of a set, as in Gymnasium 1.0, they are sorted: it
+    differs between processes, and one space must have one description."""
     listed = list(dict.fromkeys(space.character_list))
-    of_a_set = len(listed) > 8 and listed == list(space.character_set)  # no coincidence
+    of_a_set = len(listed) > 8 and listed == list(space.character_set)  # too long for a coincidence
     return sorted(listed) if of_a_set else listed
 
 
