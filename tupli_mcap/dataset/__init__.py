@@ -1,13 +1,13 @@
-"""Datasets: episodes, wherever they lie, and the arrays they are.
+"""Datasets: episodes of files, directories and servers, and the arrays of their steps.
 
 opening            `open`: the dataset of a path, a URL, a storage, ...
-dataset            `Dataset`: episodes narrowed, put in order, read, handed on
-tupli, query       `TupliDataset`: PyTupli's, with three filters, and what has been read so far
-sources, which     where episodes come from; which of them a word, a number or a filter means
-keys               the values that episodes have at a key
-columns/           whole columns: read, saved, as tables and as what other libraries expect
-access, items/     `windows`, `transitions`, and samples of them; how they read steps by number
-curate, display    a recording of fewer episodes; datasets as text and HTML
+dataset            `Dataset`: filters, sorts, reads and saves episodes
+tupli, query       `TupliDataset`: PyTupli's interface; its three filters, and the columns read so far
+sources, which     lists and opens episodes; finds those that a word, a number or a filter means
+keys               the values of episodes at a key
+columns/           whole columns: reads and saves them; as tables, and in the forms of other libraries
+access, items/     `windows`, `transitions`, and samples of them; reads steps by number
+curate, display    writes a recording of fewer episodes; shows datasets as text and HTML
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import DatasetError
     from tupli_mcap.dataset.tupli import TupliDataset
 
-# Imported on first use: who only reads items, as a worker of a DataLoader does, needs no storage.
+# Imported on first use: a process that only reads items, such as a worker of a DataLoader, needs no storage.
 _HOMES = {
     "BaseTupleParser": "columns.convert",
     "Dataset": "dataset",

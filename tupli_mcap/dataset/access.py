@@ -1,4 +1,4 @@
-"""Random access to the steps of a dataset: windows, transitions, delta windows, and samples of them."""
+"""Random access to the steps of a dataset: windows, transitions and delta windows."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ __all__ = ["RandomAccess", "episode_values"]
 
 
 class RandomAccess(SaysWhatIsMeant):
-    """What a dataset, or the columns saved of one, gives by number. Only what is asked for is read."""
+    """Items by number of a dataset, or of saved columns. Only requested items are read."""
 
     @property
     def steps(self) -> Steps:
-        """The wanted steps by number, from 0, in the episodes' order: what windows and samplers read from."""
+        """The wanted steps by number, from 0, in the order of the episodes; windows and samplers read them."""
         raise NotImplementedError
 
     @property
     def _headers(self) -> Sequence[EpisodeHeader]:
-        """The episodes that the steps are of."""
+        """The episodes of the steps."""
         raise NotImplementedError
 
     def _step_seconds(self) -> float | None:
-        """How long a step takes, where all recordings say the same."""
+        """The time that a step takes (s), if all recordings agree; else None."""
         raise NotImplementedError
 
     def windows(
@@ -64,12 +64,13 @@ class RandomAccess(SaysWhatIsMeant):
     ) -> Windows:
         """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
 
-        See `Windows`: an index gives one window, an array of numbers gives a batch of them. The fields "infos", for all
-        keys, and "info.<key>" give a dict of columns by key; all of them are put into memory. Numbers are arrays, with
-        NaN where a step has no such info. The field "frames" gives the pictures that were recorded of the states.
+        See `Windows`: an index gives one window, an array of numbers gives a batch. The fields "infos", for all keys,
+            and
+        "info.<key>" give a dict of columns by key, which are all read into memory. Numbers are arrays, with NaN for
+        steps without such an info. The field "frames" gives the recorded pictures of the states.
 
         Raises:
-            SamplingError: no episode is long enough, or the arguments mean nothing.
+            SamplingError: no episode is long enough, or an argument has no meaning.
         """
         steps, fields = self._with_more(fields)
         made = Windows(steps, length, stride, pad, history, fields=fields)
@@ -80,17 +81,17 @@ class RandomAccess(SaysWhatIsMeant):
     ) -> Transitions:
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
-        See `Transitions` for several steps, and `Transition` for what to bootstrap with. Fields are those of
+        See `Transitions` for several steps, and `Transition` for targets of values. Fields are those of
         `Transition`; "infos", "info.<key>" and "frames" are as for `windows`.
 
         Raises:
-            SamplingError: the dataset is empty, or the arguments mean nothing.
+            SamplingError: the dataset is empty, or an argument has no meaning.
         """
         steps, fields = self._with_more(fields)
         return Transitions(steps, n_step, discount, fields=fields).of_episodes(self._values_now())
 
     def _with_more(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
-        """The steps with infos and frames where fields name them, and the names of what is read of them."""
+        """The steps, with infos and frames if fields name them, and the names of the fields to read."""
         steps = self.steps
         given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
         keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] in (INFOS, "info")]
@@ -106,18 +107,18 @@ class RandomAccess(SaysWhatIsMeant):
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         """The info of each step."""
         raise SamplingError(
-            "infos are read out of recordings; open these with tupli_mcap.open, and take windows of that"
+            "saved columns hold no infos; open the recordings with tupli_mcap.open, and take windows of that"
         )
 
     def _frames_of(self, place: int) -> Frames:
         """The frames of an episode."""
         raise SamplingError(
-            "frames are read out of recordings; open these with tupli_mcap.open, and take windows of that"
+            "saved columns hold no frames; open the recordings with tupli_mcap.open, and take windows of that"
         )
 
     def episode_values(self, expression: F | BaseFilter) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The number that each episode has at a key, such as `F("metadata.score")`; of a filter, 1 where it is true,
-        else 0. What samplers take as weights.
+        """The number of each episode at a key, such as `F("metadata.score")`; for a filter, 1 if it is true, else 0.
+        Samplers take these as weights.
 
         Raises:
             SamplingError: an episode has no number there.
@@ -126,7 +127,7 @@ class RandomAccess(SaysWhatIsMeant):
         return episode_values(self._headers, expression)
 
     def _values_now(self) -> Callable[[F | BaseFilter], np.ndarray[Any, np.dtype[np.float64]]]:
-        """`episode_values` of the episodes as they are listed now, whatever is listed later."""
+        """A function like `episode_values` for the episodes as they are listed now, even if they are listed anew."""
         return partial(episode_values, self._headers)
 
     def delta_windows(
@@ -138,10 +139,10 @@ class RandomAccess(SaysWhatIsMeant):
     ) -> DeltaWindows:
         """The values around each step: `{"state": [-2, -1, 0], "action": range(16)}`, in steps or seconds.
 
-        See `DeltaWindows`. `step_seconds` is by default what the recordings say in their labels.
+        See `DeltaWindows`. `step_seconds` is by default that in the labels of the recordings.
 
         Raises:
-            SamplingError: the dataset is empty, unknown keys, or seconds where the recordings do not say them alike.
+            SamplingError: the dataset is empty, a key is unknown, or the recordings do not agree on the time of a step.
         """
         if unit == "seconds" and step_seconds is None:
             step_seconds = self._step_seconds()
@@ -150,7 +151,7 @@ class RandomAccess(SaysWhatIsMeant):
 
 
 def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter) -> np.ndarray[Any, Any]:
-    """The number that each episode has at a key, `F("metadata.score")` for example; of a filter, 1 where it is true.
+    """See `RandomAccess.episode_values`.
 
     Raises:
         SamplingError: an episode has no number there, or it is no expression.

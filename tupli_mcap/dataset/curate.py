@@ -1,4 +1,4 @@
-"""A recording of some episodes: those that match a filter, or those of a dataset."""
+"""Writes a recording of some episodes: those that match a filter, or those of a dataset."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ __all__ = [
 
 
 class FilterReport(NamedTuple):
-    """What a filter kept of a recording, or would keep; `size` in bytes, 0 where nothing was written."""
+    """The result of filtering a recording, or of a dry run; `size` of the file in bytes, 0 if none was written."""
 
     path: Path
     episodes: int
@@ -62,13 +62,13 @@ def filter_recording(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> FilterReport:
-    """Writes the episodes that a filter (or its text, such as "metadata.score > 3") is true of to `target`.
+    """Writes the episodes that match a filter (or its text, such as "metadata.score > 3") to `target`.
 
-    They keep their ids, and all that belongs to them comes along; a signature is left out.
+    They keep their ids and everything that belongs to them; a signature is left out.
 
     Raises:
-        FilterError: the filter names what episodes do not have.
-        RecordingError: it is true of no episode; the target exists (and not `overwrite`) or cannot be written.
+        FilterError: the filter names a key that episodes do not have.
+        RecordingError: no episode matches; the target exists (without `overwrite`) or cannot be written.
         FormatError: the source is damaged.
     """
     target = Path(target)
@@ -171,7 +171,7 @@ def _kept_of(episode: Episode, *, steps: slice, numbers: Collection[int]) -> sli
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
-    """The path of a new file; DatasetError if it is that of a directory."""
+    """The path of a new file; raises DatasetError if it is a directory."""
     if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
         raise DatasetError(f"{os.fspath(place)} is a directory; give the path of a file (.mcap)")
     return Path(place)
@@ -241,7 +241,7 @@ def trim(
 
 
 def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, overwrite: bool) -> Path:
-    """Has `target` made out of one recording that has all episodes of a dataset."""
+    """Makes `target` of one recording with all episodes of a dataset; several recordings are merged first."""
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     target.parent.mkdir(parents=True, exist_ok=True)

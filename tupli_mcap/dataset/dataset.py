@@ -1,4 +1,4 @@
-"""`Dataset`: episodes, wherever they lie, narrowed, put in order, read and handed on."""
+"""`Dataset`: episodes of files, directories and servers; filtered, sorted, read and saved."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
 
 
 class Dataset(RandomAccess):
-    """Episodes, wherever they lie, in an order.
+    """Episodes of files, directories and servers, in an order.
 
-    Nothing is read before it is needed, and the episodes are listed once. Verbs that
-    narrow (`filter`, `sort`, `head`, `sample`, `split`, an index) give another dataset and change nothing in this one.
-    Iteration gives episodes, and `len` counts them. Not thread-safe; a pickled copy opens the files itself.
+    Nothing is read before it is needed, and the episodes are listed once. `filter`, `sort`, `head`, `sample`, `split`
+    and an index return another dataset and do not change this one. Iteration gives episodes, and `len` counts them.
+    Not thread-safe; a pickled copy opens the files itself.
 
     Use `tupli_mcap.open` to make one.
     """
@@ -105,7 +105,7 @@ class Dataset(RandomAccess):
 
     @property
     def returns(self) -> Array:
-        """The sum of each episode's rewards: float64 (episodes,), NaN where the rewards are no numbers."""
+        """The sum of each episode's rewards: float64 (episodes,), NaN if the rewards are no numbers."""
         return np.array(
             [np.nan if header.episode_return is None else header.episode_return for header in self.headers]
         )
@@ -136,7 +136,7 @@ class Dataset(RandomAccess):
             yield self._episode(header)
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
-        """What opens its recordings, and its episodes that the filter is true of."""
+        """The source that opens its recordings, and its episodes that match the filter."""
         return self._source, (self if filter is None else self.filter(filter)).headers
 
     def _episode(self, header: EpisodeHeader) -> Episode:
@@ -145,13 +145,13 @@ class Dataset(RandomAccess):
         episode = recording.episodes[position]
         episode.listed = header
         if episode.number != header.episode:
-            raise DatasetError(f"{header.recording} has no episode {header.episode} any more; open it again")
+            raise DatasetError(f"{header.recording} has lost episode {header.episode}; open it again")
         return episode
 
     @property
     def example(self) -> Recording | None:
-        """One of the recordings, for its spaces and labels; of a dataset that filters left empty, one they left out.
-        None where there is none at all."""
+        """One of the recordings, for its spaces and labels; for an empty dataset, one that filters left out; None if
+        there is none."""
         if self.headers:
             return self._open(self.headers[0].recording)
         left_out = self._source.episodes(None, None)
@@ -173,7 +173,7 @@ class Dataset(RandomAccess):
         return numbers_by_recording(self.headers)
 
     def _open(self, name: str, needed: Sequence[int] | None = None) -> Recording:
-        """A recording with the dataset's episodes of it, or at least those that are needed."""
+        """A recording with the dataset's episodes in it, or at least the `needed` ones."""
         return self._recordings.get(name, self._chosen[name], needed)
 
     def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
@@ -185,7 +185,7 @@ class Dataset(RandomAccess):
         """The episodes of both, these first. An episode that is in both counts once.
 
         Raises:
-            DatasetError: two of their recordings have the same name, and are different.
+            DatasetError: two of their recordings have the same name and differ.
         """
         if not isinstance(other, Dataset | Recording):
             return NotImplemented
@@ -208,7 +208,7 @@ class Dataset(RandomAccess):
                 `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
-            FilterError: the test names an unknown key (of the metadata, too), compares a key with a value that it can
+            FilterError: the test names an unknown key (also of metadata), compares a key with a value that it can
                 never have, or is neither a text, an expression nor a function.
         """
         if callable(test) and not isinstance(test, BaseFilter):
@@ -232,8 +232,8 @@ class Dataset(RandomAccess):
         Equal episodes keep their order; episodes without the value come last.
 
         Raises:
-            FilterError: an unknown key, also of the metadata.
-            DatasetError: values that have no order among each other.
+            FilterError: the key is unknown, also among metadata.
+            DatasetError: two of the values cannot be ordered.
         """
         if callable(key):
             values = [key(self._episode(header)) for header in self.headers]
@@ -256,18 +256,20 @@ class Dataset(RandomAccess):
         return self._of(self.headers[: _count(n)])
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
-        """`n` different episodes (or as many as there are), drawn at random, in the order in which they were drawn."""
+        """`n` different episodes (or as many as there are), drawn at random, in the order of drawing."""
         drawn = np.random.default_rng(seed).permutation(len(self))[: _count(n)]
         return self[drawn]
 
     def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
         """Two datasets: about `fraction` of the episodes, and the others. No episode is in both.
 
-        Which side an episode is on depends on its id and the seed alone: it stays there when others are added.
+        The side of an episode depends on its id and the seed alone, so it stays the same when others are added.
 
         Args:
-            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. If there are few
-                values, all may fall on one side: look at both.
+            fraction: expected share of the episodes in the first dataset.
+            seed: of the draw.
+            by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. With few different
+                values, all may fall on one side: check both.
 
         Raises:
             DatasetError: the fraction is not between 0 and 1.
@@ -285,21 +287,21 @@ class Dataset(RandomAccess):
 
     @property
     def keys(self) -> list[str]:
-        """What filters, `sort` and `split` may name: the facts about episodes, and the metadata that some have."""
+        """The keys that filters, `sort` and `split` understand: facts about episodes, and keys of their metadata."""
         return keys_of(self.headers)
 
     # ---- reading
 
     def read(self, fields: Sequence[str] = FIVE) -> Columns:
-        """Columns of all steps, episode after episode; `episode_lengths` says where each ends.
+        """Columns of all steps, episode after episode; `episode_lengths` has the length of each.
 
         Args:
             fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames; Gymnasium's
                 names (observations, terminations, truncations) mean the same.
 
         Raises:
-            DatasetError: an unknown field.
-            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+            DatasetError: a field is unknown.
+            SpaceError: one array cannot hold the steps of two recordings; the message names them.
         """
         wanted = field_names(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
@@ -353,9 +355,9 @@ class Dataset(RandomAccess):
         """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
 
         Args:
-            length: steps of each window, which follow each other within an episode; without it, single transitions.
+            length: number of consecutive steps of each window; without it, items are single transitions.
             fields: as for `windows`, or for `transitions`.
-            seed: of the order; drawn if it is None.
+            seed: of the order; None draws one.
             drop_last: leaves out the last batch if it is not full.
             chosen: further arguments of `windows` (stride, pad, history) or `transitions` (n_step, discount).
 
@@ -383,11 +385,11 @@ class Dataset(RandomAccess):
     ) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf (`states`, or `states['arm']`; `actions`, `rewards`).
 
-        Steps are read a block at a time, once; what was found is kept. Images, and leaves of variable size (texts,
-        graphs), have no statistics.
+        Steps are read once, one block after the other, and the result is kept. Images, and leaves of variable size
+        (texts, graphs), have no statistics.
 
         Raises:
-            DatasetError: a field without numbers, or there is no step.
+            DatasetError: a field has no numbers, or there is no step.
         """
         names = field_names(fields, STATISTICAL, DatasetError)
         if missing := [name for name in names if name not in self._stats]:
@@ -397,7 +399,7 @@ class Dataset(RandomAccess):
     # ---- out
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
-        """One row per step or per episode, one column per dimension, with its name where the recording has one.
+        """One row per step or per episode, one column per dimension, with its label if the recording has one.
 
         Infos and metadata have a column for each key: `info.x`, `metadata.score`.
 
@@ -417,10 +419,10 @@ class Dataset(RandomAccess):
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording, with everything that belongs to them, in the order of their times.
 
-        Of one recording, episodes keep their ids; of several, they get new ones.
+        Episodes of one recording keep their ids; episodes of several get new ones.
 
         Raises:
-            DatasetError: there is no episode, the target exists (and not `overwrite`), or it is one of the sources.
+            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
             RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
@@ -434,18 +436,18 @@ class Dataset(RandomAccess):
         fields: Sequence[str] = ("rewards",),
         overwrite: bool = False,
     ) -> Path:
-        """Writes the episodes to a new recording, with new values of some fields; all else of them is kept.
+        """Writes the episodes to a new recording with new values of some fields; everything else stays.
 
         `ds.map(lambda episode: episode.rewards - 1, "relabelled.mcap")` gives other rewards,
         `ds.map(lambda episode: episode.all_states.clip(-1, 1), "clipped.mcap", fields=["states"])` other states.
 
         Args:
-            function: from an `Episode` to its new column (a value for each step, nested as the space is; of states one
-                more where the final state is known); with several fields, to a dict of columns.
+            function: takes an `Episode` and returns its new column (a value for each step, nested as the space is; of
+                states one more if the final state is known); with several fields, a dict of columns.
             fields: some of "rewards", "actions", "states".
 
         Raises:
-            DatasetError: there is no episode, or the target exists (and not `overwrite`).
+            DatasetError: there is no episode, or the target exists (without `overwrite`).
             RecordingError: the function returns values that the recording's dtype cannot hold exactly, or the target
                 cannot be written.
             StepError: a value of variable size is not in its space.
@@ -459,7 +461,7 @@ class Dataset(RandomAccess):
         *,
         overwrite: bool = False,
     ) -> Path:
-        """Writes the episodes to a new recording, each with only some consecutive steps; all else of them is kept.
+        """Writes the episodes to a new recording, each with only some consecutive steps; everything else stays.
 
         `ds.trim(slice(10, -5), "trimmed.mcap")` leaves out the first ten steps of each episode and the last five.
 
@@ -470,12 +472,12 @@ class Dataset(RandomAccess):
         loses its beginning has no seed, because no reset leads to its first state.
 
         Raises:
-            DatasetError: there is no episode, or the target exists (and not `overwrite`).
+            DatasetError: there is no episode, or the target exists (without `overwrite`).
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
         return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
 
-    # ---- looking
+    # ---- showing
 
     def plot(self, **options: Any) -> Any:
         """A `tupli_mcap.plots.Report` of these episodes: returns, lengths, success, states, actions and one episode.
@@ -495,7 +497,7 @@ class Dataset(RandomAccess):
         return f"<Dataset of {self._source!r}: {len(self):,} episodes, {self.n_steps:,} steps>"
 
     def __str__(self) -> str:
-        """As `repr`, of episodes that have been listed."""
+        """As `repr`, but lists the episodes first."""
         _ = self.headers
         return repr(self)
 

@@ -15,8 +15,8 @@ _WIDTH = 100
 
 
 class Facts(NamedTuple):
-    """What is known of a dataset: `headers` and `steps` (after the tuple filter) are None where it is not
-    yet."""
+    """Known facts about a dataset: `headers`, and `steps` after the tuple filter, are None before they are
+    read."""
 
     source: str
     headers: Sequence[EpisodeHeader] | None

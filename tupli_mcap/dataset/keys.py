@@ -1,4 +1,4 @@
-"""The values that episodes have at a key, such as "return" or "metadata.score", and the keys that they have."""
+"""The values of episodes at a key, such as "return" or "metadata.score", and the keys that they have."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["check_metadata", "keys_of", "values_at"]
 
 
 def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
-    """The facts about episodes, and the metadata that some of these have."""
+    """The keys of facts about episodes, and of the metadata of any of them."""
     own = {"metadata." + key for header in headers for key in header.metadata}
     runs = {id(header.run): header.run for header in headers}.values()
     own |= {"run." + key for run in runs for key in run if key != "metadata"}
@@ -23,7 +23,7 @@ def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
 
 
 def values_at(key: str, headers: Sequence[EpisodeHeader]) -> list[Any]:
-    """The value that each episode has at a key, None where it has none; FilterError if no episode knows the key."""
+    """The value of each episode at a key, None if it has none; raises FilterError if no episode has the key."""
     values = [_value(header, key) for header in headers]
     if values and all(value is None for value in values):
         check_metadata(F(key) == True, headers)  # noqa: E712 - an expression
@@ -38,7 +38,7 @@ def _value(header: EpisodeHeader, key: str) -> Any:
 
 
 def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
-    """Raises FilterError if a filter that is true of no episode names metadata or facts of runs that none of them
+    """Raises FilterError if a filter that matches no episode names metadata or parts of runs that no episode
     has."""
     known = {
         ("metadata",): {key for header in among for key in header.metadata},

@@ -28,8 +28,8 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
     a server: "http://lab:8080"), or a list of them.
 
-    An episode that is in two of the files counts once, with a warning. One that is still being recorded is there as
-    far as it has come, and ends as interrupted.
+    An episode that is in two of the files counts once, with a warning. An episode that is still being recorded has the
+    steps so far, and ends as interrupted.
 
         ds = tupli_mcap.open("runs/")
         best = ds.filter("return > 100").sort("return", descending=True).head(10)
@@ -39,7 +39,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     Raises:
         RecordingError: there is no such file.
         DatasetError: it is none of these.
-        StorageError: the directory may not be looked at.
+        StorageError: the directory cannot be read.
     """
     if isinstance(source, Dataset):
         return source

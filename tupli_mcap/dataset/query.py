@@ -1,4 +1,4 @@
-"""A query: three filters over a source, the episodes they give, and the columns read so far."""
+"""A query: three filters over a source, the episodes that match them, and the columns read so far."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["Query"]
 
 
 class Query:
-    """Three filters over a source, and what was read through them. The filters never change; columns are of `headers`.
+    """Three filters over a source, and the columns that were read for them. The filters never change.
 
-    `layout` is that of the steps read last, None before.
+    `layout` is that of the steps read last; None before.
     """
 
     def __init__(
@@ -49,11 +49,11 @@ class Query:
         self.cache_bytes, self.threads = CACHE_BYTES, THREADS
 
     def __getstate__(self) -> dict[str, Any]:
-        # Another process reads the same episodes for itself; a layout cannot be pickled.
+        # A copy reads the same episodes itself; a layout cannot be pickled.
         return {**self.__dict__, "layout": None, "_columns": {}, "_recorded": None}
 
     def with_filters(self, **filters: Any) -> Self:
-        """A query that has read nothing, with some filters replaced; named as the constructor's arguments."""
+        """A new query with some filters replaced; names are those of the constructor's arguments."""
         mine = {
             "benchmark_filter": self.benchmark_filter,
             "episode_filter": self.episode_filter,
@@ -72,17 +72,17 @@ class Query:
 
     @property
     def headers(self) -> list[EpisodeHeader]:
-        """The episodes; listed when they are first asked for."""
+        """The episodes; the first call lists them."""
         return self.refresh() if self._headers is None else self._headers
 
     @property
     def known(self) -> tuple[list[EpisodeHeader] | None, Selected | None]:
-        """The episodes and the wanted steps, as far as they are known without reading anything."""
+        """The episodes and the wanted steps; None for either if it has not been read."""
         return self._headers, self._selected
 
     @property
     def selected(self) -> Selected:
-        """The steps the tuple filter is true of."""
+        """The steps that match the tuple filter."""
         if self._selected is None:
             self.read(["terminals"])
         if self._selected is None:
@@ -90,7 +90,7 @@ class Query:
         return self._selected
 
     def refresh(self, seen: dict[str, Recording] | None = None) -> list[EpisodeHeader]:
-        """Lists the episodes anew; columns stay if the episodes are the same. `seen` as in `Source.episodes`."""
+        """Lists the episodes anew; columns are kept if the episodes are the same. `seen` as in `Source.episodes`."""
         headers = self.source.episodes(self.benchmark_filter, self.episode_filter, seen)
         if self._headers is None or _identity(headers) != _identity(self._headers):
             self._selected, self.layout, self._columns, self._recorded = None, None, {}, None
@@ -98,8 +98,7 @@ class Query:
         return headers
 
     def steps(self) -> Steps:
-        """The wanted steps by number: from columns that have been read, else from the recordings as they are asked
-        for."""
+        """The wanted steps by number: from columns in memory, else from the recordings, on access."""
         if self._recorded is None:
             seen: dict[str, Recording] = {}
             headers = self.refresh(seen) if self._headers is None else self._headers
@@ -118,13 +117,13 @@ class Query:
         return MemorySteps(loaded, self._recorded) if loaded else self._recorded
 
     def read(self, fields: Sequence[str]) -> dict[str, Any]:
-        """Columns by field, which are kept and cannot be written to."""
+        """Columns by field, read-only; they are kept."""
         found = self._missing(fields)
         self._columns.update({field: map_arrays(_frozen, column) for field, column in found.items()})
         return {field: self._columns[field] for field in fields}
 
     def own(self, fields: Sequence[str]) -> dict[str, Any]:
-        """Columns by field that are the caller's own; what has to be read for them is not kept."""
+        """Columns by field that the caller may change; columns that have to be read for this are not kept."""
         found = self._missing(fields)
         copies = {field: pick(self._columns[field], slice(None)) for field in fields if field not in found}
         return {field: found[field] if field in found else copies[field] for field in fields}
@@ -132,7 +131,7 @@ class Query:
     def columns_of(
         self, headers: Sequence[EpisodeHeader], fields: Sequence[str]
     ) -> tuple[dict[str, Any], Array, StepLayout | None]:
-        """Columns of episodes that were listed some time, the number of steps of each, and their layout."""
+        """Columns of episodes that were listed earlier, the number of steps of each, and their layout."""
         if _identity(headers) == _identity(self.headers):
             columns = self.read(fields)
             return columns, self.selected.lengths, self.layout
@@ -156,7 +155,7 @@ def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[Episod
 
 
 def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
-    """What the columns of some episodes depend on."""
+    """The facts that the columns of some episodes depend on."""
     return [(header.id, header.n_tuples, header.recording) for header in headers]
 
 

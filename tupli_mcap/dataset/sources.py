@@ -1,4 +1,4 @@
-"""Where a dataset's episodes come from: a storage, or files."""
+"""The sources of a dataset's episodes: a storage, or files."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two b
 
 
 class DatasetError(TupliError, ValueError):
-    """A dataset was asked for something that has no meaning: batches of no steps, a negative seed."""
+    """A request to a dataset has no meaning: batches without steps, a negative seed."""
 
 
 class Source(Protocol):
-    """Lists episodes and opens the recordings they lie in."""
+    """Lists episodes and opens their recordings."""
 
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]: ...
 
@@ -64,9 +64,9 @@ class Source(Protocol):
         episode_filter: BaseFilter | None,
         seen: dict[str, Recording] | None = None,
     ) -> list[EpisodeHeader]:
-        """The episodes both filters are true of; those of one recording follow each other.
+        """The episodes that match both filters; those of one recording follow each other.
 
-        `seen` is given the recordings that were opened, by name; they are closed, but still say where their steps lie.
+        Recordings that were opened are added to `seen`, by name: they are closed, but their indexes can be used.
         """
         ...
 
@@ -96,7 +96,7 @@ class StorageSource:
         return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
 
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        """How the storage looks the episodes up: SQL and plan where it has a catalog, else the filter."""
+        """How the storage finds the episodes: SQL and plan if it has a catalog, else the filter."""
         wanted = self._wanted(benchmark_filter, episode_filter)
         explain = getattr(self.storage, "explain", None)
         return str(wanted) if explain is None else str(explain(wanted))
@@ -118,12 +118,12 @@ class StorageSource:
 
 
 class FilesSource:
-    """The episodes of recordings given by path or URL. Episodes a storage has deleted stay out.
+    """The episodes of recordings given by path or URL. Episodes that a storage has deleted are left out.
 
     Args:
         files: a path, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; a pattern's
             files are taken in the order of their names.
-        of_directory: those of a directory, where other files may lie: what is no recording is left out with a warning.
+        of_directory: they are the files of a directory, where files that are no recordings are left out with a warning.
 
     Raises:
         RecordingError: nothing was given, a pattern matches nothing, or a path does not exist.
@@ -186,7 +186,7 @@ class FilesSource:
         return found
 
     def _each(self) -> Iterator[Recording]:
-        """The recordings, one after the other open."""
+        """The recordings, each open until the next one."""
         for name in self.names:
             try:
                 recording = Recording(name)
@@ -199,7 +199,7 @@ class FilesSource:
                 yield recording
 
     def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        """Files have no SQL: what every episode is tried against."""
+        """The filter that every episode is tested with; files have no SQL."""
         return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
@@ -210,10 +210,10 @@ class FilesSource:
 
 
 class JoinedSource:
-    """The recordings of several sources, each with those of its episodes that are wanted.
+    """The recordings of several sources, each with its wanted episodes.
 
     Raises:
-        DatasetError: two sources have different recordings of one name.
+        DatasetError: two sources have different recordings with the same name.
     """
 
     def __init__(self, sources: Sequence[tuple[Source, Sequence[EpisodeHeader]]]) -> None:
@@ -275,7 +275,7 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
 
 
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:
-    """Headers as a storage would list them; `recording` of each is the name the file was opened by."""
+    """The headers that a storage would list; `recording` of each is the name by which the file was opened."""
     index = recording.index
     columns: list[Any] = [index[field].tolist() for field in ("episode", "env", "length", "end", "return")]
     columns += [recording.seeds, iso_utc_each(index["end_time"])]
@@ -315,14 +315,14 @@ def _metadata(text: str, name: str, number: int) -> dict[str, Any]:
 
 
 def _benchmark_header(recording: Recording) -> BenchmarkHeader:
-    """What a recording says of its benchmark; without one, the id is empty."""
+    """The header of a recording's benchmark; without a benchmark, the id is empty."""
     metadata, environment = BenchmarkMetadata(name=""), ""
     if "benchmark.json" in recording.attachments:
         record = recording.benchmark.record
         metadata, environment = BenchmarkMetadata(name=record.name), record.name
         entry = (record.benchmark or {}).get("metadata")
         if isinstance(entry, dict):
-            with contextlib.suppress(ValidationError, FormatError):  # somebody else's words
+            with contextlib.suppress(ValidationError, FormatError):  # a stranger's metadata may be anything
                 metadata = BenchmarkMetadata.model_validate(restored(entry))
     return BenchmarkHeader(
         id=recording.benchmark_id,
@@ -335,14 +335,14 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
 
 
 class OpenRecordings:
-    """Opens recordings by name. An `Episode` keeps its recording open for as long as it lives. Not thread-safe."""
+    """Opens recordings by name. An `Episode` keeps its recording open as long as it lives. Not thread-safe."""
 
     def __init__(self, open_recording: Callable[[str, Sequence[int]], Recording]) -> None:
         self._open = open_recording
         self._kept: OrderedDict[str, tuple[Recording, frozenset[int]]] = OrderedDict()  # with their episodes
 
     def get(self, name: str, episodes: Sequence[int], needed: Sequence[int] | None = None) -> Recording:
-        """The recording, with some of its episodes at least: `needed`, by default all these `episodes`.
+        """The recording with at least the episodes `needed`, by default all of `episodes`.
 
         Raises:
             RecordingError: it cannot be opened.
@@ -365,7 +365,7 @@ def place_of(recording: Recording) -> str:
 
 
 def numbers_by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[int]]:
-    """The numbers of episodes, by the recording they are in."""
+    """The numbers of episodes, by recording."""
     found: dict[str, list[int]] = {}
     for header in headers:
         found.setdefault(header.recording, []).append(header.episode)

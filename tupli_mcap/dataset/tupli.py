@@ -1,4 +1,4 @@
-"""`TupliDataset`: which episodes and steps, and the arrays they are."""
+"""`TupliDataset`: episodes and steps chosen by filters, as arrays."""
 
 from __future__ import annotations
 
@@ -35,24 +35,22 @@ SIX = (*FIVE, "infos")
 class TupliDataset(RandomAccess):
     """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
 
-    A dataset reads when it is asked for something, and only what it is asked for. Its filters never change:
-    `with_benchmark_filter`, `with_episode_filter` and `with_tuple_filter` return another dataset with that
-    one filter replaced (None takes it away; combine conditions with `&` and `|`), which finds its episodes
-    itself.
+    A dataset reads on access, and only what is requested. Its filters never change: `with_benchmark_filter`,
+    `with_episode_filter` and `with_tuple_filter` return another dataset with that one filter replaced (None
+    removes it; combine conditions with `&` and `|`), which lists its own episodes.
 
-    The episodes are listed once, and everything the dataset says agrees with that list until `preview()` or
-    `load()` list them anew. Properties keep what they have read, as arrays that cannot be written to; the
-    `convert_to_…` methods give arrays that are the caller's own, and keep nothing that `load()` has not read
-    before.
+    The episodes are listed once, and all results agree with that list until `preview()` or `load()` list them
+    anew. Properties keep the columns they have read, as read-only arrays; the `convert_to_…` methods return
+    arrays that the caller may change, and keep nothing but what `load()` has read before.
 
-    A column is an array of shape (steps, ...) in the dtype that was recorded, a list of one value a step
-    where values differ in size (texts, graphs), or dicts and tuples of those, nested as the environment's
-    space is. Recordings may differ in dtype as long as one dtype holds the values of both exactly. Not
+    A column is an array of shape (steps, ...) in the recorded dtype, a list with a value for each step if
+    values differ in size (texts, graphs), or dicts and tuples of those, nested as the environment's
+    space is. Recordings may differ in dtype if one dtype holds the values of both exactly. Not
     thread-safe.
 
     Args:
         storage: where the episodes are: a storage, or the path of its directory.
-        info: anything the user wants to keep with the dataset.
+        info: anything to keep with the dataset.
     """
 
     def __init__(
@@ -66,7 +64,7 @@ class TupliDataset(RandomAccess):
         files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
         info: dict[str, Any] | None = None,
     ) -> Self:
-        """A dataset of recordings in no storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
+        """A dataset of recordings outside of a storage: a path, a pattern ("runs/*.mcap"), a URL, or a list.
 
         An episode that is in two of the files counts once, with a warning; one that is still being recorded
         is listed as interrupted.
@@ -92,8 +90,7 @@ class TupliDataset(RandomAccess):
     # --- filters ---
 
     def with_benchmark_filter(self, filter: BaseFilter | None) -> Self:
-        """The dataset of benchmarks a filter over `BenchmarkHeader` fields is true of, in place of any such
-        filter.
+        """The dataset with a new benchmark filter, over the fields of `BenchmarkHeader`; None removes it.
 
         Raises:
             FilterError: the filter names an unknown field.
@@ -101,8 +98,8 @@ class TupliDataset(RandomAccess):
         return self._with(benchmark_filter=filter)
 
     def with_episode_filter(self, filter: BaseFilter | None) -> Self:
-        """The dataset of episodes a filter over `EpisodeHeader` fields (`metadata.score`, `n_tuples`, `end`,
-        …) is true of, in place of any such filter.
+        """The dataset with a new episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
+        `n_tuples`, `end`, …); None removes it.
 
         Raises:
             FilterError: the filter names an unknown field.
@@ -110,7 +107,7 @@ class TupliDataset(RandomAccess):
         return self._with(episode_filter=filter)
 
     def with_tuple_filter(self, filter_fcn: TupleFilter | None) -> Self:
-        """The dataset of steps a filter is true of, in place of any such filter.
+        """The dataset with a new tuple filter, which chooses steps; None removes it.
 
         Args:
             filter_fcn: an expression over state, action, reward, terminal, timeout, info, next_state and step
@@ -130,10 +127,11 @@ class TupliDataset(RandomAccess):
         return made
 
     def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
-        """The dataset with another budget (bytes, 512 MiB by default) for what random access keeps in memory.
+        """The dataset with another budget for the cache of random access (bytes, 512 MiB by default).
 
         Args:
-            threads: how many read chunks; by default as many as there are cores, at most 4.
+            cache_bytes: the budget.
+            threads: number of threads that read chunks; by default that of cores, at most 4.
 
         Raises:
             SamplingError: a number is no integer, or too small.
@@ -144,14 +142,14 @@ class TupliDataset(RandomAccess):
             made._query.threads = checked_count(threads, 1, "a number of threads")
         return made
 
-    # --- looking and loading ---
+    # --- listing and loading ---
 
     def preview(self) -> list[EpisodeHeader]:
         """The episodes, listed anew; no step is read."""
         return list(self._query.refresh())
 
     def explain(self) -> str:
-        """How the episodes are looked up: the SQL of the filters and its plan, for a storage with a catalog."""
+        """How the episodes are found: for a storage with a catalog, the SQL of the filters and its plan."""
         return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
 
     def load(self) -> None:
@@ -159,33 +157,33 @@ class TupliDataset(RandomAccess):
         memory.
 
         Raises:
-            SpaceError: the steps of two recordings do not fit into one array; the message says which.
+            SpaceError: one array cannot hold the steps of two recordings; the message names them.
         """
 
         def attempt() -> None:
             self._query.refresh()
             self._query.read(FIVE)
 
-        anew(attempt)  # episodes that are deleted while they are read are listed no more the next time
+        anew(attempt)  # again if episodes are deleted while they are read: the next listing lacks them
 
     def save_columns(self, directory: str | os.PathLike[str]) -> None:
         """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
 
-        The directory also holds `manifest.json`; see docs/howto/columns.md. It is there as a whole or not at all: a
-        process that is killed leaves none. It keeps the steps as they are listed now, whatever becomes of their
-        recordings, and no infos. Steps are read a few at a time, within the budget of `with_cache`.
+        The directory also holds `manifest.json`; see docs/howto/columns.md. It is written atomically: a killed process
+        leaves none. It holds the steps as they are listed now, without infos, and does not depend on the recordings.
+        Steps are read a few at a time, within the budget of `with_cache`.
 
         Args:
-            directory: where nothing is yet.
+            directory: an unused path.
 
         Raises:
             DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
-            SpaceError: the steps of two recordings do not fit into one array; the message says which.
-            StorageError: there is something at that path, the disk is full, ...
+            SpaceError: one array cannot hold the steps of two recordings; the message names them.
+            StorageError: the path is used, the disk is full, ...
         """
         save_columns(directory, self.steps, self._headers, self._step_seconds())
 
-    # --- what is in it ---
+    # --- contents ---
 
     @property
     def steps(self) -> Steps:
@@ -204,22 +202,21 @@ class TupliDataset(RandomAccess):
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:
-        """The benchmarks the benchmark filter is true of."""
+        """The benchmarks that match the benchmark filter."""
         return list(self._query.benchmarks)
 
     @property
     def episodes(self) -> Sequence[EpisodeItem]:
-        """The episodes with those of their steps that the tuple filter is true of; each is made when it is
-        asked for.
+        """The episodes with those of their steps that match the tuple filter; each is made on access.
 
-        Steps are read at the first access to an item. Use `preview()` for facts about episodes only.
+        Steps are read at the first access to an item. For facts about episodes alone, use `preview()`.
         """
         query, headers = self._query, self._query.headers
         return EpisodeItems(headers, lambda: query.columns_of(headers, SIX))
 
     @property
     def tuples(self) -> Sequence[RLTuple]:
-        """The steps; each is made when it is asked for."""
+        """The steps; each is made on access."""
         return Tuples(self._query.read(SIX), self._query.layout)
 
     @property
@@ -231,7 +228,7 @@ class TupliDataset(RandomAccess):
     def next_states(self) -> Any:
         """The state after each step, never one of another episode: a read-only column.
 
-        Where it was not recorded (the last step of an episode built by hand), the step's own state.
+        If it was not recorded (the last step of an episode made from values), it is the step's own state.
         """
         return self._query.read(["next_states"])["next_states"]
 
@@ -242,25 +239,24 @@ class TupliDataset(RandomAccess):
 
     @property
     def rewards(self) -> Any:
-        """The reward of each step: a read-only column, float64 unless the rewards have a space of their
-        own."""
+        """The reward of each step: a read-only column, float64 unless there is a reward space."""
         return self._query.read(["rewards"])["rewards"]
 
     @property
     def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether the environment ended with the step (read-only, of bools)."""
+        """Whether the environment ended with the step: read-only, bool."""
         found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["terminals"])["terminals"]
         return found
 
     @property
     def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
-        """Whether the episode was truncated with the step, as it was recorded (read-only, of bools)."""
+        """Whether the episode was truncated with the step, as recorded: read-only, bool."""
         found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["timeouts"])["timeouts"]
         return found
 
     @property
     def infos(self) -> list[dict[str, Any]]:
-        """The info of each step; empty where none was recorded."""
+        """The info of each step; empty if none was recorded."""
         return list(self._query.read(["infos"])["infos"])
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
@@ -278,14 +274,14 @@ class TupliDataset(RandomAccess):
     # --- conversions ---
 
     def convert_to_numpy(self, *, mark_cuts: bool = True) -> tuple[Any, Any, Any, Any, Any]:
-        """States, actions, rewards, terminals and timeouts as columns of NumPy arrays; they are the caller's
-        own.
+        """States, actions, rewards, terminals and timeouts as columns of NumPy arrays; the caller may change
+        them.
 
         Args:
-            mark_cuts: also set the timeout of a step that is followed by anything else than its own episode's
-                next step: the last one of an interrupted episode, or the one before steps that a tuple filter
-                left out. Learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes
-                otherwise. False gives the flags as they were recorded.
+            mark_cuts: also set the timeout of a step that is not followed by its own episode's next step: the
+                last one of an interrupted episode, or the one before steps that a tuple filter left out.
+                Otherwise learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes.
+                False returns the recorded flags.
         """
         columns = self._query.own(FIVE)
         if mark_cuts:
@@ -301,7 +297,7 @@ class TupliDataset(RandomAccess):
     def convert_to_tensors(
         self, parser: type[BaseTupleParser] = NumpyTupleParser, *, mark_cuts: bool = True
     ) -> tuple[Any, ...]:
-        """What a parser makes of the five columns of `convert_to_numpy`.
+        """The five columns of `convert_to_numpy` in the form of a parser.
 
         Raises:
             MissingExtraError: the library the parser needs is not installed.
@@ -320,8 +316,8 @@ class TupliDataset(RandomAccess):
         return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
 
     def convert_to_dataframe(self) -> pd.DataFrame:
-        """A pandas DataFrame with a row a step: the episode (its place in `preview()`), the step (from 0 in
-        its episode), and the columns of `convert_to_d4rl_format`, flags as they were recorded.
+        """A pandas DataFrame with a row for each step: the episode (its position in `preview()`), the step (from
+        0 in its episode), and the columns of `convert_to_d4rl_format` with the recorded flags.
 
         Columns of numbers keep their dtype; a value of several numbers is one object in its cell.
 
@@ -335,9 +331,9 @@ class TupliDataset(RandomAccess):
     # --- batches and samples ---
 
     def set_seed(self, seed: int | None) -> None:
-        """Seed what `as_batch_generator` and `sample_episodes` draw; no other randomness is touched.
+        """Seed the draws of `as_batch_generator` and `sample_episodes`, and no others.
 
-        Datasets derived from this one by filters start from the same seed. None is a seed of the system's.
+        Datasets derived from this one by filters start from the same seed. None takes a random seed.
 
         Raises:
             DatasetError: it is no integer from 0.
@@ -352,11 +348,12 @@ class TupliDataset(RandomAccess):
     def as_batch_generator(
         self, batch_size: int, shuffle: bool = False, parser: type[BaseTupleParser] | None = None
     ) -> Iterator[Any]:
-        """Batches of `batch_size` steps, the last one as long as is left; the steps are loaded first.
+        """Batches of `batch_size` steps; the last one may have fewer. The steps are loaded first.
 
         Args:
-            shuffle: in an order drawn anew each time, see `set_seed`.
-            parser: makes five columns of each batch; without one, a batch is a list of `RLTuple`.
+            batch_size: steps of a batch.
+            shuffle: in a new random order each time, see `set_seed`.
+            parser: turns the five columns of each batch into its form; without one, a batch is a list of `RLTuple`.
 
         Raises:
             DatasetError: the batch size is no integer from 1.
@@ -367,8 +364,8 @@ class TupliDataset(RandomAccess):
         return convert.batches(columns, self._query.layout, size, order, parser)
 
     def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
-        """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter is
-        for steps.
+        """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter does not
+        apply.
 
         Only their steps are read. See `set_seed`.
 

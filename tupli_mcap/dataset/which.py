@@ -1,6 +1,6 @@
-"""Which episodes of which recordings are meant: by number, by return, by a filter; of files, directories and datasets.
+"""Finds the episodes that a user means: by number, by return, by a filter; in files, directories and datasets.
 
-Storages take long to import, and a file that was never in one can do without: they are imported where they are needed.
+Storages take long to import, and most files need none, so they are imported where they are needed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
-"""What may stand in place of an episode's number; best and worst are by return, the first of equals."""
+"""Words in place of an episode's number; best and worst are by return, the first of equal ones."""
 
 _MAX_DIGITS: Final = 10  # an episode's number has 32 bits
 _CACHE_BYTES = 64 << 20  # each chunk is read once or twice
@@ -56,10 +56,10 @@ Examinable: TypeAlias = Union[Source, "Listed", "TupliDataset", "TupliStorage"]
 
 @runtime_checkable
 class Listed(Protocol):
-    """A `Dataset`, seen from below."""
+    """The part of a `Dataset` that this module needs; it may not import `dataset`."""
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
-        """What opens its recordings, and its episodes that the filter is true of."""
+        """The source that opens its recordings, and its episodes that match the filter."""
 
 
 # ---- of one recording
@@ -71,13 +71,14 @@ def choose_episodes(
     """The episodes that a text such as "3,7-9", "best" or "first,last" names, in its order, each once.
 
     Args:
-        text: numbers of episodes, from one to another (those that there are of them) and `WORDS`, with commas between.
-        filter: the choice is among the episodes it is true of; a number it leaves out is an error.
+        recording: an open one.
+        text: numbers of episodes, ranges (of which only existing numbers count) and `WORDS`, separated by commas.
+        filter: only episodes that match it can be chosen; the number of another one is an error.
 
-    Episodes that the recording's storage has deleted are not there.
+    Episodes that the recording's storage has deleted cannot be chosen.
 
     Raises:
-        FilterError: the text is none of this, or the filter has an unknown key.
+        FilterError: the text is something else, or the filter has an unknown key.
         RecordingError: there is no such episode, or none at all.
     """
     among = candidates(recording, filter)
@@ -85,7 +86,7 @@ def choose_episodes(
 
 
 def check_choice(text: str, filter: BaseFilter | None = None) -> None:
-    """Raises FilterError where `choose_episodes` would, of any recording."""
+    """Raises FilterError if `choose_episodes` would raise it for every recording."""
     for item in text.split(","):
         if item.strip().lower() not in WORDS:
             bounds_of(item.strip(), text)
@@ -114,7 +115,7 @@ def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positi
 
 
 def _may_be_noted(path: Path) -> bool:
-    """Whether a storage may have noted deleted episodes of a recording."""
+    """Whether a storage may have deleted episodes of a recording."""
     folders = list(path.absolute().parents)[:3]
     return path.with_name(f"{path.name}.json").exists() or any(
         (folder / "deleting.json").exists() for folder in folders
@@ -131,10 +132,10 @@ def named_positions(
 ) -> list[int]:
     """The positions that a text names, as for `choose_episodes`, among some positions in the recording.
 
-    `filter` is why there are no others; errors say so.
+    `filter` is the filter that left these positions; errors name it.
 
     Raises:
-        FilterError: the text is none of this.
+        FilterError: the text is something else.
         RecordingError: there is no such episode, or none at all.
     """
     why = "" if filter is None else f" that matches {filter}"
@@ -162,7 +163,7 @@ def _named(recording: Recording, among: Positions, item: str, text: str, why: st
 
 
 def bounds_of(item: str, text: str) -> tuple[int, int]:
-    """The first and the last number that `3` or `7-9` in a text names."""
+    """The first and the last number of `3` or `7-9` in a text."""
     first, dash, last = (part.strip() for part in item.partition("-"))
     if not all(part.isdecimal() and len(part) <= _MAX_DIGITS for part in (first, last if dash else first)):
         raise FilterError(
@@ -173,14 +174,14 @@ def bounds_of(item: str, text: str) -> tuple[int, int]:
 
 
 def _extreme(word: str, returns: Any) -> int:
-    """Where the best or worst of some returns is; one that is no number is neither, unless there is no other."""
+    """The index of the best or worst return; NaN is chosen only if there is no other."""
     if word == "best":
         return int(np.nan_to_num(returns, nan=-np.inf).argmax())
     return int(np.nan_to_num(returns, nan=np.inf).argmin())
 
 
 def _range(numbers: Any) -> str:
-    """The numbers there are: they may have gaps, where episodes were deleted or the filter leaves some out."""
+    """The numbers of episodes, for people; they may have gaps, from deleted episodes or a filter."""
     low, high = int(numbers[0]), int(numbers[-1])
     if high - low + 1 == len(numbers):
         return f"{low} to {high}" if low < high else f"episode {low} only"
@@ -192,9 +193,11 @@ def _range(numbers: Any) -> str:
 
 @dataclass(frozen=True)
 class Subject:
-    """A recording and how to open it; `choose` gives the positions of the episodes that are meant, in their order.
+    """A recording and how to open it.
 
-    error: why it cannot be opened, where that is known already.
+    Attributes:
+        choose: returns the positions of the chosen episodes in order.
+        error: why it cannot be opened, if that is known already.
     """
 
     name: str
@@ -208,7 +211,7 @@ def subjects_of(
 ) -> Iterator[Subject]:
     """The recordings of a path, a directory, a recording, a dataset (each once), a storage, or several of those.
 
-    The filter is for all but `Chosen`, which are chosen already.
+    The filter does not apply to `Chosen`, which are chosen already.
 
     Raises:
         RecordingError: it is none of those.
@@ -232,7 +235,7 @@ def subjects_of(
         yield from _of_headers(*source._episodes(episode_filter))
     elif isinstance(source, TupliStorage):
         yield from subjects_of(TupliDataset(source), episode_filter)
-    elif isinstance(source, Chosen):  # a tuple too: it comes before other iterables
+    elif isinstance(source, Chosen):  # before other iterables, since it is a tuple
         recording, positions = source
         yield Subject(
             recording.name, lambda: nullcontext(recording), lambda _: np.asarray(positions, np.int64)
@@ -296,14 +299,14 @@ class Chosen(NamedTuple):
 def chosen_from(
     sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
 ) -> Iterator[list[Chosen]]:
-    """The chosen episodes of recordings, open within the block.
+    """The chosen episodes of recordings, which are open within the block.
 
     Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a
     number is that of each recording which has it; a file in it that cannot be read is left out with a warning.
 
     Raises:
         RecordingError: a source cannot be opened, or has no such episode.
-        FilterError: what names the episodes, or the filter, has no meaning.
+        FilterError: the choice of episodes, or the filter, has no meaning.
     """
     given = [sources] if isinstance(sources, Recording | str | os.PathLike) else list(sources)
     text = (
@@ -339,7 +342,7 @@ def chosen_ids(
 
 
 def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
-    """The last, the best and the worst of some episodes, and a few words on each: `199 (last, best)`."""
+    """The last, the best and the worst of some episodes, each with a caption: `199 (last, best)`."""
     returns = np.concatenate([item.recording.index["return"][list(item.positions)] for item in chosen])
     bounds = np.cumsum([0, *(len(item.positions) for item in chosen)])
     words: dict[int, list[str]] = {}
@@ -446,7 +449,7 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
 
 
 def _files_of(item: str, returns: dict[str, float]) -> list[str]:
-    """The files that an item means, of those that have such an episode; `returns` are its returns in them."""
+    """The files in which an item chooses an episode, among those that have one; `returns` are the returns by file."""
     files = list(returns)
     if not files or item not in ("best", "worst", "first", "last"):
         return files

@@ -1,9 +1,9 @@
-"""The order of an epoch: shuffled, with items that are near each other on the disk still near each other.
+"""The order of an epoch: shuffled, but items that are near each other on the disk stay near each other.
 
-The blocks (chunks) of the items are shuffled, and laid out as one sequence, of which each rank has its part, and each
-stream of a rank a part of that. Within a stream, the items of `mix` blocks at a time are shuffled. Batch b of a rank is
-number b // streams of stream b % streams, as a DataLoader takes batches from its workers in turn: each of `streams`
-workers reads blocks of its own.
+The blocks (chunks) of the items are shuffled and laid out as one sequence. Each rank has a part of it, and each
+stream of a rank a part of that. Within a stream, the items of `mix` blocks at a time are shuffled. Batch b of a rank
+is number b // streams of stream b % streams, as a DataLoader takes batches from its workers in turn: so each of
+`streams` workers reads different blocks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tupli_mcap.dataset.items import Items
 
 @dataclass(frozen=True)
 class Blocks:
-    """Items by the block their first step lies in, all int64.
+    """Items by the block of their first step; all arrays are int64.
 
     Run i holds the items from `starts[i]` to `stops[i] - 1`; those of block k are runs `firsts[k]` to
     `firsts[k + 1] - 1`.
@@ -42,7 +42,7 @@ class Blocks:
 
     @cached_property
     def digest(self) -> str:
-        """A digest (SHA-256, hex) of which items lie in which block."""
+        """A digest (SHA-256, hex) of the items in each block."""
         return hashlib.sha256(
             b"".join(part.tobytes() for part in (self.starts, self.stops, self.firsts))
         ).hexdigest()
@@ -69,7 +69,7 @@ def blocks_of(items: Items[Any], least: int) -> Blocks:
 
 
 class Part(NamedTuple):
-    """Which of the batches are meant: those of one of `ranks`, in `streams` streams."""
+    """A part of the batches: those of one of `ranks`, in `streams` streams."""
 
     rank: int
     ranks: int
@@ -80,9 +80,9 @@ class Batches:
     """The batches of one rank in one epoch: batch b is an array of numbers of items (int64).
 
     Args:
-        key: what the order is drawn from (non-negative integers); None for the order of the items.
-        mix: blocks whose items are mixed.
-        drop_last: only full batches, and as many in every rank.
+        key: seed of the order (non-negative integers); None for the order of the items.
+        mix: number of blocks whose items are mixed.
+        drop_last: only full batches, the same number in every rank.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Batches:
         return np.concatenate(parts)
 
     def _mixed(self, place: int, stream: int) -> tuple[int, int, Array]:
-        """The places of the mixed blocks that a place of the stream lies in, and their items in the order drawn."""
+        """The range of places of the mixed blocks around a place of the stream, and their items in the drawn order."""
         low, high, items = self._group
         if not low <= place < high:
             begin, end = int(self._bounds[stream]), int(self._bounds[stream + 1])
@@ -152,7 +152,7 @@ class Batches:
 
 
 def _stream_bounds(count: int, size: int, streams: int) -> Array:
-    """Where the streams begin and end, so that batch b is in stream b % streams and only the last one is not full."""
+    """The bounds of the streams such that batch b is in stream b % streams and only the last one is not full."""
     batches = -(-count // size)
     full = np.array([len(range(stream, batches, streams)) for stream in range(streams)], np.int64) * size
     if batches:

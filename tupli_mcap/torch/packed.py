@@ -1,6 +1,6 @@
-"""Hands a batch from a worker to the loader: all its tensors in one piece of shared memory.
+"""Passes a batch from a worker to the loader: all its tensors in one piece of shared memory.
 
-PyTorch passes each tensor as a file of its own, which costs more than reading a small batch; this passes one a batch.
+PyTorch passes a file for each tensor, which costs more than reading a small batch; this passes one for each batch.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from torch.multiprocessing.reductions import reduce_storage
 
 _ALIGNED = 64  # bytes
 _NUMBERS = (np.ndarray, np.generic)
-_DYING = 0.5  # seconds until a process that has closed its files is seen to be dead
+_DYING = 0.5  # seconds after closing its files until a process is surely dead
 
 
 class _Place(NamedTuple):
-    """Where a tensor lies in the shared memory."""
+    """The place of a tensor in the shared memory."""
 
     start: int
     stop: int
@@ -40,7 +40,7 @@ class PackedBatch(dict[str, Any]):
         return (_unpacked, self._parts) if self._unchanged else (dict, (dict(self),))
 
     def _handed_over(self) -> tuple[Any, ...]:
-        """What `ForkingPickler` passes to another process."""
+        """The form in which `ForkingPickler` passes it to another process."""
         if not self._unchanged:
             return dict, (dict(self),)
         buffer, places = self._parts
@@ -48,12 +48,12 @@ class PackedBatch(dict[str, Any]):
 
     @property
     def _unchanged(self) -> bool:
-        """Whether nobody has put other columns into it."""
+        """Whether it still has the columns that are in the buffer."""
         now = list(_leaves(self))
         return len(now) == len(self._leaves) and all(map(_same, now, self._leaves))
 
     def __copy__(self) -> dict[str, Any]:
-        return dict(self)  # what is changed is no longer what is in the buffer
+        return dict(self)  # a changed copy would not be what is in the buffer
 
 
 def _leaves(column: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
@@ -82,7 +82,7 @@ def packed(columns: dict[str, Any]) -> PackedBatch:
 
 
 def _placed(column: Any, arrays: list[np.ndarray[Any, Any]], ends: list[int]) -> Any:
-    """Where each array will lie. (No inner function: one that calls itself would keep the arrays alive for long.)"""
+    """The places of arrays. (Not an inner function: a recursive one is a cycle, which would keep the arrays alive.)"""
     if isinstance(column, _NUMBERS):
         array = np.asarray(column)
         start = -(-ends[-1] // _ALIGNED) * _ALIGNED

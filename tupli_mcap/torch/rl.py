@@ -22,20 +22,21 @@ except ImportError as err:
 
 
 class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
-    """The transitions of a dataset, by number, read when they are sampled; nothing can be written.
+    """The transitions of a dataset by number, read when they are sampled; read-only.
 
         RecordedStorage(dataset.transitions())
 
     A TensorDict of B transitions has the keys "observation", "action", "episode" (its place in the query), "mask"
-    (False where the next observation was not recorded, and the own one stands in its place: leave such transitions
-    out), and under "next": "observation", "reward", "done", "terminated", "truncated", the last four of shape (B, 1).
-    "truncated" (and "done") is also True where an episode was interrupted, or goes on with a step that a tuple filter
-    left out: the following row is not its next step. A Dict space gives a nested TensorDict, a Tuple space one with the
-    keys "0", "1", ..., and values that differ in size are non-tensor data. A pickled copy opens the files itself.
+    (False if the next observation was not recorded and repeats the current one: leave such transitions out), and
+    under "next": "observation", "reward", "done", "terminated", "truncated", the last four of shape (B, 1).
+    "truncated" (and "done") is also True if an episode was interrupted, or goes on with a step that a tuple filter
+    left out, so that the following row is not its next step. A Dict space gives a nested TensorDict, a Tuple space
+    one with the keys "0", "1", ..., and values that differ in size are non-tensor data. A pickled copy opens the
+    files itself.
 
     Raises:
-        SamplingError: these are no transitions over one step, or lack fields; TorchRL has `MultiStepTransform` for
-            several steps.
+        SamplingError: they are no transitions over one step, or lack fields; for several steps TorchRL has
+            `MultiStepTransform`.
     """
 
     def __init__(self, transitions: Transitions) -> None:
@@ -99,20 +100,20 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         self.set(None, None)
 
     def state_dict(self) -> dict[str, Any]:
-        """Says which transitions these are."""
+        """A state that identifies these transitions."""
         return {"items": self._transitions.identity}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Checks that the state is one of the same transitions.
+        """Checks that a state is of the same transitions.
 
         Raises:
-            SamplingError: it is another's.
+            SamplingError: it is of others.
         """
         check_state(state_dict, self._transitions.identity, {})
 
 
 def replay_buffer(transitions: Transitions, batch_size: int, **options: Any) -> TensorDictReplayBuffer:
-    """A replay buffer that samples recorded transitions, and that nothing can be added to.
+    """A replay buffer that samples recorded transitions; nothing can be added to it.
 
     Args:
         transitions: `dataset.transitions()`.
@@ -127,7 +128,7 @@ def _as_it_is(batch: TensorDict) -> TensorDict:
 
 
 def _nested(column: Any, rows: int, *, flags: bool = False) -> Any:
-    """A column as what a TensorDict holds; with `flags`, numbers have a last dimension of their own."""
+    """A column as values of a TensorDict; with `flags`, numbers get a last dimension of length 1."""
     if isinstance(column, tuple):
         column = {str(i): part for i, part in enumerate(column)}
     if isinstance(column, dict):

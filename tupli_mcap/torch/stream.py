@@ -13,7 +13,7 @@ from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
 
-_CHUNK_BYTES = 256 << 10  # where nobody knows
+_CHUNK_BYTES = 256 << 10  # assumed if the size of chunks is not known
 
 
 class StreamDataset(IterableDataset[dict[str, Any]]):
@@ -26,22 +26,22 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
     in one of the ranks and one of the workers. `state_dict` says where the epoch stands, to the next batch: used by
     torchdata's `StatefulDataLoader`, with as many workers as before, or by hand where there is none.
 
-    The same seed, epoch and number of workers give the same order. The number of workers does not matter without a
-    shuffle, nor as long as it divides `streams`, where that is given; else each worker reads chunks of its own.
+    The same seed, epoch and number of workers give the same order. Without a shuffle, the number of workers does not
+    matter; nor does it if `streams` is given and a multiple of it. Otherwise each worker reads different chunks.
 
     Args:
         items: `dataset.windows(...)`, `dataset.transitions(...)`, `Episodes(dataset.steps)`, ...
-        batch_size: items of a batch; the last one of an epoch has what is left.
-        seed: the order, together with `set_epoch`, without which it is the same in each epoch, as in PyTorch's
-            DistributedSampler. None draws another one each time from PyTorch's own random numbers
+        batch_size: items of a batch; the last one of an epoch may have fewer.
+        seed: decides the order together with `set_epoch`; without `set_epoch` each epoch has the same order, as in
+            PyTorch's DistributedSampler. None draws a new order each time from PyTorch's random numbers
             (`torch.manual_seed`), and is for one rank only.
-        drop_last: only full batches, and as many in every rank, as gradients that are averaged over ranks need.
-        rank, ranks: which part of the items; by default that of `torch.distributed`, if it has been initialised.
-        streams: how many parts the order consists of; the number of workers, by default.
-        worker_cache_bytes: what each worker keeps decoded; chunks of half as much are mixed.
+        drop_last: only full batches, the same number in every rank, as gradients that are averaged over ranks need.
+        rank, ranks: the part of the items; by default that of `torch.distributed`, if it is initialised.
+        streams: number of parts of the order; by default the number of workers.
+        worker_cache_bytes: budget of each worker for decoded chunks; chunks of half as many bytes are mixed.
 
     Raises:
-        SamplingError: a number means nothing.
+        SamplingError: an argument has no meaning.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             self._mix, self._blocks = _mixing(items, worker_cache_bytes)
         self._epoch = torch.zeros((), dtype=torch.int64)
         self._epoch.share_memory_()  # type: ignore[no-untyped-call]  # workers that persist see it change
-        self._drawn: tuple[int, int] | None = None  # a worker's seed, and how often it has gone through
+        self._drawn: tuple[int, int] | None = None  # a worker's seed, and its number of passes
         self._loaded: dict[str, Any] | None = None
         self._state = self._state_of(None, 0)
         if not len(self):
@@ -85,7 +85,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             )
 
     def set_epoch(self, epoch: int) -> None:
-        """Sets the number of the epoch that begins with the next iteration; each has an order of its own.
+        """Sets the number of the epoch that begins with the next iteration; each epoch has another order.
 
         Raises:
             SamplingError: it is no integer from 0.
@@ -105,7 +105,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         if state is not None:
             if state["workers"] != workers:
                 raise SamplingError(
-                    f"expected a state dict of a run with {workers} workers, 1 where there is none, "
+                    f"expected a state dict of a run with {workers} workers (1 stands for none), "
                     f"found {state['workers']!r:.80}"
                 )
             key, done = state["key"] or key, state["batches"]  # no key: saved before the first iteration
@@ -136,7 +136,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         return Batches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
 
     def _key(self, worker_seed: int | None) -> list[int] | None:
-        """What this epoch's order is drawn from."""
+        """The seed of this epoch's order."""
         if self._blocks is None:
             return None
         if self._seed is not None:
@@ -148,18 +148,18 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         self._drawn = worker_seed, passes  # the seed stays the same in workers that persist
         return [worker_seed, passes]
 
-    # ---- where an epoch stands
+    # ---- the state of an epoch
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the epoch stands, in this process: what `load_state_dict` goes on from."""
+        """The position in the epoch in this process, for `load_state_dict`."""
         return dict(self._state)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """The next iteration goes on from there, in the order of that epoch.
+        """Makes the next iteration go on from a state, in the order of that epoch.
 
         Raises:
-            SamplingError: the state is of another dataset, of other options, or of recordings that have other chunks
-                now; the iteration raises it where the number of workers is another.
+            SamplingError: the state is of another dataset, of other options, or of recordings whose chunks have
+                changed. If the number of workers differs, the iteration raises it.
         """
         check_state(state_dict, self._reader.items.identity, self._options())
         if not {"workers", "key", "batches"} <= state_dict.keys():
@@ -175,7 +175,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         self._loaded = self._state = dict(state_dict)
 
     def _options(self) -> dict[str, Any]:
-        """What the order of an epoch depends on, besides the items, the workers and the key."""
+        """The options that the order of an epoch depends on, besides items, workers and key."""
         return {
             "batch_size": self._size,
             "shuffle": self._blocks is not None,
@@ -194,8 +194,8 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
 
 
 def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
-    """How many blocks are mixed at a time, and the blocks, of one or several chunks: what is mixed fits into half of
-    the cache, and little is read twice because items of one block go on in the next."""
+    """How many blocks are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit into half of
+    the cache, and are large enough that few items extend into the next block, which would be read twice."""
     chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
     chunks = max(4, cache_bytes // 2 // chunk_bytes)
     single = blocks_of(items, 1)

@@ -1,8 +1,8 @@
 """Columns as tensors, and batches of them.
 
-A tensor has the dtype that was recorded, and shares the memory of the array it is made of: float16, bool and all
-integers stay what they are. PyTorch computes little with uint16, uint32 and uint64: convert those where they are used,
-with `.to(torch.int64)` (uint64 from 2**63 on does not fit). What differs in size (texts, graphs) stays a list.
+A tensor has the recorded dtype, float16, bool and all integers too, and shares the memory of its array. PyTorch
+computes little with uint16, uint32 and uint64: convert those with `.to(torch.int64)` (uint64 from 2**63 on does not
+fit). Values that differ in size (texts, graphs) stay a list.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Samples", "collate", "tensors"]
 
 
 def tensors(column: Any) -> Any:
-    """The column with a tensor in place of each array and number, nested as it is; lists stay as they are."""
+    """The column with a tensor in place of each array and number, nested in the same way; lists stay lists."""
     if isinstance(column, np.ndarray):
         return torch.from_numpy(column)
     if isinstance(column, Mapping):
@@ -31,9 +31,9 @@ def tensors(column: Any) -> Any:
 
 
 def collate(samples: Any) -> Any:
-    """The `collate_fn` for a DataLoader: what was read as one batch goes on as it is, without being copied.
+    """The `collate_fn` for a DataLoader: a batch that was read together is passed on without a copy.
 
-    Anything else is collated as PyTorch does it.
+    Anything else is collated by PyTorch's own function.
     """
     if isinstance(samples, Samples):
         return tensors(samples.batch)

@@ -1,12 +1,12 @@
-"""What records: Gymnasium wrappers, `RecordEpisodes` for one environment and its vector twin for many, and
-`EpisodeWriter` and `write_rollout`, for episodes that come from no environment.
+"""Recorders: `RecordEpisodes` wraps one environment or a vector environment; `EpisodeWriter` and `write_rollout` record
+episodes that come from no environment.
 
 single, vector, sb3       records one environment; many; a `VecEnv` of Stable-Baselines3
-base                      what these share
+base                      the base classes of these
 episode_writer, streams   `EpisodeWriter`; the episodes of each of its streams
 from_arrays               `write_rollout`
-rollout                   a rollout recorded in one call
-benchmark, run, stacks    what is noted of the environment; of the run; which leaves are stacks of frames
+rollout                   records a rollout in one call
+benchmark, run, stacks    describes the environment; the run; finds the leaves that are stacks of frames
 """
 
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter

@@ -1,4 +1,4 @@
-"""What all recorders share: options, files, rotation, closing."""
+"""Base classes of all recorders: options, files, rotation, closing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Recorder:
     """A recorder that writes one file, or one after another.
 
     Attributes:
-        rotation: the files that were written, and when the next one begins.
+        rotation: knows the files that were written, and when the next one begins.
     """
 
     rotation: Rotation
@@ -72,14 +72,14 @@ class Recorder:
 
     def __getstate__(self) -> dict[str, Any]:
         raise RecordingError(
-            f"what records to {self.path} cannot be pickled or copied; make another recorder there"
+            f"the recorder of {self.path} cannot be pickled or copied; make another recorder in the other process"
         )
 
 
 class EpisodeWrapper(Recorder):
-    """Keeps the files that a wrapper records to. `step` and `reset` are the wrapper's own.
+    """Manages the files that a wrapper records to; subclasses have `step` and `reset`.
 
-    Its constructor sets `_parts` and calls `_open`; `_recorder_of` says what records into a file.
+    The constructor of a subclass sets `_parts` and calls `_open`; its `_recorder_of` makes the recorder of a file.
     """
 
     env: Any
@@ -95,7 +95,7 @@ class EpisodeWrapper(Recorder):
         spaces: StepLayout,
         sub_environments: int | None,
     ) -> None:
-        """Opens the first file, once everything that may be refused has been looked at.
+        """Opens the first file, after all checks.
 
         Args:
             spaces: of the environment, or of one of its sub-environments.
@@ -133,15 +133,16 @@ class EpisodeWrapper(Recorder):
             raise
 
     def _recorder_of(self, writer: RecordingWriter) -> FileRecorder:
-        """What records the episodes that go to a file."""
+        """The recorder of the episodes in a file."""
         raise NotImplementedError
 
     def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder | VectorFrames:
-        """What records the frames that go to a file."""
+        """The recorder of the frames in a file."""
         raise NotImplementedError
 
     def _finish_step(self, taken: Any, result: Any) -> BaseException | None:
-        """Everything that follows a step's rows; returns what a callback raised, which changes nothing about that.
+        """Does everything that follows a step's rows; returns an exception of a callback, after which the rest is done
+        all the same.
 
         Args:
             taken: the action, or which sub-environments took a step, and the actions.
@@ -176,7 +177,7 @@ class EpisodeWrapper(Recorder):
         work.ask(self.rotation.finished, left.path)
 
     def _entries(self, step: Step) -> dict[str, Any]:
-        """What is to be recorded with the info of a step."""
+        """The entries of the step callback, to record with the info of a step."""
         entries = {} if self._infos is None else self._infos.chosen(step.info)
         if self._step_callback is not None:
             entries.update(entries_of(self._step_callback(step), "step_callback: what it returns"))
@@ -189,7 +190,7 @@ class EpisodeWrapper(Recorder):
             RecordingError: the disk refuses; everything that was recorded is safe.
         """
         if "_finalizer" not in self.__dict__:
-            return  # collected after its constructor raised: Gymnasium 1.0 closes then, and the caller's env too
+            return  # the constructor raised: Gymnasium 1.0 then calls close(), which would close the caller's env
         try:
             _close_recordings(self._work, self._live)
             self._finalizer.detach()
@@ -200,7 +201,7 @@ class EpisodeWrapper(Recorder):
             self.env.close(**kwargs)
 
     def _when_closed(self) -> None:
-        """After the files are finished."""
+        """Called after the files are finished."""
 
 
 def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
@@ -233,7 +234,7 @@ def check_kind(env: object, *, vector: bool) -> None:
 
 
 def wrong_kind(env: object, expected: str) -> RecordingError:
-    """The error for an object that is no environment, or one of the other kind; it names the right recorder."""
+    """The error for an object that is no environment, or is one of the other kind; it names the right recorder."""
     libraries = {cls.__module__.partition(".")[0] for cls in type(env).__mro__}
     name = type(env).__name__
     if isinstance(env, gym.Env):
@@ -253,7 +254,7 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
 
 
 def _close_recordings(work: Work, live: LiveSession | None) -> None:
-    """Finishes the files, and shows the rest of them."""
+    """Finishes the files, then shows the remaining episodes in the live view."""
     try:
         work.close()
     finally:
@@ -262,7 +263,7 @@ def _close_recordings(work: Work, live: LiveSession | None) -> None:
 
 
 def _live_session(writer: RecordingWriter, live: str | None, env: Any) -> LiveSession | None:
-    """The live view of a recording that has just been opened."""
+    """The live view of a new recording; None without `live`."""
     if live is None:
         return None
     from tupli_mcap.viewer.live import open_session

@@ -58,7 +58,7 @@ class Captured:
     def with_labels(
         self, spaces: StepLayout, given: Mapping[str, Sequence[str]] | None
     ) -> dict[str, tuple[str, bytes]]:
-        """What was captured, and the labels that were given or that the environment documents, if there are any."""
+        """The captured attachments, and the labels that were given or that the environment documents, if any."""
         if LABELS_NAME in self.attachments:
             return self.attachments
         documented = documented_labels(self._env) if self._documented else Labels.none()
@@ -67,7 +67,7 @@ class Captured:
     def trust_stored(self, writer: RecordingWriter) -> None:
         """Signs a pickle that the writer has just stored as this user's own, to be rebuilt without a question.
 
-        A recording that is gone on with keeps the environment it has.
+        A recording that is appended to keeps its own environment.
         """
         carried = [one for one in writer.container.attachment_indexes if one.name == _PICKLE]
         if self._digest and any(one.create_time >= self._began for one in carried):
@@ -82,7 +82,7 @@ def with_labels(
     given: Mapping[str, Sequence[str]] | None,
     documented: Labels,
 ) -> dict[str, tuple[str, bytes]]:
-    """The attachments, and the labels that were given or are documented, if there are any."""
+    """The attachments, and the labels that were given or are documented, if any."""
     labels = chosen_labels(given or {}, spaces.leaves, documented)
     return {**attachments, **({LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json())} if labels else {})}
 

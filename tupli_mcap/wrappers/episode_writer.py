@@ -155,14 +155,14 @@ class EpisodeWriter(Recorder):
             self._next(env).begin(facts, entries)
 
     def _next(self, env: int) -> Stream:
-        """The stream, ready for its next episode, which may be in the next file."""
+        """The stream, ready for its next episode, if need be in the next file."""
         self._streams.streams[env].end()
         if self.rotation.is_due(self._writer) and not self._streams.is_running:
             self._go_on()
         return self._streams.streams[env]
 
     def _go_on(self) -> None:
-        """In the next file."""
+        """Goes on in the next file."""
         before, left = self._streams, self._writer
         self._record_to(self._work.ask(self.rotation.open_next))
         self._writer.layout = left.layout
@@ -354,7 +354,7 @@ class EpisodeWriter(Recorder):
 
 
 class _Whole:
-    """Marks the work while it is done (`work`): a refused step leaves it whole, what else interrupts it does not."""
+    """Marks `work` as unfinished during the block; it stays so if anything but a refused step interrupts the block."""
 
     __slots__ = ("_work", "_writer")
 
@@ -397,7 +397,7 @@ def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> None:
-    """Finishes the files, and leaves out of them what was discarded."""
+    """Finishes the files, and writes those with discarded episodes anew without them."""
     work.close()
     while discarded:
         path, numbers = discarded.popitem()

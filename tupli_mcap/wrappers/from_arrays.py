@@ -1,4 +1,4 @@
-"""`write_rollout`: a recording of arrays that hold whole rollouts."""
+"""`write_rollout` writes a recording from arrays that hold whole rollouts."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tupli_mcap.wrappers.episode_writer import EpisodeWriter
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
 _CHUNK: Final = 256 * 1024
-_TOGETHER: Final = 1 << 13  # steps; a killed process loses the final states of what is written together
+_TOGETHER: Final = 1 << 13  # steps that are written at once; a killed process loses their final states
 _MANY: Final = (
-    16  # streams up to which chunks are as large as those of one: they all have room in the journal
+    16  # up to this many streams, chunks are as large as those of one: they all have room in the journal
 )
 _CHOOSE: Final = (
     'pass autoreset="next-step" if the step after an end is a reset, whose action was ignored, "same-step" if the step '
@@ -30,7 +30,7 @@ _CHOOSE: Final = (
 
 
 class _Part(NamedTuple):
-    """Steps of one episode; `whole`: of several, one after another, each ended by a flag and with its final state."""
+    """Steps of one episode, or if `whole` of several, each ended by a flag and with its final state."""
 
     env: int
     states: Any
@@ -126,7 +126,7 @@ def write_rollout(
 
 
 class _Rollout(NamedTuple):
-    """What is to be written; `first` has values whose axes before those of one step are `lead` many."""
+    """The rollout to write; the values in `first` have `lead` axes before those of one step."""
 
     parts: Iterable[_Part]
     first: _Given
@@ -199,7 +199,7 @@ def _episodes(given: _Given) -> Iterator[_Part]:
 
 
 def _episode(given: _Given, i: int) -> _Given:
-    """The i-th entry of everything that is given."""
+    """The i-th entry of all given lists."""
     count, entries = len(given.rewards), []
     for name, value in given._asdict().items():
         if value is None or (name == "metadata" and isinstance(value, Mapping)):
@@ -213,7 +213,7 @@ def _episode(given: _Given, i: int) -> _Given:
 
 
 def _episode_flags(given: Any, n: int) -> Array:
-    """Flags of the steps of an episode, of which the last one may be given alone."""
+    """Flags of the steps of an episode; a single given flag is that of the last step."""
     if given is not None and given.ndim:
         return np.asarray(given)
     flags = np.zeros(n, np.bool_)
@@ -267,7 +267,7 @@ def _spans(done: Array, mode: str) -> tuple[Array, Array]:
 def _parts(
     given: _Given, finals: _Finals, column: tuple[int, ...], spans: tuple[Array, Array]
 ) -> Iterator[_Part]:
-    """The episodes of one sub-environment, those together that can be written together."""
+    """The episodes of one sub-environment; consecutive whole ones are one part."""
     begins, ends = spans
     alone = ~finals.done[ends, *column] | ~finals.known(ends, column)
     if given.infos or given.metadata:
@@ -290,12 +290,12 @@ def _parts(
 
 
 class _Finals:
-    """Where the states after the last steps of episodes are."""
+    """Finds the states after the last steps of episodes."""
 
     def __init__(self, given: _Given, done: Array, mode: str) -> None:
         self.done = done
         self._given, self._mode = given, mode
-        # the numbers of the ends, as `argwhere` has them
+        # the numbers of the ends, in the order of `argwhere`
         self._order = np.cumsum(done.reshape(-1)).reshape(done.shape) - 1
         if given.final_states is not None:
             count = int(np.count_nonzero(done))
@@ -311,7 +311,7 @@ class _Finals:
         return in_states if self._given.final_states is None else in_states | done
 
     def at(self, last: Any, column: tuple[int, ...]) -> Any:
-        """The states after these steps; None where they are not known."""
+        """The states after these steps; None if they are not known."""
         given, place = self._given, (last, *column)
         if not np.all(self.known(last, column)):
             return None
@@ -332,7 +332,7 @@ def _mode(given: Any) -> str:
 
 
 def _lead(rewards: Array, space: gym.Space[Any] | None) -> int:
-    """How many axes come before those of one step: 1, or 2 with sub-environments."""
+    """The number of axes before those of one step: 1, or 2 with sub-environments."""
     own = 0 if space is None or space.shape is None else len(space.shape)
     lead = rewards.ndim - own
     if lead not in (1, 2) or 0 in rewards.shape[:lead]:
@@ -367,14 +367,14 @@ def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> N
 
 
 def _one_of(name: str, given: Any, other: str, value: Any) -> Any:
-    """What is given under either of two names."""
+    """The argument that was given under either of two names."""
     if given is not None and value is not None:
         raise StepError(f"expected {name} or {other}, which mean the same, found both")
     return value if given is None else given
 
 
 def _array(value: Any) -> Array:
-    """An array of what holds one, without a copy where that is possible."""
+    """The array in an object that holds one, without a copy if possible."""
     if isinstance(value, np.ndarray):
         return value
     if hasattr(value, "detach"):  # a tensor that has a gradient, or lies on another device
@@ -383,7 +383,7 @@ def _array(value: Any) -> Array:
         try:
             found: Array = np.from_dlpack(value)
         except (BufferError, TypeError, RuntimeError, ValueError):
-            pass  # what DLPack does not pass on may still be an array
+            pass  # an object that DLPack refuses may still be an array
         else:
             return found
     return np.asarray(value)
@@ -402,7 +402,7 @@ def _length(tree: Any) -> int:
 
 
 def _space(tree: Any, lead: int, name: str) -> gym.Space[Any]:
-    """A space of what arrays hold behind their first axes."""
+    """A space for the values in arrays, without their first `lead` axes."""
     if isinstance(tree, Mapping):
         return gym.spaces.Dict({key: _space(value, lead, f"{name}[{key!r}]") for key, value in tree.items()})
     if isinstance(tree, tuple):

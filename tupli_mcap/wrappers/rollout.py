@@ -1,4 +1,4 @@
-"""Rollouts recorded in one call: make the environment, run a policy, write one file."""
+"""Records a rollout in one call: makes the environment, runs a policy, writes one file."""
 
 from __future__ import annotations
 
@@ -26,16 +26,15 @@ from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
 Policy = Callable[[Any], Any]
-"""From one observation (never a batch) to one action."""
-
-_REPORTS = 200  # progress is told about so often in a rollout
+"""A function from one observation (never a batch) to one action."""
+_REPORTS = 200  # reports of progress in a rollout, about
 
 
 class RolloutSummary(NamedTuple):
-    """What one call recorded; interrupted episodes count too. `size` is that of whole files (bytes).
+    """The result of one call; interrupted episodes count too. `size` is that of whole files (bytes).
 
     `path` is the last of the files, `paths` are all of them. `return_mean` leaves out the `return_nan` episodes whose
-    return is NaN; it is NaN itself where there is no other.
+    return is NaN; it is NaN if there is no other.
     """
 
     path: Path
@@ -91,7 +90,7 @@ def record_rollouts(
 
 
 class _Rollout(NamedTuple):
-    """What is done with an environment; `report` is told of the steps so far."""
+    """A rollout; `report` is called with the number of steps so far."""
 
     steps: int
     seed: int | None
@@ -100,7 +99,7 @@ class _Rollout(NamedTuple):
 
 
 def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> RolloutSummary:
-    """Of the files, whose first one had `known` episodes before."""
+    """The summary of the files; the first one had `known` episodes before."""
     returns = np.concatenate([_returns(path) for path in paths])[known:]
     size = sum(path.stat().st_size for path in paths)
     spread = spread_of(returns)
@@ -126,7 +125,7 @@ def load_policy(name: str) -> Policy:
         value: Any = importlib.import_module(module_name)
         for part in function_name.split("."):
             value = getattr(value, part)
-    except (Exception, SystemExit) as err:  # whatever the module does when it is imported
+    except (Exception, SystemExit) as err:  # the module's own code may raise anything
         raise RecordingError(f"the policy {name!r} cannot be imported: {brief(err)}") from err
     if not callable(value):
         raise RecordingError(f"the policy {name!r} must be a function, found {type(value).__name__}")
@@ -148,7 +147,7 @@ def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:
 
 @contextlib.contextmanager
 def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator[None]:
-    """Closes a wrapper. A new file without steps is removed: it would be in the way of the next try."""
+    """Closes a wrapper after the block. A new file without steps is removed, so that the next try does not find it."""
     try:
         with contextlib.closing(env):
             yield
@@ -204,7 +203,7 @@ def _actions(env: RecordVectorEpisodes, policy: Policy, states: Any) -> Any:
 
 @contextlib.contextmanager
 def _failures(done: int, path: Path) -> Iterator[None]:
-    """Says at which step somebody else's code failed."""
+    """Turns an error of the policy or the environment into a RecordingError that names the step."""
     try:
         yield
     except (TupliError, OSError):

@@ -1,4 +1,4 @@
-"""The attachment `run.json` of a new recording: what its run is called, and what this process knows of it."""
+"""The attachment `run.json` of a new recording: the user's words about the run, and facts about this process."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _PATIENCE: Final = 2.0  # seconds for git
 def with_run(
     attachments: Mapping[str, tuple[str, bytes]], options: RecordOptions, environment: str
 ) -> dict[str, tuple[str, bytes]]:
-    """The attachments, and the run that begins; nothing of it where nothing is said and nothing captured.
+    """The attachments with `run.json`; without it if the user says nothing about the run and captures nothing.
 
     Raises:
-        RecordingError: what is said of the run is no text, or nothing that JSON can hold.
+        RecordingError: a part of the run is no text, or JSON cannot hold it.
     """
     run = Run.given(options.name, options.metadata, options.tags, options.split)
     if RUN_NAME in attachments or (run == Run() and options.capture == "none"):
@@ -65,14 +65,14 @@ def _versions_of(modules: tuple[str, ...]) -> dict[str, str]:
 
 
 def _program_folder() -> str:
-    """Where the program's file lies; without one, as in a notebook, the working directory."""
+    """The directory of the program's file; without a file, as in a notebook, the working directory."""
     file = getattr(sys.modules.get("__main__"), "__file__", None)
     return str(Path(file).absolute().parent) if file else os.getcwd()  # noqa: PTH109 - gone, perhaps
 
 
 @lru_cache(maxsize=8)
 def _git(folder: str) -> dict[str, Any]:
-    """The commit that a folder is at, and whether files differ from it; empty if it is not known to git."""
+    """The commit of a folder, and whether files differ from it; empty if git does not know the folder."""
     # no program of the repository's configuration is run, and nothing in it is written
     ask = ["git", "-c", "core.fsmonitor=false", "-C", folder]
     environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}

@@ -1,4 +1,4 @@
-"""`VecRecordEpisodes` for `VecEnv`s of Stable-Baselines3: the vector recorder, shown one as Gymnasium's."""
+"""`VecRecordEpisodes` records `VecEnv`s of Stable-Baselines3: it shows them to the vector recorder as Gymnasium's."""
 
 from __future__ import annotations
 
@@ -92,15 +92,15 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
 
 
 class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
-    """A `VecEnv` as an environment of Gymnasium's under same-step autoreset.
+    """A `VecEnv` as a vector environment of Gymnasium with same-step autoreset.
 
     `step` waits for the step that was sent to the `VecEnv` before.
 
     Attributes:
         envs: the sub-environments in this process, without the Monitor of `make_vec_env`, which changes no step.
-        spec: of the first sub-environment, wherever it lives, without that Monitor; None if it says nothing of it.
-        spec_is_of_one: what `spec` makes is a sub-environment.
-        tells_infos: `step` returns infos also where no episode ends.
+        spec: of the first sub-environment, in any process, without that Monitor; None if there is none.
+        spec_is_of_one: `spec` makes a single sub-environment.
+        tells_infos: `step` returns infos of steps that end no episode, too.
         result: what the `VecEnv` returned last.
     """
 
@@ -149,13 +149,13 @@ class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._venv.close()
 
     def _reset_infos(self) -> list[Any]:
-        """What the last resets of the sub-environments returned; others than Stable-Baselines3's do not keep that."""
+        """The infos of the last resets; only Stable-Baselines3's own environments keep them."""
         base = self._venv.unwrapped
         known = isinstance(base, DummyVecEnv | SubprocVecEnv)
         return list(base.reset_infos) if known else [{}] * self.num_envs
 
     def _with_final_infos(self, states: Any, done: Array, infos: Sequence[Any]) -> list[Any]:
-        """The infos of a batch, of those who are `done` as of the reset, with what the step told under `final_info`."""
+        """The infos of a batch: those that are `done` get the info of the reset, with the step's as `final_info`."""
         found, resets = list(infos), self._reset_infos()
         for i in np.flatnonzero(done).tolist():
             final = {key: value for key, value in infos[i].items() if key != _FINAL}
@@ -166,7 +166,7 @@ class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 class _Recorder(RecordEpisodes):
-    """Finds the seeds and options of a reset where a `VecEnv` keeps them."""
+    """A recorder that takes the seeds and options of a reset from the `VecEnv`."""
 
     env: StableBaselinesVecEnv
 
@@ -191,7 +191,7 @@ class _Recorder(RecordEpisodes):
 
 
 def _as_in(states: Any, state: Any) -> Any:
-    """One state in the dtypes of a batch, to which a `VecEnv` casts all states but final ones."""
+    """One state in the dtypes of a batch: a `VecEnv` casts all states to them, but not final ones."""
     if isinstance(states, dict):
         return {key: _as_in(batch, state[key]) for key, batch in states.items()}
     if isinstance(states, tuple):

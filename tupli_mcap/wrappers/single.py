@@ -151,7 +151,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         self._metadata_callback = metadata_callback
         self._watches = options.has_callbacks or bool(options.every)
         self._parts = (RecordEpisodes._watch, RecordEpisodes._end, RecordEpisodes._go_on)
-        self._stepped = True  # the callback may hold what another recorder has left in it
+        self._stepped = True  # so that the callback is reset: another recorder may have used it
         self._state: Any = None
         self._open(path, options, StepLayout(env.observation_space, env.action_space, reward_space), None)
 
@@ -181,7 +181,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         try:
             result = self.env.step(action)
             state, reward, terminal, timeout, _ = result
-        except Exception:  # a step that the environment refuses may be no step
+        except Exception:  # the environment may have taken no step
             work.state = DONE
             raise
         except (
@@ -191,7 +191,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             work.state = DONE
             raise
         try:
-            # looked up as an attribute, which it is, and not as a method: that is quicker
+            # looked up as an attribute, which is faster than as a method
             put = self._recorder.put
             put(action, state, reward, terminal, timeout)
             if self._plain:
@@ -252,7 +252,9 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             if self._stepped:
                 work.ask(self._reset_callback)
         except BaseException as err:
-            if work.is_whole_after(err):  # wherever the environment is now: the running episode is over
+            if work.is_whole_after(
+                err
+            ):  # the state of the environment is unknown: the running episode is over
                 work.state = BEGUN
                 self._recorder.forget_reset()
                 if self._frames is not None:
@@ -269,7 +271,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             self._frames.start(0, self.env.render)
 
     def _watch(self, action: Any, result: Any) -> None:
-        """Callbacks, infos and frames of a step."""
+        """Calls the callbacks, and records infos and frames of a step."""
         if not self._watches:
             return
         state, reward, terminal, timeout, info = result
@@ -289,7 +291,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             self._frames.step(0, number, step, bool(terminal or timeout), self.env.render)
 
     def _end(self, action: Any, result: Any) -> None:
-        """The end of an episode that a step has ended."""
+        """Ends the episode after its last step."""
         _, _, terminal, timeout, info = result
         if terminal or timeout:
             self._recorder.metadata = with_success(self._recorder.metadata, info)
@@ -302,7 +304,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             self._metadata_callback.reset()
 
     def _go_on(self, action: Any, result: Any) -> None:
-        """In another file, if this one is full; and with what is to be on the disk."""
+        """Goes on in another file if this one is full, and syncs to the disk if `durability` asks for it."""
         state, _, terminal, timeout, _ = result
         if (terminal or timeout) and self.rotation.is_due(self._writer):
             self._rotate(state)

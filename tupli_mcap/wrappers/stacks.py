@@ -1,4 +1,4 @@
-"""Which leaves of an environment's state are frames of a sliding window, so that each frame is stored once."""
+"""Finds the leaves of an environment's state that are stacks of frames, so that each frame is stored once."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
 from tupli_mcap.spaces.leaves import Leaf
 
-_SIZES = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasium's FrameStack before it
+_SIZES = (
+    "stack_size",
+    "num_stack",
+)  # attributes of FrameStackObservation, and of Gymnasium's older FrameStack
 
 
 def with_stacks(env: Any, spaces: StepLayout, stack_size: int | None = None) -> StepLayout:
-    """`spaces`, with the leaves that a wrapper around `env` stacks: the first axis, or else the last one, is as long as
-    `stack_size`, or as an attribute `stack_size` or `num_stack` of it says.
+    """`spaces` with its stacks: leaves whose first axis, or else the last one, has the length `stack_size`, or the
+    length in the attribute `stack_size` or `num_stack` of a wrapper around `env`.
 
-    A wrapper outside of it may change what it gives: then, too, what is stored is what the environment returned.
+    If a wrapper further out changes the frames, they are stored exactly all the same.
     """
     leaves = [leaf for leaf in spaces.state if any(map(can_stack, _both(leaf)))]
     sizes = (_sizes(env) if stack_size is None else {stack_size}) if leaves else set()
@@ -38,10 +41,10 @@ def _both(leaf: Leaf) -> tuple[Leaf, Leaf]:
 
 
 def _sizes(env: Any) -> set[Any]:
-    """How many frames the windows of an environment have; nothing is known of one in another process."""
+    """The numbers of frames that the wrappers of an environment stack; empty for one in another process."""
     if isinstance(env, gym.vector.VectorEnv | gym.vector.VectorWrapper):
         base = env.unwrapped
-        if type(base).__module__ == "ale_py.vector_env":  # which stacks by itself, frames first
+        if type(base).__module__ == "ale_py.vector_env":  # it stacks without a wrapper, frames first
             return set((base.single_observation_space.shape or ())[:1])
         inner = getattr(base, "envs", None)
         return _sizes(inner[0]) if inner else set()
@@ -53,5 +56,5 @@ def _sizes(env: Any) -> set[Any]:
 
 
 def format_version(spaces: StepLayout, images: ImageFormat) -> str:
-    """The least version of the format that has what these spaces need."""
+    """The lowest format version that can hold these spaces."""
     return "2" if spaces.stacks or (images != "raw" and spaces.images) else "1"

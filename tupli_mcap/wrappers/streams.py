@@ -1,4 +1,4 @@
-"""What records the episodes of streams that nobody steps: each begins, takes steps and ends, on its own."""
+"""Records the episodes of streams without an environment: each stream begins, takes steps and ends by itself."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Streams:
         return any(stream.is_running for stream in self.streams)
 
     def begin(self, state: Any, action: Any, reward: Any) -> None:
-        """Fixes the layout by the values of the first step, where it is not fixed yet."""
+        """Decides the layout by the values of the first step, unless it is decided."""
         writer = self.writer
         if not writer.streams:
             layout = decide_layout(self.spaces, [state], [action], [reward], writer.layout)
@@ -135,7 +135,7 @@ class Stream:
         stops: Array,
         finals: Any,
     ) -> None:
-        """Records whole episodes, of which `stops` are the ends: together where that can be, else one by one."""
+        """Records whole episodes, which end before the steps `stops`: together if possible, else one by one."""
         columns = (states, actions, rewards, terminals, timeouts)
         facts = ResetFacts(None, None, "", "{}", time.time_ns())
         begin = 0
@@ -152,10 +152,10 @@ class Stream:
             begin = stop
 
     def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
-        """Records whole episodes, of which rows and final states hold all there is to say.
+        """Records whole episodes that need no records but rows and final states.
 
         Raises:
-            StepError: something cannot be stored exactly; nothing is recorded.
+            StepError: a value cannot be stored exactly; nothing is recorded.
         """
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
         numbers = np.arange(writer.next_episode, writer.next_episode + count)
@@ -178,7 +178,7 @@ class Stream:
             self._streams.infos.put(self._writer, self._episode.number, step, info)
 
     def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
-        """Ends the running episode, if there is one; one without a step is none."""
+        """Ends the running episode, if there is one with a step."""
         writer, episode, store = self._writer, self._episode, self._store
         if episode is not None and store is not None:
             final = None
@@ -192,14 +192,14 @@ class Stream:
         self.is_running, self.over = False, None
 
     def discard(self) -> int | None:
-        """Ends the running episode as one to leave out; returns its number, None if it has no step."""
+        """Ends the running episode and marks it as discarded; returns its number, None if it has no step."""
         number = None if self._episode is None else self._episode.number
         self.end(metadata={"discarded": True})
         return number
 
 
 def _final_bytes(layout: StepLayout, finals: Any, count: int) -> Array:
-    """Final states as they follow `episode` and `env` in `/final_state`: uint8 (count, bytes)."""
+    """Final states as bytes after `episode` and `env` in `/final_state`: uint8 (count, bytes)."""
     message = layout.final_message
     table = np.zeros(count, message.dtype)
     for leaf in layout.final_leaves:

@@ -1,4 +1,4 @@
-"""`RecordEpisodes` for `gymnasium.vector` environments: one episode stream a sub-environment, in one file."""
+"""`RecordEpisodes` for `gymnasium.vector` environments: a stream of episodes for each sub-environment, in one file."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Whole columns of a dataset's episodes.
 
-load         reads them, from episodes to arrays; filters of tuples
+load         reads columns of episodes; applies tuple filters
 tuples       columns as steps and episodes
-convert      columns as what other libraries expect
-tables       as pandas and Arrow tables
-statistics   what the values are like
-saved        as a directory of `.npy` files
+convert      columns in the forms of other libraries
+tables       pandas and Arrow tables
+statistics   statistics of values
+saved        columns as a directory of `.npy` files
 """

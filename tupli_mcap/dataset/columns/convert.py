@@ -1,4 +1,4 @@
-"""Columns as what other libraries expect: D4RL, pandas, batches, and what parsers make of them."""
+"""Columns in the forms of other libraries: D4RL, pandas, batches, and those of parsers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ D4RL_NAMES: Mapping[str, str] = {
 
 
 def mark_cuts(columns: dict[str, Any], selected: Selected) -> None:
-    """Sets, in `columns["timeouts"]`, the timeout of each step that is no terminal and not followed by its
+    """Sets the flag in `columns["timeouts"]` of each step that is no terminal and is not followed by its
     episode's next step."""
     timeouts = columns["timeouts"]
     if not len(timeouts):
@@ -59,8 +59,7 @@ def batches(
     order: np.ndarray[Any, Any] | None,
     parser: type[BaseTupleParser] | None,
 ) -> Iterator[Any]:
-    """Batches of `size` steps in the given order of rows: lists of tuples, or what `parser` makes of
-    columns."""
+    """Batches of `size` steps in the given order of rows: lists of tuples, or the result of `parser`."""
     total = len(columns["terminals"])
     for start in range(0, total, size):
         rows: Any = slice(start, min(start + size, total)) if order is None else order[start : start + size]
@@ -73,7 +72,7 @@ def batches(
 
 
 def import_pandas() -> Any:
-    """The module.
+    """The module pandas.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -94,7 +93,7 @@ def dataframe(columns: Mapping[str, Any], selected: Selected) -> pd.DataFrame:
 
 
 def _cells(column: Any, rows: int) -> Any:
-    """A column as pandas can hold it: numbers as an array, everything else an object a row."""
+    """A column for pandas: numbers as an array, everything else as one object for each row."""
     if isinstance(column, np.ndarray) and column.ndim == 1:
         return column
     cells = np.empty(rows, object)
@@ -113,26 +112,26 @@ def _value(column: Any, row: int) -> Any:
 
 # ---- parsers: columns of steps as the arrays of a library
 #
-# A column is an array of shape (steps, ...), a list of one value a step where values differ in size (texts, graphs), or
-# dicts and tuples of those, nested as the environment's space is.
+# A column is an array of shape (steps, ...), a list with a value for each step if values differ in size (texts,
+# graphs), or dicts and tuples of those, nested as the environment's space is.
 
 Five = tuple[Any, Any, Any, Any, Any]
 
 
 class BaseTupleParser:
-    """To be subclassed: `parse_lists` makes what a library wants out of five columns."""
+    """Base class of parsers: `parse_lists` turns five columns into the form of a library."""
 
     @classmethod
     def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> tuple[Any, ...]:
         """The five columns (states, actions, rewards, terminals, timeouts) in another form.
 
-        The arrays are the parser's own: it may change them.
+        The parser may change the arrays.
         """
         raise NotImplementedError(f"{cls.__name__} has no parse_lists")
 
 
 class NumpyTupleParser(BaseTupleParser):
-    """NumPy arrays, in the dtypes that were recorded."""
+    """NumPy arrays in the recorded dtypes."""
 
     @classmethod
     def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
@@ -141,7 +140,7 @@ class NumpyTupleParser(BaseTupleParser):
 
 
 class TorchTupleParser(BaseTupleParser):
-    """PyTorch tensors on the CPU, of the dtypes that were recorded; they share the arrays' memory."""
+    """PyTorch tensors on the CPU in the recorded dtypes; they share the arrays' memory."""
 
     @classmethod
     def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
@@ -158,7 +157,7 @@ class TorchTupleParser(BaseTupleParser):
 
 
 class TensorflowTupleParser(BaseTupleParser):
-    """TensorFlow tensors, of the dtypes that were recorded."""
+    """TensorFlow tensors in the recorded dtypes."""
 
     @classmethod
     def parse_lists(cls, obs: Any, act: Any, rew: Any, term: Any, trunc: Any) -> Five:
@@ -182,7 +181,7 @@ def _convert_each(convert: Callable[[Any], Any], columns: Five) -> Five:
 
 
 def _as_arrays(column: Any) -> Any:
-    """Lists of numbers, as subclasses may pass them on, become arrays; values that differ in size stay a
+    """Turns lists of numbers, which subclasses may return, into arrays; values that differ in size stay a
     list."""
     if (
         isinstance(column, list)

@@ -1,4 +1,4 @@
-"""Loads columns: the steps of listed episodes that pass a tuple filter, a block of episodes at a time."""
+"""Reads whole columns: the steps of listed episodes that pass a tuple filter, one block of episodes after the other."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ _RECORDED = tuple(field for field in FIELDS if field != "infos")
 
 @dataclass(frozen=True)
 class Selected:
-    """Which steps of the listed episodes are wanted: a bool mask over all of them, None for all of them.
+    """The wanted steps of the listed episodes: a bool mask over all steps, or None for all.
 
-    `steps` counts the wanted ones; `lengths` (int64) those of each episode.
+    `steps` is the number of wanted ones, `lengths` (int64) that of each episode.
     """
 
     lengths: Array
@@ -58,19 +58,20 @@ def read_columns(
     selector: TupleSelector | None = None,
     known: Selected | None = None,
 ) -> tuple[dict[str, Any], Selected, StepLayout | None]:
-    """Columns of the wanted steps, by field; which steps those are; and the layout they share.
+    """Columns of the wanted steps by field, the selection of these steps, and their common layout.
 
     Fields are those of `Recording.read`, "infos" (a list of dicts) and "steps" (int64, from 0 in each
-    episode).
-    No more is held at any time than the result, one block of episodes (64 MiB, or one episode) and the cache
+    episode). Memory holds at most the result, one block of episodes (64 MiB, or one episode) and the cache
     of one recording.
 
     Args:
-        selector: the tuple filter; `known` is its result if it has been evaluated before.
+        source: opens the recordings.
+        headers: the episodes.
+        selector: the tuple filter; `known` is its result if it was evaluated before.
 
     Raises:
-        SpaceError: two recordings do not fit into one array.
-        NotFoundError: an episode is not in its recording any more.
+        SpaceError: one array cannot hold two of the recordings.
+        NotFoundError: an episode is missing in its recording: the file was changed.
     """
     total = sum(header.n_tuples for header in headers)
     with (
@@ -86,7 +87,7 @@ def read_columns(
 
 
 class _Reader:
-    """The columns that are being read."""
+    """Collects the columns, recording by recording."""
 
     def __init__(
         self, fields: Sequence[str], selector: TupleSelector | None, known: Selected | None, total: int
@@ -98,7 +99,7 @@ class _Reader:
         self._needed = list(dict.fromkeys([*self._fields, *extra]))
         self._capacity = total if known is None else known.steps
         self._total = total
-        self._done = 0  # listed steps
+        self._done = 0  # listed steps read so far
         self._builders: dict[str, _FieldBuilder] = {}
         self._layout: StepLayout | None = None
         self._first_name = ""
@@ -148,7 +149,7 @@ class _Reader:
 
 
 def _empty_column(field: str) -> Any:
-    """The column of no episodes at all, whose spaces nobody knows."""
+    """The column of an empty dataset, whose spaces are not known."""
     if field == "infos":
         return []
     if field == "frames":
@@ -165,10 +166,9 @@ def _empty_column(field: str) -> Any:
 def _read_block(
     recording: Recording, positions: Array, lengths: Array, fields: Sequence[str]
 ) -> dict[str, Any]:
-    """The fields of some whole episodes; a recording that has grown since it was listed is cut to what
-    was."""
+    """The fields of some whole episodes; steps that were recorded after the listing are left out."""
     recorded = [field for field in fields if field in _RECORDED]
-    # "All of it" is cheaper than a list of all: it leaves the cache alone.
+    # None for all episodes is cheaper than a list of them: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
     found = recording.read(None if everything else positions, fields=recorded)
     columns = {field: getattr(found, field) for field in recorded}
@@ -195,7 +195,7 @@ def _steps_within(lengths: Array) -> Array:
     return np.arange(int(lengths.sum())) - starts
 
 
-# ---- columns while they are filled, recording after recording
+# ---- columns that are filled, recording after recording
 
 Keep = Array | None  # a bool mask of rows, a slice as None: all
 
@@ -203,7 +203,7 @@ Keep = Array | None  # a bool mask of rows, a slice as None: all
 class _LeafBuilder:
     """One array (a list for a leaf of variable size) that grows up to `capacity` rows.
 
-    Memory that is never written to is never used, so a generous capacity costs nothing.
+    A capacity that is too large costs nothing: memory that is not written to takes no pages.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -220,7 +220,7 @@ class _LeafBuilder:
         rows = values if keep is None else values[keep]
         if self._array is None:
             if len(rows) == self._capacity and rows.base is None:
-                self._array, self._filled = rows, len(rows)  # the whole at once: nothing to copy
+                self._array, self._filled = rows, len(rows)  # all rows at once: nothing to copy
                 return
             self._array = np.empty((self._capacity, *rows.shape[1:]), rows.dtype)
         elif self._array.dtype != rows.dtype:
@@ -239,17 +239,17 @@ class _LeafBuilder:
         self._array = wider
 
     def finish(self) -> Any:
-        """What has been put; the builder is empty afterwards."""
+        """The rows so far; the builder is empty afterwards."""
         array, self._array = self._array, None
         if array is None:
             return self._items
         if self._filled < len(array):
-            array.resize((self._filled, *array.shape[1:]), refcheck=False)  # gives the rest back in place
+            array.resize((self._filled, *array.shape[1:]), refcheck=False)  # frees the rest in place
         return array
 
 
 class _FieldBuilder:
-    """A field's leaves while they are filled, nested as its space is once it is finished."""
+    """The leaves of a field; `finish` nests them as its space is."""
 
     def __init__(self, field: str, capacity: int, layout: StepLayout) -> None:
         self._field = field
@@ -287,21 +287,21 @@ STEP_KEYS: Mapping[str, str] = {
     "info": "infos",
     "step": "steps",
 }
-"""What an expression may name, and the column it is in; `step` counts from 0 within its episode."""
+"""Name in an expression -> column; `step` counts from 0 within its episode."""
 
 TupleFilter = BaseFilter | Callable[[RLTuple], bool]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 class TupleSelector:
-    """A tuple filter and the columns it needs to see."""
+    """A tuple filter and the columns that it needs."""
 
     def __init__(self, fields: tuple[str, ...], filter: TupleFilter) -> None:
         self.fields = fields
         self.filter = filter
 
     def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
-        """Which steps of `columns` (by field, at least `self.fields`) are wanted.
+        """A mask of the wanted steps of `columns` (by field, at least `self.fields`).
 
         Raises:
             FilterError: the expression does not fit the columns, or the function returned no flag.
@@ -314,7 +314,7 @@ class TupleSelector:
 
 
 def selector_of(filter: TupleFilter) -> TupleSelector:
-    """What to read for a filter.
+    """A filter with the columns that it needs.
 
     Raises:
         FilterError: it is neither an expression nor a function, or it names an unknown field of a step.

@@ -1,6 +1,6 @@
-"""Saved columns: the steps of a dataset as a directory of plain `.npy` files, which are read mapped into memory.
+"""Saved columns: the steps of a dataset as a directory of plain `.npy` files, which readers map into memory.
 
-`docs/howto/columns.md` says what the directory holds. It takes its place as a whole, and is never changed afterwards.
+`docs/howto/columns.md` describes the directory. It is written atomically and never changes afterwards.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from tupli_mcap.storage.atomic import os_errors
 __all__ = ["SavedColumns", "open_columns", "save_columns"]
 
 _MANIFEST = "manifest.json"
-_BLOCK_BYTES = 16 << 20  # of steps that are written together
-_BLOCK = 4096  # steps that are close to each other
+_BLOCK_BYTES = 16 << 20  # of steps that are written at once
+_BLOCK = 4096  # steps in a block: cheap to read together
 _INT64, _BOOL = np.dtype("<i8"), np.dtype(np.bool_)
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": "time"}
-# What NumPy raises for a file that is no `.npy` file, or is shorter than its header says.
+# Errors that NumPy raises for a file that is no `.npy` file, or is shorter than its header says.
 _BROKEN = (ValueError, TypeError, SyntaxError, OverflowError, RecursionError, MemoryError, TokenError)
 
 
 class _Manifest(BaseModel):
-    """What a directory says of its columns. `episodes` are headers as JSON texts: few who open columns need them, and
-    reading them takes longer than all the rest. `runs` are the runs that they are of, by the places that they name."""
+    """The content of `manifest.json`. `episodes` are headers as JSON texts, which are parsed only on access, since that
+    takes longer than everything else; the run of each is an index in `runs`."""
 
     format: Literal["tupli_mcap columns"] = "tupli_mcap columns"
     version: Literal[1] = 1
@@ -86,8 +86,7 @@ def save_columns(
     place = _path_of(directory)
     if os.path.lexists(place):
         raise StorageError(
-            f"expected a path for columns where nothing is, found something at {place}; choose another one, or "
-            "remove it"
+            f"expected an unused path for columns, but {place} exists; choose another one, or remove it"
         )
     layout = _layout_of(steps)
     runs = {id(header.run): header.run for header in headers}
@@ -111,7 +110,7 @@ def save_columns(
 
 
 def _layout_of(steps: Steps) -> StepLayout:
-    """The layout of the columns: spaces of the steps, and the dtypes that hold the values of all their recordings.
+    """The layout of the columns: the spaces of the steps, with dtypes that hold the values of all their recordings.
 
     Raises:
         DatasetError: there is no step, or values are of variable size.
@@ -131,7 +130,7 @@ def _layout_of(steps: Steps) -> StepLayout:
 
 
 def _text_of(header: EpisodeHeader, run: int) -> str:
-    """A header as JSON; its run is a place in the manifest's `runs`, for many episodes are of one."""
+    """A header as JSON; its run is an index in the manifest's `runs`, since many episodes share one."""
     try:
         return jsonvalue.dumps({**dict(header), "run": run})
     except ValueError as err:  # it is one level deeper here
@@ -139,7 +138,7 @@ def _text_of(header: EpisodeHeader, run: int) -> str:
 
 
 def _write(directory: Path, steps: Steps, layout: StepLayout, manifest: _Manifest) -> None:
-    """Fills the directory, a block of steps at a time. Not through maps: a full disk would kill the process."""
+    """Fills the directory, one block of steps after the other; not through maps: a full disk would kill the process."""
     plan = _plan(layout, manifest)
     for name, (dtype, shape) in plan.items():
         header = io.BytesIO()
@@ -165,7 +164,7 @@ def _write(directory: Path, steps: Steps, layout: StepLayout, manifest: _Manifes
 
 
 def _arrays(steps: Steps, layout: StepLayout, rows: Array) -> Iterator[tuple[str, Array]]:
-    """The arrays of some steps that follow each other, by the names of their files."""
+    """The arrays of some consecutive steps, by the names of their files."""
     columns = steps.read([field for field in FIELDS if field != "next_states"], rows)
     ends = steps.breaks[slice(*steps.breaks.searchsorted([rows[0], rows[-1] + 1]))] if len(rows) else rows
     columns |= steps.read(["next_states"], ends)
@@ -182,10 +181,10 @@ def _arrays(steps: Steps, layout: StepLayout, rows: Array) -> Iterator[tuple[str
 
 
 class SavedColumns(RandomAccess):
-    """The columns of a directory: windows, transitions and delta windows as those of the dataset that was saved.
+    """The columns in a directory; they have windows, transitions and delta windows like the saved dataset.
 
-    They are the steps as they were saved; nobody looks at the recordings again. Safe from several threads. Windows of
-    them can be pickled: a copy in another process maps the same files.
+    The steps are those at the time of saving; the recordings are not read. Thread-safe. Windows of them can be pickled:
+    a copy in another process maps the same files.
     """
 
     def __init__(self, directory: Path, manifest: _Manifest, steps: SavedSteps) -> None:
@@ -196,10 +195,10 @@ class SavedColumns(RandomAccess):
         return self._steps
 
     def preview(self) -> list[EpisodeHeader]:
-        """The episodes, as they were listed when they were saved.
+        """The episodes as they were listed at the time of saving.
 
         Raises:
-            FormatError: the manifest says something else of one.
+            FormatError: an entry of the manifest is no header of an episode.
         """
         return list(self._headers)
 
@@ -216,7 +215,7 @@ class SavedColumns(RandomAccess):
             raise _defect(self._directory / _MANIFEST, "headers of episodes", _first_line(err)) from err
 
     def _values_now(self) -> Callable[[F | BaseFilter], Array]:
-        return self.episode_values  # the headers are read only if somebody asks for values
+        return self.episode_values  # the headers are read only when values are needed
 
     def _step_seconds(self) -> float | None:
         return self._manifest.step_seconds
@@ -231,14 +230,14 @@ class SavedColumns(RandomAccess):
 
 
 class SavedSteps:
-    """The steps of saved columns, by number (see `Steps`): rows of arrays that are mapped into memory."""
+    """The steps of saved columns by number (see `Steps`): rows of arrays that are mapped into memory."""
 
     fields: tuple[str, ...] = FIELDS
 
     def __init__(
         self, directory: Path, layout: StepLayout, identity: str, arrays: Mapping[str, Array]
     ) -> None:
-        self._directory = directory.absolute()  # as it is now: copies elsewhere open it again
+        self._directory = directory.absolute()  # absolute, since copies in other processes open it again
         self.layout: StepLayout | None = layout
         self.identity = identity
         self.episode_lengths, self.breaks = arrays["episode_length"], arrays["break"]
@@ -269,7 +268,7 @@ class SavedSteps:
         }
 
     def _next_states(self, rows: Array) -> Any:
-        """The state of the step after each, and after a break the one that was saved for it."""
+        """The state of the step after each; after a break, the next state that was saved for it."""
         places = np.minimum(self.breaks.searchsorted(rows), len(self.breaks) - 1)
         broken = self.breaks[places] == rows
         after, places = np.where(broken, rows, rows + 1), places[broken]
@@ -288,14 +287,14 @@ class SavedSteps:
 
 
 def open_columns(directory: str | os.PathLike[str]) -> SavedColumns:
-    """The columns that `TupliDataset.save_columns` has written to a directory, mapped into memory and read-only.
+    """The columns that `TupliDataset.save_columns` wrote to a directory, mapped into memory and read-only.
 
-    Nothing in the files is executed, and nothing of their sizes is believed.
+    Nothing in the files is executed, and all sizes are checked.
 
     Raises:
         DatasetError: the directory is no path.
         StorageError: there are no columns, or the system refuses.
-        FormatError: a file is missing, or is not as columns are saved.
+        FormatError: a file is missing, or is no file of saved columns.
     """
     place = _path_of(directory)
     with os_errors("columns cannot be read from", place):
@@ -329,7 +328,7 @@ def _read_manifest(path: Path) -> _Manifest:
 
 
 def _mapped(path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """The array of a `.npy` file, no more and no less than the file holds."""
+    """The array of a `.npy` file, which must fill the file exactly."""
     if not path.is_file():
         raise _defect(path, "a file", "none")
     try:
@@ -348,7 +347,7 @@ def _mapped(path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
 
 
 def _check_episodes(directory: Path, arrays: Mapping[str, Array], steps: int) -> None:
-    """Whether lengths and breaks fit the steps; the columns themselves are not looked at."""
+    """Raises FormatError unless lengths and breaks fit the steps; the columns themselves are not read."""
     lengths, breaks = arrays["episode_length"], arrays["break"]
     if lengths.sum() != steps:
         raise _defect(directory / "episode_length.npy", f"{steps} steps of all episodes", "others")

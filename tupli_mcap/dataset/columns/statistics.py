@@ -1,4 +1,4 @@
-"""Statistics of a dataset's values, for normalisation: a block of steps at a time."""
+"""Statistics of a dataset's values, for normalisation; computed one block of steps after the other."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["QUANTILES", "STATISTICAL", "FieldStatistics", "statistics_of"]
 
 STATISTICAL = ("states", "actions", "rewards", "next_states")
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
-_SAMPLED = 1 << 16  # steps that quantiles are of, at even distances
+_SAMPLED = 1 << 16  # steps that quantiles are computed from, at even distances
 _BLOCK = 1 << 16  # steps
 
 
@@ -31,10 +31,10 @@ class FieldStatistics:
     """Statistics of a leaf; each array has the leaf's shape.
 
     Attributes:
-        count: finite values (int64).
+        count: number of finite values (int64).
         mean, std: float64; the standard deviation is that of the population.
         min, max: of the finite values.
-        quantiles: by fraction (0.5 is the median): exact up to 65,536 steps, beyond of so many at even distances.
+        quantiles: by fraction (0.5 is the median); exact up to 65,536 steps, else of 65,536 steps at even distances.
     """
 
     count: Array

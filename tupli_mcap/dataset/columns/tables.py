@@ -1,4 +1,4 @@
-"""Datasets as tables of pandas or Arrow: a row a step, or a row an episode."""
+"""Datasets as tables of pandas or Arrow: a row for each step, or for each episode."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
 
 
 def _times(texts: Sequence[str]) -> Any:
-    """Times (ISO 8601 in UTC), NaT where there is none."""
+    """Times (ISO 8601 in UTC) for pandas, NaT for an empty text."""
     return np.array([text.removesuffix("+00:00") or "NaT" for text in texts], "datetime64[ns]")
 
 
 def _whole_numbers(values: Sequence[int | None]) -> Any:
-    """Integers, some of which are not known; without a loss, which floats would be."""
+    """Integers, some of which are None; floats would lose digits."""
     fits = all(value is None or -(2**63) <= value < 2**63 for value in values)
     return (
         import_pandas().array(values, dtype="Int64") if fits else import_pandas().Series(values, dtype=object)
@@ -90,7 +90,7 @@ def _whole_numbers(values: Sequence[int | None]) -> Any:
 
 
 def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A column for each key that one of the items has, None where another one has it not."""
+    """A column for each key of any item, with None for items without the key."""
     keys = dict.fromkeys(key for item in items for key in item)
     columns: dict[str, Any] = {}
     for key in keys:
@@ -134,7 +134,7 @@ def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mappin
         if isinstance(values, list):
             columns[leaf.path] = values
             continue
-        if leaf.apart:  # an image a cell
+        if leaf.apart:  # one image in each cell
             columns[leaf.path] = list(values)
             continue
         flat = values.reshape(len(values), leaf.size)

@@ -16,10 +16,10 @@ __all__ = ["EpisodeItems", "Tuples", "items_of"]
 
 
 class Tuples(Sequence[RLTuple]):
-    """The steps of some columns, as tuples that are made when they are asked for.
+    """The steps of some columns as tuples, which are made on access.
 
     A tuple's state and action have the type of the space's own samples and share memory with the columns; the
-    info is empty where none was recorded (or `columns` has no "infos").
+    info is empty if none was recorded (or `columns` has no "infos").
     """
 
     def __init__(
@@ -76,8 +76,8 @@ class EpisodeItems(Sequence[EpisodeItem]):
 
     Args:
         headers: the episodes.
-        columns: gives the columns of all of them, the number of steps of each, and their layout.
-        chosen: places in `headers`.
+        columns: returns the columns of all of them, the number of steps of each, and their layout.
+        chosen: positions in `headers`.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class EpisodeItems(Sequence[EpisodeItem]):
             columns, lengths, layout = self._columns()
             self._found = Tuples(columns, layout), np.concatenate([[0], np.cumsum(lengths)])
         tuples, ends = self._found
-        # Both are valid already; validating each step again would cost more than reading it.
+        # Header and steps are valid already.
         return EpisodeItem.model_construct(
             **dict(self._headers[place]), tuples=list(tuples[int(ends[place]) : int(ends[place + 1])])
         )

@@ -1,12 +1,12 @@
-"""Steps by number, and what is made of them: windows, transitions, the values around a step.
+"""Steps by number, and items made of them: windows, transitions, the values around a step.
 
-steps                          what all of these read from; steps in memory
+steps                          the interface that items read from; steps in memory
 beside                         steps with infos and frames; infos as columns
-recorded, index, kept          steps read out of recordings; where they lie; those kept decoded
-items                          what windows, transitions and delta windows have in common
+recorded, index, kept          reads steps from recordings; finds their chunks; caches decoded columns
+items                          the base of windows, transitions and delta windows
 windows, transitions, deltas   the three kinds of items
-order, draws, sumtree          which items come next: each once an epoch, or drawn by weight
-batches                        items read in batches, some of them ahead
+order, draws, sumtree          numbers of items: each once an epoch, or drawn by weight
+batches                        reads items in batches, also ahead
 """
 
 from tupli_mcap.dataset.items.batches import Batches

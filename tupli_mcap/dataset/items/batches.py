@@ -1,4 +1,4 @@
-"""Batches of items in an order, some of them read ahead."""
+"""Reads batches of items in an order, also ahead."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ T = TypeVar("T", bound="Parts")
 
 
 class Batches(Generic[T]):
-    """The items whose numbers an `Order` or a `Sampler` gives, a batch at a time.
+    """The items whose numbers an `Order` or a `Sampler` gives, one batch after the other.
 
     Args:
-        read_ahead: batches that a thread reads while the one before is used: worth it where chunks are decompressed
-            or files are slow. A sampler draws them as early; weights that change meanwhile count for later ones.
+        read_ahead: number of batches that a thread reads while the caller uses the one before; this pays if chunks
+            are decompressed or files are slow. A sampler draws these early: weights that change meanwhile apply to
+            later batches.
 
     Raises:
         SamplingError: the numbers are those of other items.
@@ -74,11 +75,11 @@ class Batches(Generic[T]):
                 pool.shutdown(cancel_futures=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the iteration is: the next batch is the first that was not given yet."""
+        """The position of the iteration: the next batch is the first one that was not returned."""
         return self.numbers.state_dict([numbers for numbers, _ in self._drawn])
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """The next iteration goes on from there.
+        """Makes the next iteration go on from a state.
 
         Raises:
             SamplingError: it is the state of something else, or of other items.

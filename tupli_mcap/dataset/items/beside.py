@@ -1,4 +1,4 @@
-"""Steps with a field that is read elsewhere: infos out of memory, frames out of recordings; infos as columns."""
+"""Steps with a field from elsewhere: infos from memory, frames from recordings; infos as columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ INFOS, FRAMES = BESIDE = ("infos", "frames")
 
 
 class StepsWith:
-    """Steps that have one more field. `values` gives its column of some steps (int64), and can be pickled."""
+    """Steps with one more field; `values` returns its column for some steps (int64), and can be pickled."""
 
     def __init__(self, rest: Steps, field: str, values: Callable[[Array], Any]) -> None:
         self._rest, self._field, self._values = rest, field, values
@@ -64,11 +64,11 @@ class InfoValues:
 
 
 class FrameValues:
-    """The frames of steps, decoded when they are asked for: uint8 (steps, height, width, 3).
+    """The frames of steps, decoded on access: uint8 (steps, height, width, 3).
 
     Args:
         lengths: of the episodes (int64).
-        frames_of: gives the frames of an episode by its place.
+        frames_of: returns the frames of an episode by its place.
     """
 
     def __init__(self, lengths: Array, frames_of: Callable[[int], Frames]) -> None:
@@ -83,10 +83,10 @@ class FrameValues:
 
 
 def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None = None) -> dict[str, Any]:
-    """A column for each of some keys, by default of all.
+    """A column for each of `keys`, by default for all keys.
 
-    Numbers, and arrays of one shape, become an array of shape (steps, ...): float64 with NaN where some steps lack the
-    key, else of their own dtype. Other values become a list, with None where a step lacks the key.
+    Numbers, and arrays of one shape, become an array of shape (steps, ...) with their dtype; if some steps lack the
+    key it is float64, with NaN for them. Other values become a list, with None for steps that lack the key.
 
     Raises:
         SamplingError: no step has one of the keys.

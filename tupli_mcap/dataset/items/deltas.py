@@ -22,19 +22,22 @@ KEYS = {
     "state": "states", "action": "actions", "reward": "rewards", "terminal": "terminals",
     "timeout": "timeouts", "next_state": "next_states", "time": "times",
 }  # fmt: skip
-_CLOSEST = 1e-4  # seconds that a delta may lie beside a step
+_CLOSEST = 1e-4  # seconds by which a delta may miss a step
 _FARTHEST = 1 << 48  # steps: beyond every episode
-_LONGEST = 1e9  # seconds of the clock, 31 years: the same
+_LONGEST = 1e9  # seconds, 31 years: beyond every episode
 
 
 @dataclass(frozen=True)
 class DeltaWindow(Parts):
-    """Values around one step, or around B steps, by key ("state", "action", …).
+    """Values around one step, or around B steps, by key ("state", "action", …). `window["state"]` is
+    `window.values["state"]`.
 
-    `values[key]` is a column of shape (K, ...), or (B, K, ...), with K the number of the key's deltas, nested as the
-    space is; lists where values differ in size. `masks[key]` (bool, (B, K)) is False where the episode has no such
-    step: the nearest one stands there. `steps` (int64, (B,)) is the number of the step, `episodes` the place of its
-    episode in the query. `window["state"]` is `window.values["state"]`.
+    Attributes:
+        values: by key, a column of shape (K, ...), or (B, K, ...), where K is the number of the key's deltas; nested as
+            the space is; lists if values differ in size.
+        masks: by key, bool (B, K): False if the episode has no such step, and the value is that of the nearest one.
+        steps: number of the step, int64 (B,).
+        episodes: place of its episode in the query, int64 (B,).
     """
 
     values: dict[str, Any]
@@ -47,20 +50,20 @@ class DeltaWindow(Parts):
 
 
 class DeltaWindows(StepItems[DeltaWindow]):
-    """The values around each step, by the number of the step, as LeRobot's delta_timestamps give them.
+    """The values around each step, by the number of the step, like LeRobot's delta_timestamps.
 
-    Values are of the step's own episode, and between the cuts of a tuple filter.
+    Values come from the step's own episode, and from between the cuts of a tuple filter.
 
     Args:
-        deltas: for each key ("state", "action", "reward", "terminal", "timeout", "next_state", "time") how far from the
-            step: `{"state": [-2, -1, 0], "action": range(16)}`.
-        unit: "steps"; "seconds", of which a step has `step_seconds`; or "clock": seconds of the wall clock between the
-            times recorded, of which the nearest is taken.
-        step_seconds: how long a step takes (s).
+        deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time"), the distances from
+            the step: `{"state": [-2, -1, 0], "action": range(16)}`.
+        unit: "steps"; "seconds", where each step takes `step_seconds`; or "clock": seconds between the recorded times,
+            of which the nearest is taken.
+        step_seconds: time that a step takes (s).
 
     Raises:
-        SamplingError: unknown keys, deltas that are no numbers, no steps (in seconds: none within 0.1 ms), or unknown
-            seconds of a step.
+        SamplingError: a key is unknown; a delta is no number, or no whole number of steps (seconds: within 0.1 ms); or
+            the time of a step is not known.
     """
 
     def __init__(
@@ -108,7 +111,7 @@ class DeltaWindows(StepItems[DeltaWindow]):
         return DeltaWindow(ordered, masks, *((steps[0], episodes[0]) if single else (steps, episodes)))
 
     def _rows(self, steps: Array, deltas: Array, firsts: Array, lasts: Array) -> tuple[Array, Array]:
-        """The step of each delta, of shape (B, K), and whether it is there."""
+        """The step of each delta, shape (B, K), and whether it exists."""
         if self.unit == "clock":
             return self._nearest(steps, deltas, firsts, lasts)
         wanted = steps[:, None] + deltas
@@ -116,7 +119,7 @@ class DeltaWindows(StepItems[DeltaWindow]):
         return rows, rows == wanted
 
     def _nearest(self, steps: Array, deltas: Array, firsts: Array, lasts: Array) -> tuple[Array, Array]:
-        """The steps whose times are nearest, found by bisection: times grow within an episode."""
+        """The steps with the nearest times, found by bisection: times grow within an episode."""
         shape = (len(steps), len(deltas))
         target = self._times(steps)[:, None] + np.round(deltas.clip(-_LONGEST, _LONGEST) * 1e9).astype(
             np.int64
@@ -171,8 +174,8 @@ def _in_steps(given: Mapping[str, Array], unit: str, step_seconds: float | None)
     if unit == "seconds":
         if not isinstance(step_seconds, int | float | np.number) or not 0 < step_seconds < np.inf:
             raise SamplingError(
-                f"expected a known time of a step, found {step_seconds!r}; give step_seconds=, or take unit='clock', "
-                "for the times recorded"
+                f"expected a known time of a step, found {step_seconds!r}; give step_seconds=, or take unit='clock' "
+                "for the recorded times"
             )
         scale = step_seconds
     in_steps = {}

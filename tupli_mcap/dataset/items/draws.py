@@ -1,4 +1,4 @@
-"""Item numbers drawn without end, in batches: seeded, and resumable from a saved state."""
+"""Draws item numbers without end, in batches: seeded, and resumable from a saved state."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ _DRAWS = 0  # the stream of random numbers; an `Order` has another
 
 
 class Sampler:
-    """Draws batches of item numbers without end, with replacement; batch i of a seed is the same wherever it is drawn.
+    """Draws batches of item numbers without end, with replacement; a seed always gives the same batch i.
 
     Args:
-        items: what is drawn from.
+        items: the items to draw from.
         batch_size: numbers in a batch.
-        by: "steps" draws from all items alike; "episodes" draws an episode (of those that have items) first, and then
+        by: "steps" draws from all items with equal chances; "episodes" first draws an episode that has items, then
             one of its items, so that long episodes weigh no more than short ones.
-        weights: one for each item, or with `by="episodes"` one for each episode of the query; the chance is in
-            proportion. `update` changes them at little cost. An expression, such as `F("metadata.score")` or
+        weights: one for each item, or with `by="episodes"` one for each episode of the query; chances are proportional
+            to them. `update` changes them in logarithmic time. An expression, such as `F("metadata.score")` or
             `F("metadata.score") > 3`, is the weight of an episode; with `by="steps"`, of each of its items.
-        seed: an integer from 0; None takes one of the system's.
+        seed: an integer from 0; None takes a random one.
 
     Raises:
-        SamplingError: an argument means nothing; weights that are negative, NaN, infinite, all zero or too few.
+        SamplingError: an argument has no meaning, or weights are negative, NaN, infinite, all zero or too few.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Sampler:
                 f"expected weights from 0 on, found {checked[i]} for {self._what} {i}; their sum must be finite, too"
             )
         if self._counts is not None and len(checked) == len(self._counts):
-            # of an episode without items, none can be drawn
+            # an episode without items cannot be drawn
             checked = np.where(self._counts > 0, checked, 0.0)
         if not checked.any():
             raise SamplingError(
@@ -101,7 +101,7 @@ class Sampler:
         """Sets the weights of some items (of some episodes with `by="episodes"`), from the next batch on.
 
         Raises:
-            SamplingError: there are no weights, the places are not there, or a weight means nothing.
+            SamplingError: the sampler has no weights, a place does not exist, or a weight has no meaning.
         """
         if self._tree is None:
             raise SamplingError(
@@ -129,11 +129,11 @@ class Sampler:
 
     @property
     def weights(self) -> Array | None:
-        """The weights as they are now (float64), as a copy; None if all count alike."""
+        """A copy of the current weights (float64); None if all are equal."""
         return None if self._tree is None else self._tree.weights.copy()
 
     def draw(self, number: int) -> Array:
-        """Batch `number` of this seed, with the weights as they are now."""
+        """Batch `number` of this seed, drawn with the current weights."""
         random = seeded(self.seed, _DRAWS, checked_count(number, 0, "the number of a batch"))
         if self._tree is not None:
             if not self._tree.total > 0:
@@ -160,7 +160,7 @@ class Sampler:
         self._unused = [*batches, *self._unused]
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """Where this is; with weights, they are in it as bytes (float64), which `torch.load` also takes."""
+        """The position; weights are in it as bytes (float64), which `torch.load` also takes."""
         return {
             "kind": f"{type(self).__name__} by {self.by}",
             "items": self.items_identity,
@@ -196,5 +196,5 @@ class Sampler:
 
 
 def _usable(weights: Array, n: int) -> Array:
-    """Which weights can be one of n: from 0 on, and so small that the sum of n such is finite."""
+    """A mask of the weights that are usable: not negative, and so small that the sum of n of them is finite."""
     return (weights >= 0) & (weights <= np.finfo(np.float64).max / n)

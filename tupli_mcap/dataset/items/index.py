@@ -1,4 +1,4 @@
-"""Where the steps of listed episodes lie: found once, from the indexes of their recordings."""
+"""Finds the chunks with the steps of listed episodes, once, from the indexes of their recordings."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
 
 
 class ListedEpisodes(NamedTuple):
-    """Episodes of one recording: the name that opens it, their numbers, and how many steps of each are meant."""
+    """Episodes of one recording: the name that opens it, their numbers, and how many steps of each are listed."""
 
     recording: str
     numbers: Array
@@ -45,10 +45,10 @@ class ListedEpisodes(NamedTuple):
 
 
 def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
-    """Where the episodes are in the recording's index.
+    """The positions of the episodes in the recording's index.
 
     Raises:
-        NotFoundError: one of them is not there any more, or is shorter.
+        NotFoundError: an episode is missing, or shorter than listed: the file was changed.
     """
     numbers = recording.index["episode"].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
@@ -59,19 +59,19 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
         gone = recording.index["length"][positions] < listed.lengths
     if gone.any():
         raise NotFoundError(
-            f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is not there as it "
-            "was: the file has been changed since; open it again, or list the episodes anew with load()"
+            f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is missing or shorter: "
+            "the file was changed afterwards; open it again, or list the episodes anew with load()"
         )
     return positions
 
 
 @dataclass
 class StepIndex:
-    """Where the steps of listed episodes lie, in rows 0 to n - 1, episode after episode.
+    """The places of the steps of listed episodes, as rows 0 to n - 1, episode after episode.
 
-    `after` (int64) says for each episode what comes after its last listed step: `-1 - k` is row k of `finals`; from n
-    on, the row of a step it has gone on with since it was listed; the number of that last step where nothing is known
-    (`unknown`). `finals` are of the episodes `final_numbers`.
+    `after` (int64) gives for each episode the state after its last listed step: `-1 - k` is row k of `finals`; a
+    number from n on is the row of a step that was recorded after the listing; the number of the last step itself
+    means that the state is not known (`unknown`). `finals` are the final states of the episodes `final_numbers`.
     """
 
     layouts: list[StepLayout]
@@ -97,8 +97,8 @@ class StepIndex:
         """Opens one recording after the other.
 
         Raises:
-            SpaceError: two recordings do not fit into one array.
-            NotFoundError: an episode is not in its recording any more.
+            SpaceError: one array cannot hold two of the recordings.
+            NotFoundError: an episode is missing in its recording: the file was changed.
         """
         builder = _Builder(files, cache)
         for part in listed:
@@ -128,13 +128,13 @@ class _Part(NamedTuple):
 
     @property
     def known(self) -> Array:
-        """Which of the episodes end with a final state that is known; not those that went on since they were listed."""
+        """Mask of the episodes that ended when they were listed, and whose final state is known."""
         found: Array = (self.rows["final_row"] >= 0) & (self.rows["length"] == self.lengths)
         return found if self.stored.final_channel is not None else np.zeros_like(found)
 
     @property
     def went_on(self) -> Array:
-        """Which of the episodes have more steps than were listed."""
+        """Mask of the episodes that have more steps than were listed."""
         found: Array = self.rows["length"] > self.lengths
         return found
 
@@ -197,7 +197,7 @@ class _Builder:
         )
 
     def _steps(self, path: str | None) -> Segments:
-        """Where the steps lie, or the images of a leaf of the state; then the next one of each episode that went on."""
+        """The places of the steps, or of images of a leaf; then that of the next one of each episode that went on."""
         builder = SegmentsBuilder()
         places = [(*self._places(part, path), part) for part in self._parts]
         for file, (channels, first, part) in enumerate(places):
@@ -232,12 +232,12 @@ def _joined(parts: list[Array], dtype: Any) -> Array:
 
 
 class OpenFiles:
-    """Opens files when they are read, and keeps those open that were read last. Safe from several threads.
+    """Opens files when they are read, and keeps those open that were read last. Thread-safe.
 
-    A forked child opens them itself, as does a copy in another process.
+    A forked child, or a copy in another process, opens them itself.
 
     Args:
-        limit: how many are open at a time; a few more while several threads read.
+        limit: number of open files; a few more while several threads read.
     """
 
     def __init__(self, limit: int = 64) -> None:
@@ -258,7 +258,7 @@ class OpenFiles:
             if source is None:
                 source = self._sources[where] = open_source(where)
                 if len(self._sources) > self._limit:
-                    self._sources.popitem(last=False)  # closed when the last reader has let go of it
+                    self._sources.popitem(last=False)  # the last reader's reference closes it
             self._sources.move_to_end(where)
             return source
 
@@ -270,7 +270,7 @@ class OpenFiles:
 
 
 class FileOfMany:
-    """A `Source` that is open only while it is among those read last."""
+    """A `Source` that is open only while it is among the files read last."""
 
     def __init__(self, files: OpenFiles, where: str, path: Path, size: int) -> None:
         self._files = files
@@ -291,4 +291,4 @@ class FileOfMany:
         self.size = self._files.source(self.name).size
 
     def close(self) -> None:
-        """Nothing: the others decide."""
+        """Does nothing: `OpenFiles` closes files."""

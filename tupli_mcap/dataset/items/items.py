@@ -1,4 +1,4 @@
-"""What windows, transitions and delta windows have in common: items that start at a step, taken by number."""
+"""The base of windows, transitions and delta windows: items by number, each of which starts at a step."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ __all__ = [
 ]
 
 T = TypeVar("T", bound="Parts")
-_MANY = 1 << 20  # items that are looked at together
+_MANY = 1 << 20  # items that are processed together
 
 
 @dataclass(frozen=True)
 class Parts(SaysWhatIsMeant):
-    """Columns of one item or of a batch, and facts about them, by name; None where not asked for."""
+    """Columns of one item or of a batch, and facts about them, by name; None if not requested."""
 
     def asdict(self) -> dict[str, Any]:
-        """What there is, by name, without what was not asked for."""
+        """The requested columns and facts, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
 class Samples(Sequence[dict[str, Any]]):
-    """A batch that has been read at once: `batch` (columns of `len` samples), and the samples one by one, as views."""
+    """A batch that was read together: `batch` has its columns; as a sequence, it gives the single samples as views."""
 
     def __init__(self, batch: dict[str, Any], size: int) -> None:
         self.batch = batch
@@ -66,12 +66,12 @@ class Samples(Sequence[dict[str, Any]]):
 class Items(ABC, Generic[T]):
     """Items by number, each of which belongs to one step of an episode.
 
-    An index gives one item; a slice, or an array of numbers, a batch of them that is read together. Negative numbers
+    An index gives one item; a slice or an array of numbers gives a batch, which is read together. Negative numbers
     count from the end.
 
     Args:
-        steps: where they are read from.
-        parameters: what makes these items differ from others of the same steps.
+        steps: the steps to read.
+        parameters: tell these items apart from others of the same steps.
     """
 
     def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
@@ -96,7 +96,7 @@ class Items(ABC, Generic[T]):
 
     @abstractmethod
     def counts(self) -> Array:
-        """How many items each episode has (int64); they follow each other as the episodes do."""
+        """The number of items of each episode (int64); items are in the order of episodes."""
 
     @abstractmethod
     def _one(self, item: int) -> T: ...
@@ -122,7 +122,7 @@ class Items(ABC, Generic[T]):
         return map(self._one, range(len(self)))
 
     def __getitems__(self, indices: Sequence[int]) -> Samples:
-        """The items of a batch, as a PyTorch `DataLoader` asks for them: read together, and dicts, which its own
+        """The items of a batch for a PyTorch `DataLoader`: they are read together, and are dicts, which its own
         collate function understands."""
         chosen = self._batch(np.asarray(indices, np.int64))
         return Samples(chosen.asdict(), len(indices))
@@ -149,7 +149,7 @@ class Items(ABC, Generic[T]):
         drop_last: bool = False,
         buffer: int | None = None,
     ) -> Order:
-        """An `Order` of these items: the number of each once an epoch, in batches."""
+        """An `Order` of these items: each number once an epoch, in batches."""
         return Order(self, batch_size, shuffle=shuffle, seed=seed, drop_last=drop_last, buffer=buffer)
 
     def batches(self, numbers: Numbers | int, *, read_ahead: int = 0) -> Batches[T]:
@@ -165,7 +165,7 @@ class Items(ABC, Generic[T]):
         """The value of an expression over `EpisodeHeader` for each episode (float64).
 
         Raises:
-            SamplingError: these items are of no dataset, which alone knows its episodes; or a value is no number.
+            SamplingError: the items belong to no dataset, which alone knows its episodes; or a value is no number.
         """
         if self._values_of is None:
             raise SamplingError(
@@ -175,16 +175,16 @@ class Items(ABC, Generic[T]):
         return self._values_of(expression)
 
     def of_episodes(self, values_of: Callable[[F | BaseFilter], Array]) -> Self:
-        """These items, which from now on know the values of expressions over their episodes."""
+        """Gives these items a function for the values of expressions over their episodes; returns them."""
         self._values_of = values_of
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        # a copy elsewhere reads items; it needs no list of episodes
+        # a copy in another process reads items and needs no list of episodes
         return {**self.__dict__, "_values_of": None}
 
     def block_runs(self) -> tuple[Array, Array, Array]:
-        """Runs of items that lie in one block of the storage: the first item and the length of each, and its block."""
+        """Runs of items in one block of the storage: the first item, the length and the block of each, int64."""
         starts, blocks = [], []
         for first in range(0, len(self), _MANY):
             items = np.arange(first, min(first + _MANY, len(self)))
@@ -197,7 +197,7 @@ class Items(ABC, Generic[T]):
 
 
 class StepItems(Items[T]):
-    """Items of which each step has one, by the number of the step."""
+    """Items by the number of a step: each step has one."""
 
     def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
         super().__init__(steps, parameters)

@@ -1,4 +1,4 @@
-"""Rows by number, in any order: from decoded columns where all fit into memory, else chunk by chunk."""
+"""Rows by number, in any order: from decoded columns if all fit into memory, else chunk by chunk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tupli_mcap.recording.columns.threads import do_all
 
 __all__ = ["NumberedRows"]
 
-# Threads that decode small chunks take the interpreter from each other at every one: for so few, one thread is quicker.
+# Threads that decode small chunks contend for the interpreter lock at each one: for few chunks, one thread is faster.
 _FEW_CHUNKS = 128
 _LARGE_CHUNK = 1 << 20  # bytes
 
@@ -24,9 +24,9 @@ _LARGE_CHUNK = 1 << 20  # bytes
 class NumberedRows:
     """The rows of one kind, by number.
 
-    A row is copied from decoded columns where `hold` says so (they fill as chunks are read), else from the chunks that
-    the stores' cache keeps. Values of variable size are decoded each time they are read, so that nobody shares them.
-    Safe from several threads: two may read the same chunk, with the same result.
+    Columns that `hold` names are kept decoded and fill as chunks are read; other rows are copied from the chunks in
+    the stores' cache. Values of variable size are decoded at each read, so that nobody shares them. Thread-safe: two
+    threads may read the same chunk, with the same result.
     """
 
     def __init__(self, rows: Rows, segments: Segments) -> None:
@@ -49,7 +49,7 @@ class NumberedRows:
             )
 
     def nbytes(self, names: Iterable[str]) -> int:
-        """Bytes of some columns of all rows, decoded; 0 where they cannot be kept so."""
+        """Bytes of some decoded columns of all rows; 0 if they cannot be kept decoded."""
         return self._segments.total * sum(self.columns[name].nbytes for name in names if self._rows.constant)
 
     def read(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class NumberedRows:
         where = following(rows, self._segments.total)
         held = self._held
         if held is None or not held.columns.keys() >= set(names):
-            if not self._rows.constant:  # decoding leaves no time to other threads
+            if not self._rows.constant:  # decoding holds the interpreter lock
                 threads = 1
             return self._rows.read(names, self._segments.parts(where), len(rows), threads)
         if not held.whole:
@@ -84,7 +84,7 @@ class NumberedRows:
         def fill(unit: int, part: Part, task: Callable[[], None]) -> None:
             task()
             self._rows.check(held.columns, [part], whole=False)
-            held.there[unit] = True  # last: another thread may be looking
+            held.there[unit] = True  # last, since another thread may read it
 
         do_all([partial(fill, *each) for each in zip(units, parts, tasks, strict=True)], threads)
         if units:
@@ -92,7 +92,7 @@ class NumberedRows:
 
 
 class _HeldColumns:
-    """Decoded columns of all rows. `there` says which units are in them, `whole` that all are."""
+    """Decoded columns of all rows. `there` marks the units that are filled, `whole` says that all are."""
 
     def __init__(self, segments: Segments, columns: dict[str, Array]) -> None:
         self.columns = columns
@@ -104,13 +104,13 @@ class _HeldColumns:
         self._ends = np.concatenate([[0], np.cumsum(counts)])
 
     def missing(self, rows: Array) -> list[int]:
-        """The units that rows lie in and that are not there."""
+        """The units of rows that are not filled."""
         wanted = np.zeros(len(self.there), np.bool_)
         wanted[self._segments.units[self._segments.of(rows)]] = True
         return np.flatnonzero(wanted & ~self.there).tolist()
 
     def part(self, unit: int) -> Part:
-        """The rows of a unit, and where they belong."""
+        """The rows of a unit, and their places."""
         chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
         begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
         steps = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts

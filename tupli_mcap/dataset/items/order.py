@@ -1,4 +1,4 @@
-"""Every item's number once an epoch, in batches: in order or shuffled, seeded, resumable from a saved state."""
+"""Gives every item's number once an epoch, in batches: in order or shuffled, seeded, resumable from a saved state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHUFFLES = (False, "exact", "blocks")
 class Numbers(Protocol):
     """Batches of item numbers (int64), one after the other.
 
-    `items_identity` tells of which items; `give_back` takes the last batches that were not used after all.
+    `items_identity` identifies the items; `give_back` takes back the last batches if they were not used.
     """
 
     items_identity: str
@@ -35,11 +35,11 @@ class Numbers(Protocol):
     def give_back(self, batches: Sequence[Array]) -> None: ...
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """Where this is: plain numbers, strings, bytes and lists. `unused` are the last batches, to be given again."""
+        """The position, as plain numbers, strings, bytes and lists. `unused` are the last batches, to give again."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from there.
+        """Goes on from a state.
 
         Raises:
             SamplingError: it is the state of something else, or of other items.
@@ -51,18 +51,17 @@ class Order:
     """Gives every item's number once an epoch, in batches; iterating again begins the next epoch.
 
     Args:
-        items: what is numbered.
-        batch_size: numbers in a batch; the last one has what is left.
-        shuffle: False: in their order. "exact": any order is as likely as any other. "blocks": items wait in a
-            buffer that is filled block (chunk) by block, in random order, and leave it at random: few chunks are in
-            use at a time, and each is read once or twice an epoch, also where the cache holds only some of them.
-        seed: an integer from 0; None takes one of the system's. Each epoch has an order of its own.
+        items: the items.
+        batch_size: numbers in a batch; the last one may have fewer.
+        shuffle: False keeps their order. "exact" makes all orders equally likely. "blocks" fills a buffer with blocks
+            (chunks) in random order, and takes items out of it at random: few chunks are in use at a time, and each is
+            read once or twice an epoch, even if the cache holds only some of them.
+        seed: an integer from 0; None takes a random one. Each epoch has another order.
         drop_last: leave out a last batch that is not full.
-        buffer: how many items' worth of blocks are in use at a time; by default 65,536, or as many as half the cache
-            holds.
+        buffer: number of items in the blocks in use; by default 65,536, or as many as half the cache holds.
 
     Raises:
-        SamplingError: an argument means nothing.
+        SamplingError: an argument has no meaning.
     """
 
     def __init__(
@@ -117,7 +116,7 @@ class Order:
             self.batch = number + 1
             yield batch
             if self.epoch != epoch:
-                return  # another iteration has begun the next one
+                return  # another iteration has begun the next epoch
         self.epoch, self.batch = epoch + 1, 0
 
     def _batches(self, epoch: int) -> Iterator[Array]:
@@ -161,15 +160,14 @@ def _cut(order: Array, size: int) -> Iterator[Array]:
 def _through_buffer(
     runs: tuple[Array, Array, Array], size: int, batch_size: int, random: np.random.Generator
 ) -> Iterator[Array]:
-    """Batches of item numbers (int64) in which each item is once, the last one as long as is left.
+    """Batches of item numbers (int64), each item once; the last batch may be shorter.
 
-    Each item waits a random time, but none longer than `span` blocks: so few blocks are in use at any time. (Drawing
-    from a full buffer at random would leave stragglers of almost every block behind.)
+    Each item waits a random time, but none longer than `span` blocks, so that few blocks are in use at any time. (If
+    items were drawn at random from a full buffer, some items of almost every block would stay behind.)
 
     Args:
-        runs: the first item, the length and the block of runs of items; blocks are put into the buffer in random
-            order.
-        size: how many items' worth of blocks are in use at a time, about twice as many as wait.
+        runs: the first item, the length and the block of runs of items; blocks enter the buffer in random order.
+        size: number of items in the blocks in use, about twice as many as wait.
     """
     _, lengths, blocks = runs
     count = len(np.unique(blocks))
@@ -181,7 +179,7 @@ def _through_buffer(
         low, high = max(now, first), min(now + span, count)
         waiting = np.concatenate([waiting, block])
         due = np.concatenate([due, low + max(0.0, high - low) * random.random(len(block))])
-        over = due < now + 1  # nothing that comes later can be due before
+        over = due < now + 1  # items of later blocks are due later
         ready = np.concatenate([ready, waiting[over][np.argsort(due[over])]])
         waiting, due = waiting[~over], due[~over]
         full = len(ready) - len(ready) % batch_size
@@ -204,12 +202,12 @@ def _blocks(firsts: Array, lengths: Array, blocks: Array, random: np.random.Gene
 
 
 def seeded(seed: int, stream: int, number: int) -> np.random.Generator:
-    """A generator of its own for each number of a stream."""
+    """A random generator for one number of a stream; each has another."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, number]))
 
 
 def _digest(runs: tuple[Array, Array, Array]) -> str:
-    """A digest (SHA-256, hex) of which items lie in which block."""
+    """A digest (SHA-256, hex) of the items in each block."""
     return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
 
 
@@ -220,18 +218,18 @@ def checked_seed(seed: object) -> int:
 
 
 def check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """SamplingError unless a state is of the same kind, and of the same items."""
+    """Raises SamplingError unless a state is of the same kind, and of the same items."""
     if not isinstance(state, Mapping) or not {"kind", "items"} <= state.keys():
         raise SamplingError(f"expected a state that state_dict() gave, found {state!r:.80}")
     if state["items"] != own["items"]:
         raise SamplingError(
-            "expected the state of these items, found that of others: the dataset, its filters or the windows have "
-            "changed since; begin anew, or take what the state was saved with"
+            "expected the state of these items, found that of others: the dataset, its filters or the windows were "
+            "changed; begin anew, or use what the state was saved with"
         )
     if state.get("blocks") != own.get("blocks") and state["kind"] == own["kind"]:
         raise SamplingError(
-            "expected the state of a shuffle of these blocks, found that of others: the recordings have been written "
-            "anew, loaded or saved as columns since; read them as before, or take shuffle='exact'"
+            "expected the state of a shuffle of these blocks, found that of others: the recordings were written "
+            "anew, loaded or saved as columns; read them in the same way, or take shuffle='exact'"
         )
     for key in ("kind", "batch_size", "buffer"):
         if state.get(key) != own.get(key):

@@ -1,4 +1,4 @@
-"""Reads steps by number out of recordings."""
+"""Reads steps by number from recordings."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ _STATES = ("states",)
 
 
 class RecordedSteps:
-    """The steps of episodes in recordings, by number (see `Steps`); each chunk is read when a step of it is asked for.
+    """The steps of episodes in recordings, by number (see `Steps`); a chunk is read when one of its steps is.
 
-    What is read is kept: decoded columns, where those asked for so far fit into the budget all together, else the
-    chunks used last. Opening reads the indexes of all recordings; few files are open at any time. Safe from several
-    threads; a forked child goes on with its own copy, and a pickled copy opens the files itself, with nothing kept.
+    It caches decoded columns if all columns read so far fit into the budget, else the chunks used last. Opening reads
+    the indexes of all recordings; few files are open at any time. Thread-safe; a forked child goes on with its own
+    copy, and a pickled copy opens the files itself, with an empty cache.
 
     Args:
         listed: the episodes, in order.
-        open_recording: opens a recording by its name; it is left when it has been looked at.
-        mask: which of the listed steps are wanted (bool); None for all.
-        cache_bytes: budget for what is kept.
-        threads: how many read chunks.
+        open_recording: a context manager that opens a recording by its name.
+        mask: the wanted ones of the listed steps (bool); None for all.
+        cache_bytes: budget of the cache.
+        threads: number of threads that read chunks.
 
     Raises:
-        SpaceError: two recordings do not fit into one array.
-        NotFoundError: an episode is not in its recording any more.
+        SpaceError: one array cannot hold two of the recordings.
+        NotFoundError: an episode is missing in its recording: the file was changed.
     """
 
     fields: tuple[str, ...] = FIELDS
@@ -107,14 +107,14 @@ class RecordedSteps:
         return int(self._index.lengths.sum()) if self._wanted is None else len(self._wanted)
 
     def blocks(self, rows: Array) -> Array:
-        """The chunk that each row lies in: that of the image, where a state has one."""
+        """The chunk of each row: that of the image if states have one."""
         listed = rows if self._wanted is None else self._wanted[rows]
         where = next(iter(self._index.images.values()), self._index.steps)
         return where.units[where.of(listed)]
 
     @property
     def block_bytes(self) -> int:
-        """Bytes of a chunk once it is decompressed, on average; 0 where there is none."""
+        """Average size of a decompressed chunk (bytes); 0 without a chunk."""
         index = self._index
         units = next(iter(index.images.values()), index.steps)
         sizes = [
@@ -126,7 +126,7 @@ class RecordedSteps:
         return int(sum(sizes)) // max(1, len(units.chunk_of))
 
     def limit(self, cache_bytes: int, threads: int) -> None:
-        """Forgets what is kept, and keeps to another budget, and to other threads, from now on."""
+        """Empties the cache, and sets its budget and the number of threads."""
         self.cache_bytes, self.threads = cache_bytes, threads
         self._cache.clear()
         for rows in self._rows:
@@ -135,7 +135,7 @@ class RecordedSteps:
 
     @property
     def room(self) -> int:
-        """How many steps are in the chunks that fit into half the cache."""
+        """The number of steps in the chunks that fit into half the cache."""
         stored = sum(int(store.table["uncompressed"].sum()) for store in self._index.stores)
         # images may be stored smaller than they are
         images = sum(leaf.size for leaf in self.layout.images) if self.layout else 0
@@ -152,7 +152,7 @@ class RecordedSteps:
         )
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
-        if self._wanted is not None:  # what follows a step is not always in the next row
+        if self._wanted is not None:  # the next wanted step is not always in the next row
             return self.read(fields, rows_of_runs(starts, length))
         return self._columns(
             fields,
@@ -166,7 +166,7 @@ class RecordedSteps:
         read: Callable[[NumberedRows, Sequence[str]], dict[str, Any]],
         listed: Callable[[], Array],
     ) -> dict[str, Any]:
-        """The columns of some listed steps, whose leaves `read` gives."""
+        """The columns of some listed steps; `read` returns their leaves."""
         if self.layout is None:
             return {field: np.empty(0) for field in checked_fields(fields)}
         with memory_for(lambda: f"reading {', '.join(fields)} of {len(listed())} steps"):
@@ -181,7 +181,7 @@ class RecordedSteps:
             return {field: columns[field] for field in checked_fields(fields)}
 
     def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
-        """What has to be read for some fields; from now on, the budget is shared with it."""
+        """The plan to read some fields, whose columns then share the budget."""
         names = checked_fields(fields)
         plan = Plan.of([field for field in names if field != "next_states"], layout, self._rows[:-1])
         for i, leaves in plan.sources:
@@ -197,7 +197,7 @@ class RecordedSteps:
         return plan
 
     def _share_budget(self) -> None:
-        """Decides which columns are kept decoded, out of those that were asked for so far."""
+        """Decides which of the columns read so far are kept decoded."""
         sizes = {i: rows.nbytes(self._used[i]) for i, rows in enumerate(self._rows)}
         if sum(sizes.values()) > self.cache_bytes:
             sizes = {i: size for i, size in sizes.items() if i in (0, len(self._rows) - 1)}  # without images
@@ -239,7 +239,7 @@ class RecordedSteps:
 def steps_of(
     recording: Recording, *, cache_bytes: int = CACHE_BYTES, threads: int = THREADS
 ) -> RecordedSteps:
-    """All steps of one recording, for `Windows(steps_of(recording), 32)` and the like.
+    """All steps of one recording, for example for `Windows(steps_of(recording), 32)`.
 
     Raises:
         RecordingError: it has no step yet.

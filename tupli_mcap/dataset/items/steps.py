@@ -1,4 +1,4 @@
-"""The steps of a query by number: what windows, transitions and samplers read from."""
+"""The steps of a query by number, which windows, transitions and samplers read."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ _TOGETHER = 1 << 16  # rows that are looked at together
 
 
 class SamplingError(TupliError, ValueError):
-    """Steps were asked for in a way that has no meaning: a window longer than every episode, negative weights."""
+    """A request for steps has no meaning: a window longer than every episode, negative weights."""
 
 
 class Steps(Protocol):
     """The wanted steps of a query, numbered 0 to n - 1, episode after episode in the query's order.
 
     Attributes:
-        fields: what `read` knows.
-        layout: says how columns nest, and of which leaves they are; None where there is no step.
-        episode_lengths: int64, the wanted steps of each episode; may be 0.
-        breaks: int64, ascending: the steps that are not followed by their own episode's next step, that is the last
-            one of each episode, and the one before steps that a tuple filter left out.
-        open_ends: int64, ascending: the steps the state after which was not recorded; `next_states` repeats theirs.
-        identity: a digest of which steps these are; the same for the same steps, however they are read.
+        fields: the fields that `read` knows.
+        layout: the leaves of columns and their nesting; None without a step.
+        episode_lengths: int64, the number of wanted steps of each episode; may be 0.
+        breaks: int64, ascending: steps that are not followed by their episode's next step: the last one of each
+            episode, and the one before steps that a tuple filter left out.
+        open_ends: int64, ascending: steps whose next state was not recorded; `next_states` repeats their own state.
+        identity: a digest of these steps, independent of how they are read.
     """
 
     fields: tuple[str, ...]
@@ -62,8 +62,8 @@ class Steps(Protocol):
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         """Columns of the steps `rows` (int64, any order, repeats allowed), by field.
 
-        A column has the shape (len(rows), ...), is a list where values differ in size, and is nested as the space
-        is; arrays are the caller's own. Fields are those of `Recording.read`.
+        A column has the shape (len(rows), ...), is a list if values differ in size, and is nested as the space
+        is; the caller may change arrays. Fields are those of `Recording.read`.
 
         Raises:
             SamplingError: there is no such field.
@@ -73,19 +73,20 @@ class Steps(Protocol):
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
         """Columns of the steps `start` to `start + length - 1` for each of `starts` (int64), one run after the other.
 
-        As `read` gives them for all those rows, with len(starts) * length rows; `length` is at least 1.
+        The same as `read` for all those len(starts) * length rows; `length` is at least 1.
         """
         ...
 
     def blocks(self, rows: Array) -> Array:
-        """int64: the block of the storage that each of `rows` lies in; rows of one block are cheap to read together."""
+        """The block of the storage of each of `rows`, int64; rows of one block are cheap to read together."""
         ...
 
 
 class MemorySteps:
-    """Steps whose columns are in memory, at least some of them; the other fields are read from `rest`.
+    """Steps with some columns in memory; the other fields are read from `rest`.
 
-    A pickled copy, such as that in a worker which is spawned, is one of `rest`: memory is not sent to others.
+    A pickled copy, as in a spawned worker, is a copy of `rest` alone: columns in memory are not sent to other
+    processes.
     """
 
     def __init__(self, columns: Mapping[str, Any], rest: Steps) -> None:
@@ -121,7 +122,7 @@ class MemorySteps:
         return rows // _BLOCK
 
     def limit(self, cache_bytes: int, threads: int) -> None:
-        """Keeps to another budget for what is not in memory."""
+        """Sets another budget for the fields that are not in memory."""
         if hasattr(self._rest, "limit"):
             self._rest.limit(cache_bytes, threads)
 
@@ -134,10 +135,10 @@ def _same(steps: Steps) -> Steps:
 
 
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
-    """The fields, one name as a list of one.
+    """The fields as a list; one name becomes a list of one.
 
     Raises:
-        SamplingError: one of them is unknown, or there is something else.
+        SamplingError: a field is unknown, or is no text.
     """
     return field_names(fields, known, SamplingError)
 
@@ -152,7 +153,7 @@ def pick(column: Any, rows: Array | slice) -> Any:
 
 
 def following(rows: Array, total: int) -> Array | slice:
-    """Rows out of `total`, as a slice if they follow each other: NumPy copies that more quickly."""
+    """Rows out of `total`, as a slice if they are consecutive: NumPy copies slices faster."""
     n = len(rows)
     if n < 2 or rows[0] < 0 or rows[-1] >= total or rows[-1] - rows[0] != n - 1:
         return rows
@@ -182,7 +183,7 @@ def _copy_runs(array: Array, starts: Array, length: int) -> Array:
     width = array.strides[0] * length if array.size and array.flags.c_contiguous else 0
     if not 0 < width < _MAX_ITEM:
         return array.take(rows_of_runs(starts, length), axis=0)
-    # each run as one item: NumPy copies it at once, an order of magnitude faster than row by row
+    # each run is one item, which NumPy copies at once
     runs = np.ndarray(len(array) - length + 1, f"V{width}", array, 0, array.strides[:1])
     return runs[starts].view(array.dtype).reshape(-1, *array.shape[1:])
 
@@ -198,7 +199,7 @@ def map_arrays(
     return of_list(column) if isinstance(column, list) else function(column)
 
 
-_MOST = 1 << 48  # of what can be counted here; sums of a few such numbers are integers of 64 bits
+_MOST = 1 << 48  # largest count; sums of a few such numbers fit 64 bits
 
 
 def checked_count(value: object, least: int, what: str, most: int = _MOST) -> int:
@@ -227,6 +228,6 @@ def checked_numbers(value: Any, what: str) -> Array:
     if numbers.ndim != 1 or (numbers.dtype.kind not in "iu" and len(numbers)):
         raise SamplingError(f"expected {what} in one dimension, found {value!r:.80}")
     if numbers.dtype == np.uint64:
-        # which is beyond everything, and does not become negative
+        # large enough to be refused later, and does not become negative
         numbers = np.minimum(numbers, np.uint64(_MOST))
     return numbers.astype(np.int64)

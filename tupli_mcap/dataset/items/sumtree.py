@@ -1,4 +1,4 @@
-"""Weights that are drawn from and changed in logarithmic time."""
+"""Weights: drawing from them and changing them takes logarithmic time."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SumTree:
         return self._nodes[self._size : self._size + self._n]
 
     def update(self, places: Array, weights: Array) -> None:
-        """Sets some weights; of a place that is there several times, the last one counts."""
+        """Sets some weights; if a place occurs several times, the last one counts."""
         self._nodes[self._size + places] = weights
         nodes = np.unique(self._size + places) >> 1
         while len(nodes) and nodes[0] > 0:
@@ -46,9 +46,9 @@ class SumTree:
             nodes = nodes >> 1
 
     def find(self, points: Array) -> Array:
-        """The places at which the running sum of the weights passes each of some points from 0 to `total`.
+        """The places where the running sum of the weights passes each of some points from 0 to `total`.
 
-        Never one whose weight is 0, which rounding alone could give.
+        It never returns a place with weight 0, even after rounding.
         """
         nodes = np.ones(len(points), np.int64)
         left_over = points.astype(np.float64)

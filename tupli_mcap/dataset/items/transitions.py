@@ -20,18 +20,21 @@ TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals",
 
 @dataclass(frozen=True)
 class Transition(Parts):
-    """One transition, or columns of B transitions; columns are nested as the space is, None where not asked for.
+    """One transition, or columns of B transitions; columns are nested as the space is, None if not requested.
 
-    states, actions: where the transition starts.
-    rewards: the reward; over several steps the discounted sum of rewards (float).
-    next_states: the state after the last of its steps.
-    terminals, timeouts: the flags of its last step (bool).
-    discounts: what the value of `next_states` counts (float64): 0 after a terminal, else the discount to the power
-        of the number of its steps; so the target is `rewards + discounts * value(next_states)`, at timeouts too.
-    mask: False where the state after the last step was not recorded, and matters: `next_states` repeats the last state
-        that was, and the transition is better left out.
-    steps: the number of the step it starts at (int64), `episodes` the place of its episode in the query.
-    infos, frames: of the step it starts at, a dict of columns by key, and the picture (uint8, height x width x 3).
+    Attributes:
+        states, actions: of its first step.
+        rewards: the reward; over several steps the discounted sum of rewards (float).
+        next_states: the state after its last step.
+        terminals, timeouts: the flags of its last step (bool).
+        discounts: factor of the value of `next_states` (float64): 0 after a terminal, else the discount to the power
+            of the number of its steps; so the target is `rewards + discounts * value(next_states)`, at timeouts too.
+        mask: False if the state after the last step was not recorded, and matters: `next_states` repeats the last
+            recorded state, and the transition is better left out.
+        steps: number of its first step (int64).
+        episodes: place of its episode in the query (int64).
+        infos: of its first step, a dict of columns by key.
+        frames: picture of its first step: uint8 (height, width, 3).
     """
 
     mask: Any
@@ -51,12 +54,12 @@ class Transition(Parts):
 class Transitions(StepItems[Transition]):
     """The transition that starts at each step, by the number of the step.
 
-    With `n_step`, a transition is of as many steps, or of fewer where its episode (or the run of steps that a tuple
-    filter leaves) ends before. Where the state after an episode's last step was not recorded, it ends one step
+    With `n_step`, a transition has that many steps, or fewer if its episode (or the run of steps that a tuple
+    filter leaves) ends before. If the state after an episode's last step was not recorded, the transition ends one step
     earlier.
 
     Raises:
-        SamplingError: an argument means nothing, a field is unknown, or rewards of variable size would be summed.
+        SamplingError: an argument has no meaning, a field is unknown, or rewards of variable size would be summed.
     """
 
     def __init__(
@@ -111,7 +114,7 @@ class Transitions(StepItems[Transition]):
         }
 
     def _ahead(self, rows: Array) -> tuple[Array, Array, dict[str, Any]]:
-        """The last step of each transition, how many it has, and its rewards if they are asked for."""
+        """The last step of each transition, its number of steps, and its rewards if they are requested."""
         source = self.source
         breaks = source.breaks[source.breaks.searchsorted(rows)]
         ahead = np.arange(min(self.n_step, int((breaks - rows).max(initial=0)) + 1))
@@ -136,7 +139,7 @@ class Transitions(StepItems[Transition]):
 
 
 def _sum(rewards: Array, weights: Array) -> Array:
-    """Weighted sums of rewards (B * n, ...), with weights (B, n); floats keep their dtype, the others give float64."""
+    """Weighted sums of rewards (B * n, ...) with weights (B, n); floats keep their dtype, others become float64."""
     terms = rewards.reshape(*weights.shape, *rewards.shape[1:])
     shaped = weights.reshape(*weights.shape, *[1] * (terms.ndim - 2))
     sums = np.where(shaped > 0, terms * shaped, 0.0).sum(axis=1)

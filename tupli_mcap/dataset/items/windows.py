@@ -27,12 +27,16 @@ FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 @dataclass(frozen=True)
 class Window(Parts):
-    """Columns of one window, of shape (T, ...), or of B windows, of shape (B, T, ...); None where not asked for.
+    """Columns of one window, shape (T, ...), or of B windows, shape (B, T, ...); None if not requested.
 
-    They are nested as the space is; values that differ in size are in a list (of B lists). `mask` (bool, (B, T)) is
-    False where there was no step and the columns are filled up. `steps` (int64, (B,)) is the number of the step the
-    window starts at (its history lies before), `episodes` (int64, (B,)) the place of its episode in the query.
-    `infos` is a dict of columns by key, `frames` the recorded pictures: uint8 (B, T, height, width, 3).
+    They are nested as the space is; values that differ in size are in a list (of B lists).
+
+    Attributes:
+        mask: bool (B, T), False where there was no step and the columns are padded.
+        steps: number of the step that the window starts at (its history lies before), int64 (B,).
+        episodes: place of its episode in the query, int64 (B,).
+        infos: a dict of columns by key.
+        frames: the recorded pictures, uint8 (B, T, height, width, 3).
     """
 
     mask: Array
@@ -53,11 +57,11 @@ class Windows(Items[Window]):
     """Windows of `length` steps, each after `history` earlier ones, at every `stride`-th step of an episode.
 
     A window lies in one episode, and between the cuts of a tuple filter. With `pad="none"` all its steps exist.
-    Otherwise there is a window at every `stride`-th step, whatever is left of the episode: what is missing is the
-    nearest step again ("repeat"), or zero ("zero"; None in a list), and `mask` says so.
+    Otherwise there is a window at every `stride`-th step up to the end of the episode: missing steps repeat the
+    nearest one ("repeat"), or are zero ("zero"; None in a list), and `mask` marks them.
 
     Raises:
-        SamplingError: no episode is long enough, an argument means nothing, or a field is unknown.
+        SamplingError: no episode is long enough, an argument has no meaning, or a field is unknown.
     """
 
     def __init__(
@@ -105,7 +109,7 @@ class Windows(Items[Window]):
         return counts.astype(np.int64)
 
     def _starts(self, items: Array) -> tuple[Array, Array]:
-        """The step that each window starts at, and the piece between two breaks that it lies in."""
+        """The step that each window starts at, and the piece between two breaks that holds it."""
         pieces = self._ends.searchsorted(items, side="right")
         starts = self._firsts[pieces] + (items - self._before[pieces]) * self.stride
         return starts + self.history if self.pad == "none" else starts, pieces
@@ -127,7 +131,7 @@ class Windows(Items[Window]):
         )
 
     def _read(self, items: Array) -> dict[str, Any]:
-        """The parts of a `Window`; the rows of columns are those of one window after the other."""
+        """The parts of a `Window`; columns have the rows of one window after the other."""
         starts, pieces = self._starts(items)
         total = self.history + self.length
         mask = np.ones((len(items), total), np.bool_)
@@ -149,7 +153,7 @@ class Windows(Items[Window]):
 
 
 def _zeroed(column: Any, rows: Array) -> Any:
-    """The column with zero in some rows, None in a list."""
+    """The column with some rows set to zero, to None in a list."""
 
     def of_array(part: Array) -> Array:
         part[rows] = 0
