@@ -1,17 +1,17 @@
-"""Where benchmarks, artifacts and recordings live.
+"""Storages of benchmarks, artifacts and recordings.
 
-base             the contract of a storage, and who sees what is in it
+base             the contract of a storage, and groups that see its items
 files/, api/     `FileStorage`: a directory; `TupliAPIClient`: a server
-at, exchange     which of them a path or URL stands for; from one to another
-bundles/         a benchmark with all that it needs in one file
+at, exchange     opens the storage at a path or URL; copies between storages
+bundles/         a benchmark with everything that it needs in one file
 catalog/         the database that finds episodes
-listing          recordings below any directory: found, listed, read by episodes
-sidecar          what is noted beside recordings: deletions, publications
+listing          finds, lists and reads recordings below any directory
+sidecar          notes beside recordings: deletions, publications
 benchmark_json   a benchmark as text
-from_values      episodes made of values: their spaces, and the form that these ask for
-downloads        files fetched from elsewhere, kept for a while
-verify           whether all of it is whole
-atomic, texts    whole files, the lock between processes, and the texts in files
+from_values      episodes made from values: infers their spaces, and fits the values to these
+downloads        a cache of downloaded files
+verify           verifies a storage
+atomic, texts    atomic writes, the lock between processes, and the texts in files
 """
 
 from tupli_mcap.storage.api import TupliAPIClient

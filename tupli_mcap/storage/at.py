@@ -1,4 +1,4 @@
-"""Which storage a path or URL stands for."""
+"""Opens the storage at a path or URL."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["storage_at"]
 
 
 def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
-    """A storage; or the one at the address of a server, or in a directory, which need not be there yet.
+    """The storage at the address of a server, or in a directory, which need not exist; a storage is returned as it is.
 
     Raises:
-        StorageError: it is neither, or the path is that of recordings.
+        StorageError: `place` is none of these, or is the path of recordings.
     """
     if isinstance(place, TupliStorage):
         return place

@@ -1,4 +1,4 @@
-"""Writes files of a storage whole or not at all, and locks out other processes meanwhile."""
+"""Writes the files of a storage atomically, and locks out other processes while it does."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _Class = TypeVar("_Class")
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
-    """Write a file as a whole, and its directory if it is missing: a crash leaves the old file, or none.
+    """Write a file atomically, and make its directory if it is missing: a crash leaves the old file, or none.
 
     Raises:
         FileExistsError: The file exists and `replace` is false.
@@ -36,7 +36,7 @@ def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
 
 @contextlib.contextmanager
 def fill(path: Path) -> Iterator[Path]:
-    """Gives the path of a recording to write, which becomes `path` when the block ends without an error.
+    """Yields the path of a recording to write; it becomes `path` when the block ends without an error.
 
     Raises:
         FileExistsError: There is a file at `path` by then.
@@ -50,10 +50,10 @@ def fill(path: Path) -> Iterator[Path]:
             FormatError,
             RecordingError,
             SignatureError,
-        ) as err:  # nobody knows the file by its name for now
+        ) as err:  # the user does not know the temporary name
             raise type(err)(str(err).replace(str(new), str(path))) from err
         finally:
-            with contextlib.suppress(OSError):  # of a writer that was broken off
+            with contextlib.suppress(OSError):  # left by an interrupted writer
                 journal_path(new).unlink(missing_ok=True)
 
 
@@ -67,7 +67,7 @@ def os_errors(what: str, path: Path) -> Iterator[None]:
 
 
 def refusals_told(cls: type[_Class]) -> type[_Class]:
-    """A class decorator: what the system refuses in a public method is a StorageError that names the file."""
+    """A class decorator: an OSError in a public method becomes a StorageError that names the file."""
     for name, member in list(vars(cls).items()):
         if inspect.isfunction(member) and not name.startswith("_"):
             setattr(cls, name, _told(member))
@@ -87,7 +87,7 @@ def _told(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class LockError(StorageError):
-    """The lock's file cannot be opened: the storage can only be read, or the disk is full."""
+    """The lock's file cannot be opened: the storage is read-only, or the disk is full."""
 
 
 class Lock:
@@ -109,7 +109,7 @@ class Lock:
         self._fd = -1
 
     def __enter__(self) -> Self:
-        if self._process != os.getpid():  # held by a thread that is not here, perhaps
+        if self._process != os.getpid():  # forked: a thread of the parent may hold it
             self._forget()
         self._thread_lock.acquire()
         try:
@@ -134,7 +134,7 @@ class Lock:
         self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._process != os.getpid() or self._fd < 0:
-            return  # the block was entered before the fork, by the parent
+            return  # the parent entered the block before the fork
         self._depth -= 1
         if self._depth == 0:
             fd, self._fd = self._fd, -1
@@ -143,7 +143,7 @@ class Lock:
 
 
 def locked(path: Path, *, exclusive: bool = True) -> int:
-    """A descriptor that holds the lock of a file (made if it is missing), for `drop_private`."""
+    """A descriptor that holds the lock of a file (made if it is missing); close it with `drop_private`."""
     fd = open_private(path, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)

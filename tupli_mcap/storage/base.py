@@ -1,4 +1,4 @@
-"""The contract of a storage: where benchmarks, artifacts and episodes live, whatever is behind it."""
+"""The contract of a storage of benchmarks, artifacts and episodes: a directory or a server."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TupliStorageError = StorageError
 
 
 LOCAL_USER = "local_storage"
-"""Who creates what is in a directory; also the name of the only group that sees it."""
+"""The creator of all items in a directory; also the only group that sees them."""
 _ATTEMPTS = 5
 _T = TypeVar("_T")
 
@@ -45,16 +45,16 @@ _T = TypeVar("_T")
 class TupliStorage(ABC):
     """Stores benchmarks, artifacts and episodes and finds them again.
 
-    An id (`uri`) that nothing is stored under raises NotFoundError, whatever its form; ids are compared,
-    never used as paths. Filters see the fields of the listed headers (`id`, `metadata.score`); None lists
-    everything. Every other failure is a StorageError.
+    An unknown id (`uri`) of any form raises NotFoundError; ids are compared, never used as paths. Filters see the
+    fields of the listed headers (`id`, `metadata.score`); None lists everything. Every other failure is a
+    StorageError.
     """
 
     # --- benchmarks ---
 
     @abstractmethod
     def store_benchmark(self, benchmark_query: BenchmarkQuery) -> BenchmarkHeader:
-        """Store a benchmark. Its id is its hash: storing the same content again returns what is there."""
+        """Store a benchmark. Its id is its hash: storing the same content again returns the stored benchmark."""
 
     @abstractmethod
     def load_benchmark(self, uri: str) -> Benchmark:
@@ -66,21 +66,21 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
-        """Delete a benchmark, and with `episodes` its episodes too; returns how many of them. Artifacts stay.
+        """Delete a benchmark, and with `episodes` its episodes too; returns their number. Artifacts stay.
 
         Raises:
-            StorageError: `episodes` are to be deleted while somebody records more of them; nothing is deleted.
+            StorageError: somebody records episodes that shall be deleted; nothing is deleted.
         """
 
     @abstractmethod
     def publish_benchmark(self, uri: str, publish_in: str = "global") -> None:
-        """Let a group see a benchmark."""
+        """Make a benchmark visible to a group."""
 
     # --- artifacts ---
 
     @abstractmethod
     def store_artifact(self, artifact: bytes, metadata: ArtifactMetadata) -> ArtifactMetadataItem:
-        """Store bytes. Their id is their SHA-256: storing the same bytes again returns what is there."""
+        """Store bytes. Their id is their SHA-256: storing the same bytes again returns the stored artifact."""
 
     @abstractmethod
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
@@ -104,17 +104,17 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def publish_artifact(self, uri: str, publish_in: str = "global") -> None:
-        """Let a group see an artifact."""
+        """Make an artifact visible to a group."""
 
     # --- episodes ---
 
     @abstractmethod
     def record_episode(self, episode: Episode) -> EpisodeHeader:
-        """Store an episode that was built by hand, see `record_episodes`."""
+        """Store an episode that was made from values, see `record_episodes`."""
 
     @abstractmethod
     def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
-        """Store episodes that were built by hand (historic data, no environment).
+        """Store episodes that were made from values (historic data, no environment).
 
         States, actions and rewards may be arrays, numbers, flags, texts, lists, or dicts and tuples of them;
         spaces are inferred from the values. Each benchmark must be stored.
@@ -137,7 +137,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
-        """How many episodes match a filter."""
+        """The number of episodes that match a filter."""
 
     @abstractmethod
     def delete_episode(self, uri: str) -> None:
@@ -145,35 +145,35 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def delete_episodes(self, filter: BaseFilter) -> int:
-        """Delete every episode that matches a filter; returns how many."""
+        """Delete every episode that matches a filter; returns their number."""
 
     @abstractmethod
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
-        """Let a group see an episode."""
+        """Make an episode visible to a group."""
 
     # --- recordings ---
 
     @abstractmethod
     def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
-        """Where a new recording of a stored benchmark may be written; nothing is there yet. `name` is part of it."""
+        """An unused path for a new recording of a stored benchmark; `name` is part of it."""
 
     def beginning_recording(self) -> AbstractContextManager[object]:
-        """A lock to hold from looking up a benchmark until its new recording is open, so that nobody deletes it in
-        between."""
+        """A lock to hold from looking up a benchmark until its new recording is open, so that nobody deletes the
+        benchmark in between."""
         return nullcontext()
 
     @abstractmethod
     def ingest(self, path: Path) -> None:
         """Catalogue a recording that was written to `new_recording_path`, or has grown.
 
-        A finished one without episodes is removed.
+        A finished recording without episodes is removed.
         """
 
     @abstractmethod
     def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
-        """The recording of an `EpisodeHeader.recording`; the caller closes it.
+        """The recording that an `EpisodeHeader.recording` names; the caller closes it.
 
-        episodes: the numbers of those that will be read (None: all); what is opened may lack the others.
+        `episodes` are the numbers of those that will be read (None: all); the recording may lack the others.
         """
 
     @abstractmethod
@@ -182,10 +182,10 @@ class TupliStorage(ABC):
 
 
 def published_in(groups: Sequence[str], group: str) -> list[str]:
-    """The groups that see an item, and one more.
+    """The groups that see an item, with `group` added.
 
     Raises:
-        StorageError: That is no name of a group.
+        StorageError: `group` is no name of a group.
     """
     if not isinstance(group, str) or not group or not group.isprintable():
         raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
@@ -198,10 +198,10 @@ def episode_id(uuid: str, episode: int) -> str:
 
 
 def anew(read: Callable[[], _T]) -> _T:
-    """Calls a function that lists and reads, again if something that it had listed was deleted before it was read.
+    """Calls a function that lists and reads; calls it again if a listed item was deleted before it was read.
 
     Raises:
-        NotFoundError: that happened five times.
+        NotFoundError: this happened five times.
     """
     for _ in range(_ATTEMPTS - 1):
         with contextlib.suppress(NotFoundError):

@@ -1,4 +1,4 @@
-"""Benchmarks as text: what `BenchmarkQuery.serialized` holds, and what identifies a benchmark."""
+"""Benchmarks as text, as in `BenchmarkQuery.serialized`, and the hash that identifies a benchmark."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def plain(model: BaseModel) -> dict[str, Any]:
     """A model as JSON-able dict: NumPy values become numbers and lists, NaN becomes `{"$float": "nan"}`.
 
     Raises:
-        StorageError: It holds something that has no JSON form.
+        StorageError: A value has no JSON form.
     """
     try:
         value: dict[str, Any] = json.loads(dumps_plain(model.model_dump()))
@@ -65,10 +65,10 @@ def benchmark_entry(header: BenchmarkHeader) -> dict[str, Any]:
 
 
 def header_of(entry: Any) -> BenchmarkHeader:
-    """The header in the `benchmark` entry of a document, with the name and the description that it was given last.
+    """The header in the `benchmark` entry of a document, with its latest name and description.
 
     Raises:
-        FormatError, ValidationError: It is none.
+        FormatError, ValidationError: The entry is no header.
     """
     header = BenchmarkHeader.model_validate(restored(entry))
     for edit in edits_of(entry):
@@ -77,10 +77,10 @@ def header_of(entry: Any) -> BenchmarkHeader:
 
 
 def edits_of(entry: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What a benchmark was called after it was stored, in this order.
+    """The edits of a benchmark's name and description, in order.
 
     Raises:
-        FormatError: The entry says something else.
+        FormatError: The entry holds something else.
     """
     said = entry.get("edits", [])
     if not isinstance(said, list) or not all(map(_is_edit, said)):
@@ -93,10 +93,10 @@ def _is_edit(said: Any) -> bool:
 
 
 def restored(value: Any) -> Any:
-    """What `plain` was given, from JSON read back: `{"$float": "nan"}` is NaN again.
+    """The values that `plain` turned into JSON: `{"$float": "nan"}` becomes NaN again.
 
     Raises:
-        FormatError: It is nothing that `plain` made.
+        FormatError: `plain` did not make this JSON.
     """
     return loads(json.dumps(value))
 
@@ -127,7 +127,7 @@ def pack(
 
 
 def unpack(serialized: str, *, where: str = "the benchmark") -> BenchmarkContent:
-    """Read what `pack` wrote; executes nothing.
+    """Parse a text of `pack`; executes nothing.
 
     Raises:
         FormatError: It is something else.
@@ -155,7 +155,7 @@ def artifacts_of(record: EnvironmentRecord, where: str) -> tuple[str, ...]:
 
 
 def facts_about(env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """What the `benchmark` entry says of an environment beside its identity: its spaces, where they have
+    """Facts about an environment for the `benchmark` entry, besides its identity: its spaces, if they have
     JSON."""
     try:
         return {
@@ -167,7 +167,7 @@ def facts_about(env: gym.Env[Any, Any]) -> dict[str, Any]:
 
 
 def declared_spaces(serialized: str) -> list[gym.Space[Any]]:
-    """The observation and action space that a serialized benchmark says it has; empty if it does not."""
+    """The observation and action space that a serialized benchmark declares; empty if it declares none."""
     try:
         facts = unpack(serialized).record.benchmark or {}
         return [space_from_json(facts[name]) for name in ("observation_space", "action_space")]
@@ -176,9 +176,9 @@ def declared_spaces(serialized: str) -> list[gym.Space[Any]]:
 
 
 def recording_attachments(serialized: str, *, max_pickle: int = 16 << 20) -> dict[str, tuple[str, bytes]]:
-    """What a recording carries of its benchmark: name -> (media type, bytes).
+    """The attachments of a recording for its benchmark: name -> (media type, bytes).
 
-    A pickle of more than `max_pickle` bytes is left to the storage, and added when a bundle is made.
+    A pickle of more than `max_pickle` bytes stays in the storage, and is added when a bundle is made.
     """
     try:
         record = unpack(serialized).record

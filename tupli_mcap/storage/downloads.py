@@ -1,11 +1,11 @@
-"""Files that were fetched from elsewhere, kept for a while: `<cache>/downloads/<name>`, where the name says what is in
-it, such as a SHA-256. All of it may be deleted at any time.
+"""A cache of downloaded files: `<cache>/downloads/<name>`, where the name identifies the contents, such as a SHA-256.
+All of it may be deleted at any time.
 
-1. What has come so far is in `<name>.part`, locked by who fetches it. Whoever wants the same file waits; whoever comes
-   after one that broke off or was killed goes on where that ended.
-2. A file that is whole is checked against its SHA-256, then renamed. Wrong bytes are an error, and deleted.
-3. Who uses a file holds a shared lock on it. What was not used for longest is deleted while nobody does, until all of
-   it is within the budget.
+1. The bytes so far are in `<name>.part`, which the downloading process locks. Another process that wants the same file
+   waits; after a download that was interrupted, the next one goes on where it ended.
+2. A complete file is checked against its SHA-256, then renamed. Wrong bytes are an error, and are deleted.
+3. A process that uses a file holds a shared lock on it. Files without a lock are deleted, those used longest ago first,
+   until the rest is within the budget.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ def fetched(
     digest: str | None = None,
     tell: Callable[[int], None] = lambda _: None,
 ) -> Iterator[Path]:
-    """The path of a file, valid in the block; it is fetched if it is not kept.
+    """The path of a file, valid in the block; it is downloaded unless the cache has it.
 
     Args:
-        name: what it is kept as: files with different contents have different names.
-        pieces: gives its bytes from an offset on.
-        digest: their SHA-256.
-        tell: is told how many bytes more are here.
+        name: in the cache; files with different contents need different names.
+        pieces: returns its bytes from an offset on.
+        digest: SHA-256 of the bytes.
+        tell: called with the number of bytes that have arrived.
 
     Raises:
-        FormatError: they are others.
+        FormatError: the bytes have another SHA-256.
         StorageError: there is no room for it, or TUPLI_MCAP_CACHE_BYTES is no number.
     """
     budget, path = _budget(), cache_dir() / "downloads" / name
@@ -70,12 +70,12 @@ def fetched(
 
 @contextlib.contextmanager
 def fetched_url(url: str) -> Iterator[Path]:
-    """The path of a file at a URL, valid in the block; it is fetched unless this version of it is kept.
+    """The path of a file at a URL, valid in the block; it is downloaded unless the cache has this version of it.
 
     Raises:
-        RecordingError: it cannot be read, or changes meanwhile.
+        RecordingError: it cannot be read, or changes during the download.
         StorageError: there is no room for it.
-        MissingExtraError: what reads such URLs is not installed.
+        MissingExtraError: the package that reads such URLs is not installed.
     """
     remote = find(url)
     try:
@@ -103,7 +103,7 @@ def fetched_url(url: str) -> Iterator[Path]:
 
 
 def _held(path: Path) -> int | None:
-    """A descriptor with which nobody deletes the file; None if it is not there."""
+    """A descriptor with a shared lock, so that nobody deletes the file; None if there is no file."""
     try:
         fd = open_private(path, os.O_RDONLY)
     except FileNotFoundError:
@@ -130,9 +130,9 @@ def _fetch(
     fd = open_private(part, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)
-        if not _is_at(fd, part):  # another one has finished it, or it was deleted
+        if not _is_at(fd, part):  # another process has finished it, or it was deleted
             return
-        if path.exists():  # another one had finished it before this one was made
+        if path.exists():  # another process had finished it before this file was made
             part.unlink()
             return
         with os.fdopen(os.dup(fd), "r+b") as file:
@@ -154,7 +154,7 @@ def _fetch(
 
 
 def _tidy(directory: Path, budget: int) -> None:
-    """Deletes what was not used for longest."""
+    """Deletes files until the rest is within the budget, those used longest ago first."""
     found = []
     for path in directory.iterdir():
         with contextlib.suppress(FileNotFoundError):

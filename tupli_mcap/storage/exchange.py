@@ -1,4 +1,4 @@
-"""From one storage to another: benchmarks with all that they need, and their episodes."""
+"""Copies benchmarks, with everything that they need, and their episodes from one storage to another."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ __all__ = [
 
 
 class Copied(NamedTuple):
-    """How much was new to the storage it was copied to, or would be."""
+    """Numbers of items that were new to the target, or would be."""
 
     artifacts: int
     episodes: int
@@ -60,9 +60,9 @@ def copy_episodes(
     """Copies the episodes that match a filter to another storage, with their benchmarks and what these need; only
     those of one benchmark if it is named. Without a filter, benchmarks without episodes are copied, too.
 
-    What the target has already stays as it is there; episodes keep their ids. Nothing of it is executed. In a
-    directory, an environment is trusted if it was before, or for as long as a key is trusted that has signed one of its
-    recordings, which must have come whole for that.
+    Items that the target has stay unchanged; episodes keep their ids. Nothing is executed. In a directory, an
+    environment is trusted if it was before, or as long as a key is trusted that signed one of its recordings, which has
+    to be copied whole for that.
 
     Returns:
         By benchmark, how much was copied.
@@ -124,7 +124,7 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
         data = source.load_artifact(artifact)
         (item,) = source.list_artifacts(FilterEQ(key="id", value=artifact))
         target.store_artifact(data, ArtifactMetadata.model_validate(item.model_dump()))
-    told = benchmark.stored_metadata  # what its hash is of
+    told = benchmark.stored_metadata  # the metadata that its hash covers
     target.store_benchmark(
         BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=told)
     )
@@ -151,7 +151,7 @@ def _copy_recording(
 
 @contextlib.contextmanager
 def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: str) -> Iterator[Path]:
-    """A file with these episodes of a recording and no others: its own, where it is that."""
+    """A file with exactly these episodes of a recording: its own file, if that has no others."""
     if isinstance(source, TupliAPIClient):
         with source.downloaded(name, len(numbers), place) as path:
             if path is not None:
@@ -169,7 +169,7 @@ def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: s
 
 
 def _vouch(target: FileStorage, uri: str) -> None:
-    """Trusts the environment of a benchmark for as long as a key is trusted that has signed one of its recordings."""
+    """Trusts the environment of a benchmark as long as a key is trusted that signed one of its recordings."""
     if not trust.trusted_keys():
         return
     for name in {
@@ -187,7 +187,7 @@ def _vouch(target: FileStorage, uri: str) -> None:
 
 
 def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> str | None:
-    """Sends a recording to a server, before it the benchmark and the artifacts that it carries; returns its name there.
+    """Sends a recording to a server, after the benchmark and artifacts that it carries; returns its name there.
 
     Raises:
         FormatError: the file is damaged.
@@ -209,7 +209,7 @@ def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False)
 
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:
-    """Sends what was recorded to a server and waits here; returns what did.
+    """Sends the recordings of a server that wait on this machine; returns those that waited.
 
     Raises:
         StorageError: the server does not answer, or refuses some of it.
@@ -222,7 +222,8 @@ def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiti
 
 
 def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
-    """Lets a group see a benchmark, its artifacts, and the caller's episodes of it; returns how many these are."""
+    """Makes a benchmark, its artifacts, and the caller's episodes of it visible to a group; returns the number of
+    these episodes."""
     own = _own_episodes(client, uri)
     if dry_run:
         client.load_benchmark(uri)
@@ -235,8 +236,8 @@ def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: 
 
 
 def unpublish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
-    """Takes a benchmark and the caller's episodes of it away from a group; returns how many these are. Its artifacts
-    stay: other benchmarks may need them."""
+    """Hides a benchmark and the caller's episodes of it from a group; returns the number of these episodes. Its
+    artifacts stay visible: other benchmarks may need them."""
     own = _own_episodes(client, uri)
     if dry_run:
         client.load_benchmark(uri)

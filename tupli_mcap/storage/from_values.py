@@ -1,4 +1,4 @@
-"""Episodes built by hand: spaces from values, and values in the form their spaces have."""
+"""Episodes made from values: infers spaces from the values, and fits the values to them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def infer_space(values: Sequence[Any], where: str = "value") -> gym.Space[Any]:
 
 
 def conform(value: Any, space: gym.Space[Any]) -> Any:
-    """The value as a sample of an inferred space looks, equal to what it was.
+    """An equal value with the types of an inferred space's samples.
 
     Raises:
         SpaceError: The value does not have the space's structure, or would be changed.
@@ -71,7 +71,7 @@ def conform(value: Any, space: gym.Space[Any]) -> Any:
 
 def _same_numbers(given: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
     if given.dtype.kind in "iu" and cast.dtype.kind == "f":
-        # NumPy would compare them as floats, where neighbours beyond 2**53 are one.
+        # NumPy would compare them as floats, which cannot tell neighbours beyond 2**53 apart.
         with np.errstate(invalid="ignore"):
             return np.array_equal(cast.astype(given.dtype), given)
     return np.array_equal(cast, given, equal_nan=True)
@@ -85,7 +85,7 @@ def episode_data(
 
     Raises:
         SpaceError: A value does not have the space's structure, or would be changed.
-        StorageError: The metadata holds something that has no JSON form.
+        StorageError: A value in the metadata has no JSON form.
     """
     states, actions, rewards = space
     tuples = episode.tuples
@@ -150,7 +150,7 @@ def _array_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
     arrays = [_array(value, where) for value in values]
     dtype = np.result_type(*{array.dtype for array in arrays})
     if dtype.kind == "f" and all(array.dtype.kind in "iu" and array.min(initial=0) >= 0 for array in arrays):
-        dtype = np.dtype(np.uint64)  # which NumPy does not take for signed and unsigned integers
+        dtype = np.dtype(np.uint64)  # NumPy would take float64 for signed and unsigned integers
     if dtype.kind not in _KINDS:
         raise SpaceError(f"{where}: expected numbers or flags of one kind, found {dtype}")
     shapes = {array.shape for array in arrays}

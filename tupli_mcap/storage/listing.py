@@ -1,5 +1,4 @@
-"""The recordings of files and directories, whether a storage or not: found, listed, and read by episodes; nothing is
-written."""
+"""Finds, lists and reads the recordings of files and directories, storages or not; nothing is written."""
 
 from __future__ import annotations
 
@@ -43,14 +42,14 @@ _PARTS = ("benchmarks", "artifacts", "recordings", "storage.json")
 
 
 def is_storage(root: Path) -> bool:
-    """Whether a directory has been used as a storage, and is not only one of recordings."""
+    """Whether a directory is a storage, and not only a directory with recordings."""
     return any((root / part).exists() for part in _PARTS)
 
 
 class RecordingStamp(NamedTuple):
-    """What a recording's file and its sidecar looked like when they were catalogued.
+    """Identifies the contents of a recording's file and its sidecar at the time of cataloguing.
 
-    size (bytes), mtime_ns: of the recording. mixed: a hash of what else tells both files from others.
+    `size` (bytes) and `mtime_ns` are those of the recording; `mixed` is a hash of other facts about both files.
     """
 
     size: int
@@ -59,7 +58,7 @@ class RecordingStamp(NamedTuple):
 
 
 LIVE = -1
-"""In place of `RecordingStamp.mixed` where somebody writes to the recording: the stamp must not be believed again."""
+"""In place of `RecordingStamp.mixed` while somebody writes to the recording: the entry must be read again."""
 
 
 class FoundRecording(NamedTuple):
@@ -71,13 +70,16 @@ class FoundRecording(NamedTuple):
 
 
 class ListedRecording(NamedTuple):
-    """A recording without its deleted episodes; `error` says why there is nothing else.
+    """Facts about a recording without its deleted episodes; `error` says why they are missing.
 
-    return_mean: over the episodes that are left, None if there are none; without the `return_nan` whose return is
-        NaN, and NaN itself where that is so of all. size: bytes of the file.
-    state: as `tupli_mcap.recording.description.state_of` says.
-    name, environment, started (ISO 8601 in UTC), split, tags, settings (its metadata): of its run.
-    success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if none do.
+    Attributes:
+        return_mean: over its episodes, None if there are none; it leaves out the `return_nan` episodes whose return is
+            NaN, and is NaN if there is no other.
+        size: of the file (bytes).
+        state: see `tupli_mcap.recording.description.state_of`.
+        name, environment, started (ISO 8601 in UTC), split, tags, settings (its metadata): of its run.
+        success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
+            none do.
     """
 
     path: str
@@ -101,7 +103,7 @@ class ListedRecording(NamedTuple):
 
 
 class Compactable(NamedTuple):
-    """A recording (its path below the storage) with how many deleted episodes, and its size (bytes)."""
+    """A recording (its path below the storage), its number of deleted episodes, and its size (bytes)."""
 
     recording: str
     deleted: int
@@ -109,10 +111,10 @@ class Compactable(NamedTuple):
 
 
 def scan(root: Path) -> Iterator[FoundRecording]:
-    """Every recording below a directory; what is hidden is passed over, and so are links to directories.
+    """Every recording below a directory; hidden files and links to directories are skipped.
 
     Raises:
-        FormatError: What is noted there about a deletion is damaged.
+        FormatError: `deleting.json` is damaged.
     """
     pending = [(os.fspath(root), "")]
     deleting = Deletion()
@@ -122,7 +124,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
             with os.scandir(directory) as entries:
                 by_name = {entry.name: entry for entry in entries if not entry.name.startswith(".")}
         except FileNotFoundError:
-            continue  # deleted since it was listed
+            continue  # deleted after it was listed
         if not prefix and DELETING in by_name:
             deleting = Deletion.read(root)
         for name, entry in by_name.items():
@@ -140,7 +142,7 @@ def scan(root: Path) -> Iterator[FoundRecording]:
 
 
 def stamp_of(root: Path, relative: str) -> RecordingStamp:
-    """The stamp of one recording below a directory; FileNotFoundError if it is gone."""
+    """The stamp of one recording below a directory; raises FileNotFoundError if it is gone."""
     deleting = Deletion.read(root).stamp(relative)
     path = root / relative
     status = path.stat()
@@ -154,13 +156,13 @@ def _stamp(
     entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]], deleting: Sequence[int]
 ) -> RecordingStamp:
     beside = found.get(f"{entry.name}.json")
-    # Not `beside.stat()`: what scandir knows of a file may be older than its name.
+    # Not `beside.stat()`: scandir's facts about a file may be older than its name.
     return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path), deleting)  # noqa: PTH116
 
 
 def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequence[int]) -> RecordingStamp:
-    # A clock ticks every few ms only, and archives set the times of their files: neither inodes nor times of change
-    # repeat where a file is replaced.
+    # Size and time may repeat when a file is replaced: clocks tick every few ms, and archives set the times of files.
+    # Its inode or its time of change does not.
     facts = [
         (found.st_ino, found.st_ctime_ns, found.st_size) for found in (status, beside) if found is not None
     ]
@@ -188,7 +190,7 @@ def list_recordings(
 ) -> Iterator[ListedRecording]:
     """The recordings of files and directories; one that cannot be read is listed with its error.
 
-    `choose` gives the positions of the episodes that count; recordings without any are left out.
+    `choose` returns the positions of the episodes that count; recordings without any are left out.
     """
     for path in paths:
         try:
@@ -206,7 +208,7 @@ def compactable(root: Path) -> list[Compactable]:
     """The recordings of a storage that `FileStorage.compact` would rewrite.
 
     Raises:
-        FormatError: a recording with deleted episodes is damaged, or what is noted beside it.
+        FormatError: a recording with deleted episodes, or its sidecar, is damaged.
     """
     compactables = []
     for item in sorted(scan(root)):
@@ -261,7 +263,7 @@ def with_tuples(
 ) -> Iterator[EpisodeItem]:
     """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
 
-    A tuple's values have the type of the space's own samples; the info is empty where none was recorded.
+    A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
     """
     for name, same in itertools.groupby(headers, key=lambda header: header.recording):
         group = list(same)
@@ -275,5 +277,5 @@ def with_tuples(
                     RLTuple.from_env_step(s.state, s.action, s.reward, s.terminal, s.timeout, s.info or {})
                     for s in episode
                 ]
-                # Both are valid already; validating each step again would cost more than reading it.
+                # Header and steps are valid already.
                 yield EpisodeItem.model_construct(**dict(header), tuples=tuples)

@@ -1,23 +1,24 @@
-"""Facts about a recording that are not in the recording: `<name>.mcap.json` beside it.
+"""Sidecars: `<name>.mcap.json` beside a recording notes its deleted and published episodes.
 
-Deleting an episode or publishing one must not rewrite gigabytes, nor touch a file that is being written.
+To delete or publish an episode must not rewrite gigabytes, nor touch a file that is being written.
 
-Episodes of several recordings are deleted as a whole:
+Episodes of several recordings are deleted together:
 
-1. `deleting.json` in the storage's directory is written, which names them all: from then on they are gone.
-2. They are noted in one sidecar after another.
+1. `deleting.json` in the storage's directory is written and names them all: from then on they are deleted.
+2. They are noted in one sidecar after the other.
 3. `deleting.json` is removed.
 
-Whoever finds one reads the sidecars as if they said it too; the next one who deletes or compacts goes on at 2.
+A reader that finds `deleting.json` treats its entries like notes in sidecars. The next process that deletes or compacts
+goes on at 2.
 
-Another recording may take the place of one (`mode="w"`), and has episodes of the same numbers. So:
+Another recording may replace one (`mode="w"`), with episodes of the same numbers. So:
 
-4. A sidecar, and each entry of `deleting.json`, names the UUID of the recording that it is about. Who appends to a
-   recording, or compacts it, keeps its UUID.
-5. What is about another recording than the one that is there does not count, and the next note takes its place.
-6. What names no recording (earlier versions wrote that) counts for one that was begun before it was written, as the
-   file's time tells: what is recorded in the place of another is begun after all notes about that. Written again, it
-   names the recording.
+4. A sidecar, and each entry of `deleting.json`, names the UUID of its recording. A recording that is appended to or
+   compacted keeps its UUID.
+5. A note about another recording than the one at the path does not count, and the next note replaces it. 6. A note
+without a UUID (from earlier versions) counts for a recording that was begun before the note was written, by the
+   file's time: a recording that replaces another one is begun after all notes about that one. When it is written again,
+   it gets the UUID.
 """
 
 from __future__ import annotations
@@ -41,8 +42,13 @@ RecordingUuid = Annotated[str, Field(pattern="^([0-9a-f]{32})?$")]
 
 
 class Sidecar(BaseModel):
-    """uuid: of the recording that this is about; empty if it names none. deleted: numbers of the episodes that are
-    gone. published_in: groups that see an episode, by its number."""
+    """The notes beside a recording.
+
+    Attributes:
+        uuid: of the recording; empty if the note names none.
+        deleted: numbers of deleted episodes.
+        published_in: by number of an episode, the groups that see it.
+    """
 
     version: Literal[1] = 1
     uuid: RecordingUuid = ""
@@ -52,7 +58,7 @@ class Sidecar(BaseModel):
 
     @classmethod
     def read(cls, recording: Path) -> Sidecar:
-        """What lies beside a recording, whichever it is about; an empty one if there is none.
+        """The sidecar at a recording's path, about any recording; an empty one if there is none.
 
         Raises:
             FormatError: The file is no sidecar.
@@ -67,13 +73,13 @@ class Sidecar(BaseModel):
         return found
 
     def is_about(self, metadata: Mapping[str, str]) -> bool:
-        """Whether it counts for the recording that has these metadata."""
+        """Whether it counts for the recording with these metadata."""
         if self.uuid:
             return self.uuid == metadata.get("uuid")
         return int(metadata.get("created_ns", "0")) <= self._written_ns
 
     def is_empty(self) -> bool:
-        """Whether it says nothing."""
+        """Whether it has no notes."""
         return not (self.deleted or self.published_in)
 
     def write(self, recording: Path) -> None:
@@ -87,8 +93,8 @@ class Sidecar(BaseModel):
 
 
 class Deletion(BaseModel):
-    """A deletion that is being done: numbers of the episodes that are gone, by recording (path below the root), and the
-    UUIDs of these recordings."""
+    """A deletion that is going on: numbers of the deleted episodes, by recording (path below the root), and the UUIDs
+    of these recordings."""
 
     version: Literal[1] = 1
     deleted: dict[str, set[EpisodeNumber]] = Field(default_factory=dict)
@@ -97,7 +103,7 @@ class Deletion(BaseModel):
 
     @classmethod
     def read(cls, root: Path) -> Deletion:
-        """The deletion that a storage is in the middle of; an empty one if there is none.
+        """The deletion that is going on in a storage; an empty one if there is none.
 
         Raises:
             FormatError: The file is something else.
@@ -116,13 +122,13 @@ class Deletion(BaseModel):
         return found
 
     def of(self, relative: str) -> Sidecar:
-        """What it says of the recording at a path below the root, as a sidecar would."""
+        """The part about the recording at a path below the root, as a sidecar."""
         found = Sidecar(uuid=self.uuids.get(relative, ""), deleted=self.deleted.get(relative, set()))
         found._written_ns = self._written_ns
         return found
 
     def stamp(self, relative: str) -> tuple[int, ...]:
-        """Numbers that change with what is noted about a recording. (Hashes of texts differ between processes.)"""
+        """Numbers that change with the notes about a recording; not a hash of text, which differs between processes."""
         numbers = self.deleted.get(relative)
         return () if numbers is None else (int(self.uuids.get(relative) or "0", 16), *sorted(numbers))
 
@@ -141,9 +147,9 @@ class Deletion(BaseModel):
 
 
 class Notes(NamedTuple):
-    """What is noted at a recording's path, whichever recording it is about.
+    """The notes at a recording's path, about any recording.
 
-    It is read before the recording is opened: what was deleted may be taken out of both meanwhile.
+    Read them before the recording is opened: compacting removes deleted episodes from both.
     """
 
     deleting: Sidecar
@@ -168,7 +174,7 @@ class Notes(NamedTuple):
         return self.deleting.deleted | self.beside.deleted
 
     def about(self, metadata: Mapping[str, str]) -> Sidecar:
-        """What counts for the recording that has these metadata."""
+        """The notes that count for the recording with these metadata."""
         found = Sidecar(uuid=metadata.get("uuid", ""))
         for said in self:
             if said.is_about(metadata):
@@ -178,7 +184,7 @@ class Notes(NamedTuple):
 
 
 def _content(path: Path) -> tuple[bytes | None, int]:
-    """What is in a file and when that was written (ns); None if there is none."""
+    """The content of a file (None if there is none) and the time when it was written (ns)."""
     with os_errors("cannot read", path):
         try:
             with path.open("rb") as file:
@@ -188,11 +194,11 @@ def _content(path: Path) -> tuple[bytes | None, int]:
 
 
 def storage_of(recording: Path) -> Path:
-    """The directory of the storage that a recording seems to be in: it lies there, or below `recordings/<id>`."""
+    """The directory of the storage that a recording seems to be in: its own directory, or that of `recordings/<id>`."""
     above = recording.parent.parent
     return above.parent if above.name == "recordings" else recording.parent
 
 
 def sidecar_path(recording: Path) -> Path:
-    """Where the sidecar of a recording lies."""
+    """The path of a recording's sidecar."""
     return recording.with_name(recording.name + ".json")

@@ -1,4 +1,4 @@
-"""Texts in the files of a storage: ids, JSON, what is wrong in it, and names that every database can hold."""
+"""Texts in the files of a storage: ids, JSON, descriptions of defects, and names that every database can hold."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _SURROGATES_AT: Final = 0x100
 
 
 def is_hash(value: object) -> bool:
-    """Whether something is 64 lower-case hex digits: only such ids become file names."""
+    """Whether a value is 64 lower-case hex digits: only such ids become file names."""
     return isinstance(value, str) and len(value) == 64 and set(value) <= set("0123456789abcdef")
 
 
 def to_json(value: Mapping[str, Any]) -> bytes:
-    """JSON to be read by people too."""
+    """JSON that is indented, for people."""
     return json.dumps(value, indent=2, ensure_ascii=False).encode("utf-8")
 
 
 def first_defect(err: ValidationError) -> str:
-    """Where data is wrong, and what is."""
+    """The first defect of data: its place, and what is wrong."""
     first = err.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(str(part) for part in first['loc']) or 'the whole'}: {first['msg']}"
 

@@ -1,4 +1,4 @@
-"""Verifying many files: recordings of directories, and of a storage what else it holds. Nothing is written."""
+"""Verifies many files: recordings of directories, and the other files of a storage. Nothing is written."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ _PIECE = 1 << 20
 
 @dataclass
 class StorageReport:
-    """What was verified: a report for each recording, and one (kind "storage") for each storage's other files."""
+    """The result of verifying: a report for each recording, and one (kind "storage") for each storage's other files."""
 
     files: list[VerifyReport] = field(default_factory=list)
 
     @property
     def damaged(self) -> list[VerifyReport]:
-        """The reports of what is damaged."""
+        """The reports with damage."""
         return [report for report in self.files if not report.ok]
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is damaged."""
+        """Whether there is no damage."""
         return not self.damaged
 
     def to_json(self) -> dict[str, Any]:
-        """The report as JSON has it."""
+        """The report as a JSON value."""
         return {
             "ok": self.ok,
             "files": len(self.files),
@@ -64,10 +64,9 @@ def verify_storage(storage: FileStorage | Path) -> StorageReport:
 
 
 def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
-    """Verifies files and directories, one after another; a bad one stops nothing. A URL is copied to a temporary file.
+    """Verifies files and directories, one after the other, also after damage. A URL is copied to a temporary file.
 
-    A path that does not exist is a report with a problem. What killed processes have left beside the files is
-    reported last.
+    A path that does not exist gives a report with a problem. Files that killed processes left are reported last.
     """
     beside: dict[Path, None] = {}
     for given in paths:
@@ -100,7 +99,7 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
 
 
 def _at_url(url: str) -> VerifyReport:
-    """The report on a file on a server, as of the copy that is verified."""
+    """The report on a file on a server, from a copy."""
     try:
         with copied(url) as path:
             report = _recording(path)
@@ -119,7 +118,7 @@ def _recording(path: Path) -> VerifyReport:
         findings = Findings(report)
         if report.kind == "recording" and report.ok:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of the journal: the report says it
+                warnings.simplefilter("ignore", UserWarning)  # about the journal, which the report covers
                 _sidecar(path, findings)
                 _benchmark(path, findings)
     except (TupliError, OSError) as err:
@@ -131,7 +130,7 @@ def _recording(path: Path) -> VerifyReport:
 
 
 def _sidecar(path: Path, findings: Findings) -> None:
-    """What is noted beside a recording is about it, and about episodes it has."""
+    """Checks that the notes beside a recording are about it, and about episodes it has."""
     try:
         notes = Notes.read(path)
     except TupliError as err:
@@ -156,7 +155,7 @@ def _sidecar(path: Path, findings: Findings) -> None:
 
 
 def _benchmark(path: Path, findings: Findings) -> None:
-    """The id of a benchmark that a recording carries is the hash of its contents."""
+    """Checks that the id of a carried benchmark is the hash of its contents."""
     if any(problem.kind == "benchmark" for problem in findings.report.problems):
         return  # said already
     with Recording(path) as recording:
@@ -170,11 +169,11 @@ def _benchmark(path: Path, findings: Findings) -> None:
             findings.error("benchmark", str(err).removeprefix(f"{path}: "))
 
 
-# ---- what else is in a directory
+# ---- the other files of a directory
 
 
 def _directory(root: Path) -> Iterator[VerifyReport]:
-    """A report on the files beside the recordings, if there are any to speak of."""
+    """A report on the files beside the recordings, if there are any."""
     report = VerifyReport(str(root), kind="storage")
     findings = Findings(report)
     is_whole = is_storage(root)
@@ -207,7 +206,7 @@ def _guarded(check: Callable[[Path, Findings], None], root: Path, findings: Find
 
 
 def _leftovers(root: Path, findings: Findings) -> None:
-    """Files that belong to nothing: of processes that were killed, or of recordings that are gone."""
+    """Reports files of killed processes, and those of recordings that are gone."""
     for path in files.left_below(root):
         _left(str(path.relative_to(root)), findings)
     for path in sorted(root.rglob("*")):
@@ -221,7 +220,7 @@ def _leftovers(root: Path, findings: Findings) -> None:
             _finished_journal(path, relative, findings)
         elif relative == DELETING:
             advice = "nothing to be done: the episodes are gone; the next deletion finishes it, or tupli-mcap compact"
-            findings.note("leftover", f"{relative} is of a deletion that was broken off", advice)
+            findings.note("leftover", f"{relative} is of a deletion that was interrupted", advice)
         elif name.endswith(".mcap.json") and not path.with_name(name.removesuffix(".json")).exists():
             findings.note("leftover", f"{relative} is about a recording that is not here", "delete it")
 
@@ -240,7 +239,7 @@ def _finished_journal(path: Path, relative: str, findings: Findings) -> None:
 
 
 def _artifacts(root: Path, findings: Findings) -> None:
-    """Bytes by their SHA-256, and what is known of them."""
+    """Checks artifacts: bytes against their SHA-256, and their metadata."""
     directory = root / "artifacts"
     if not directory.is_dir():
         return
@@ -274,7 +273,7 @@ def _digest(path: Path) -> str:
 
 
 def _benchmarks(root: Path, findings: Findings) -> None:
-    """Benchmarks by the hash of their contents, and their artifacts."""
+    """Checks benchmarks against the hash of their contents, and that their artifacts are there."""
     directory = root / "benchmarks"
     if not directory.is_dir():
         return

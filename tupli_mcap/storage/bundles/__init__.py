@@ -1,8 +1,8 @@
-"""Bundles: one recording that carries its benchmark and all artifacts, so that nothing else is needed.
+"""Bundles: a recording that carries its benchmark and all artifacts, so that nothing else is needed.
 
-write      a benchmark or a recording as a bundle; episodes of a storage as one file
-read       a bundle into a storage, and what that would bring
-carried    the benchmark, artifacts and signature that a file carries, checked
+write      writes a benchmark or a recording as a bundle; episodes of a storage as one file
+read       imports a bundle into a storage, and previews that
+carried    checks the benchmark, artifacts and signature that a file carries
 """
 
 from tupli_mcap.storage.bundles.carried import carried_artifacts, carried_benchmark, checked_signature

@@ -1,4 +1,4 @@
-"""What a recording carries besides its episodes, checked: its benchmark, the artifacts of it, and who signed it."""
+"""Checks what a recording carries besides its episodes: its benchmark, the benchmark's artifacts, the signature."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ __all__ = ["carried_artifacts", "carried_benchmark", "carried_environment", "che
 
 
 def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
-    """The environment that a recording carries. StorageError if there is none, FormatError if it is damaged."""
+    """The environment that a recording carries; raises StorageError if there is none, FormatError if it is damaged."""
     if DOCUMENT_NAME not in recording.attachments:
         raise StorageError(
-            f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so there is no benchmark of it; it is whole as "
-            "it is: copy it into the storage's directory, where its episodes are found"
+            f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so it has no benchmark to import; "
+            "copy it into the storage's directory, where its episodes are found"
         )
     pickle = recording.read_attachment(PICKLE_NAME) if PICKLE_NAME in recording.attachments else None
     return EnvironmentRecord.from_json(
@@ -57,7 +57,7 @@ def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
 def carried_benchmark(
     recording: Recording, path: Path
 ) -> tuple[EnvironmentRecord, BenchmarkHeader, BenchmarkQuery]:
-    """The benchmark that a recording carries. StorageError if there is none, FormatError if it is not what it says."""
+    """The benchmark that a recording carries; raises StorageError if there is none, FormatError if its id is wrong."""
     record = carried_environment(recording, path)
     header = _header(record, path)
     query = BenchmarkQuery(
@@ -85,7 +85,7 @@ def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
 def carried_artifacts(
     recording: Recording, record: EnvironmentRecord, path: Path, storage: TupliStorage | None = None
 ) -> list[tuple[bytes, ArtifactMetadata]]:
-    """The artifacts that a recording carries, checked. StorageError if it lacks one that the storage has not either."""
+    """The artifacts that a recording carries, checked; raises StorageError if recording and storage both lack one."""
     said = (record.benchmark or {}).get("artifact_metadata")
     facts = said if isinstance(said, dict) else {}
     artifacts = []
@@ -105,10 +105,10 @@ def carried_artifacts(
 
 
 def checked_signature(recording: Recording, required: bool, signers: Sequence[str] = ()) -> Signature | None:
-    """The signature of a recording that is to be imported, checked; None if nobody asks or it has none.
+    """The checked signature of a recording to import; None if it has none, or if its signature does not fit.
 
     Raises:
-        SignatureError: One is required, and missing, not fitting, or of another key.
+        SignatureError: One is required, and is missing, does not fit, or is of another key.
     """
     if not required:
         known = _trust.trusted_keys() and SIGNATURE_NAME in recording.attachments

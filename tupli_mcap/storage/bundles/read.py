@@ -1,4 +1,4 @@
-"""Takes what a file carries into a storage: its benchmark, the artifacts, and the episodes that are not there yet."""
+"""Imports a file into a storage: its benchmark, the artifacts, and the episodes that the storage lacks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PIECE = 1 << 22
 
 
 class ImportPreview(NamedTuple):
-    """What a file holds, and how much of it a storage does not have yet."""
+    """The contents of a file, and how much of it a storage lacks."""
 
     benchmark_id: str
     name: str
@@ -49,7 +49,7 @@ def read_bundle(
     require_signature: bool = False,
     signers: Sequence[str] = (),
 ) -> str:
-    """Take a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
+    """Import a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
     needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
@@ -92,7 +92,7 @@ def read_bundle(
 def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
     """What `read_bundle` would do; checks the whole file but its steps, and writes nothing. Raises as that does.
 
-    storage: None stands for an empty one.
+    `storage` None stands for an empty one.
     """
     with Recording(path) as recording:
         record, header, _ = carried_benchmark(recording, path)
@@ -110,10 +110,10 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
 
 
 def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
-    """Numbers of the episodes that the storage does not hold yet.
+    """Numbers of the episodes that the storage lacks.
 
     Raises:
-        StorageError: It holds others under their names.
+        StorageError: It holds other episodes with the same ids.
     """
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
@@ -155,8 +155,8 @@ def _copy(
 ) -> None:
     """Copy the episodes that the storage does not hold yet.
 
-    The file may be changed by others at any time. So what counts is a copy that nobody else can write to: `check` is
-    made on it, and what it holds goes into the storage.
+    Others may change the file at any time. So it is copied to where nobody else can write: `check` is called with the
+    copy, and the copy goes into the storage.
     """
     target = storage.new_recording_path(benchmark_id)
     try:

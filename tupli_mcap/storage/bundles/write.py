@@ -105,10 +105,12 @@ def bundle_recording(
 
     A recording that was made outside a storage gets a benchmark: its environment, under the name that it has.
 
-    sign: the key to sign it with; without it, a signature stays where nothing it covers changes.
-
-    storage: has what the recording lacks; None if it lacks nothing, as a bundle or a recording of a plain
-    environment does.
+    Args:
+        path: of the recording.
+        target: of the new file.
+        storage: has the parts that the recording lacks; None if it lacks none, like a bundle or a recording of an
+            environment that needs no artifacts.
+        sign: the key to sign it with; without it, a signature stays if nothing it covers changes.
 
     Raises:
         NotFoundError: The storage does not know the recording's benchmark.
@@ -145,7 +147,7 @@ def bundle_recording(
 
 
 def _own_benchmark(recording: Recording, path: Path) -> tuple[str, Attachments]:
-    """The id of a benchmark that is a recording's environment and nothing else, and what a file carries of it."""
+    """The id of a benchmark made of a recording's environment alone, and the attachments for it."""
     record = carried_environment(recording, path)
     spaces = {"observation_space": recording.observation_space, "action_space": recording.action_space}
     facts = {name: space_to_json(space) for name, space in spaces.items()}
@@ -222,13 +224,13 @@ def _write_episodes(
         )
     except StepError as err:
         raise StorageError(
-            f"the recordings of benchmark {benchmark_id} differ in what they hold, so that one file cannot "
-            f"take them all ({err}); use a filter on `recording`"
+            f"the recordings of benchmark {benchmark_id} differ, so that one file cannot hold them all ({err}); "
+            "use a filter on `recording`"
         ) from err
 
 
 def _carried(recording: Recording) -> Attachments:
-    """What a recording carries, without its signature, which is of its own episodes only."""
+    """The attachments of a recording without its signature, which covers its own episodes only."""
     return {
         name: (info.media_type, recording.read_attachment(name))
         for name, info in recording.attachments.items()

@@ -7,8 +7,8 @@ database, tables    the database, and what is in it
 place               where it lies, for this user alone
 entries             what it holds of a recording, read here or by other processes
 rows                episodes as rows
-filter_sql          filters as SQL that finds what may match; Python looks at that again
-metadata_sql        what SQL finds in metadata
-order               the order of episodes, and where a page goes on
-tallies             numbers of each recording, without its episodes
+filter_sql          turns filters into SQL that finds all candidates; Python checks them again
+metadata_sql        looks into metadata with SQL
+order               the order of episodes, and the condition for the next page
+tallies             sums over the episodes of each recording
 """

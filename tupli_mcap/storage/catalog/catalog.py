@@ -42,15 +42,14 @@ _T = TypeVar("_T")
 class Catalog:
     """The episodes of a storage's recordings, to be filtered without opening a file.
 
-    Safe to use from several threads and several processes at once; usable in a forked child. What SQLite
-    refuses is a StorageError.
+    Safe to use from several threads and several processes at once; usable in a forked child. Errors of SQLite
+    become StorageErrors.
     """
 
     def __init__(self, path: Path | None) -> None:
-        """Open or create the catalog at `path`; None is one in memory, gone when it is closed.
+        """Open or create the catalog at `path`; None makes one in memory, which is lost when it is closed.
 
-        A file that is no catalog, one of another version, or one that somebody else could write, is replaced by an
-        empty catalog.
+        An empty catalog replaces a file that is no catalog, is of another version, or that somebody else could write.
 
         Raises:
             StorageError: The file cannot be opened or written.
@@ -66,11 +65,11 @@ class Catalog:
 
     @property
     def identity(self) -> int:
-        """Tells the file of the last transaction from others that were at its path."""
+        """A number that identifies the file of the last transaction, among all that were at its path."""
         return self._database.identity
 
     def is_current(self) -> bool:
-        """Whether nobody has replaced or deleted the file of the last transaction."""
+        """Whether the file of the last transaction is still at its path."""
         return self._database.is_current()
 
     def alone(self) -> AbstractContextManager[None]:
@@ -96,7 +95,7 @@ class Catalog:
         self._database.replace()
 
     def recordings(self) -> dict[str, RecordingStamp]:
-        """The catalogued recordings: path relative to the storage, and what their files looked like."""
+        """The catalogued recordings: path relative to the storage -> stamp of the file."""
         columns = (RECORDING.c.path, *(RECORDING.c[name] for name in RecordingStamp._fields))
         with self._read() as connection:
             rows = connection.execute(select(*columns).order_by(RECORDING.c.path))
@@ -120,9 +119,9 @@ class Catalog:
         rows: Iterable[EpisodeRow],
         runs: str = "[{}]",
     ) -> None:
-        """Catalogue a recording, in place of what was known of it; all of it or nothing.
+        """Catalogue a recording in one transaction; it replaces its earlier entry.
 
-        `runs` is JSON: a list of those that its episodes are of. `rows` is consumed a chunk at a time while the catalog
+        `runs` is JSON: a list of its episodes' runs. `rows` is consumed a chunk at a time while the catalog
         is locked for other writers.
 
         Raises:
@@ -159,17 +158,17 @@ class Catalog:
             return list(queries.find_episodes(connection, filter, limit=limit, offset=offset))
 
     def count(self, filter: BaseFilter | None = None) -> int:
-        """How many episodes match a filter. Raises as `episodes` does."""
+        """The number of episodes that match a filter. Raises as `episodes` does."""
         with self._read() as connection:
             return queries.count_episodes(connection, filter)
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
-        """What a question, such as those of `queries`, finds in one transaction."""
+        """The result of a function of a connection, such as those of `queries`, called in one transaction."""
         with self._read() as connection:
             return question(connection)
 
     def explain(self, filter: BaseFilter | None) -> str:
-        """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python looks at what that finds."""
+        """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python checks the result again."""
         with self._read() as connection:
             return queries.plan_of(connection, filter)
 

@@ -23,7 +23,9 @@ from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
 
 _BUSY_MS: Final = 30_000
 _ATTEMPTS: Final = 100  # to open a file that others replace
-_CACHE_KIB: Final = 32 * 1024  # rows come in no order of a declared key: its index has to stay in memory
+_CACHE_KIB: Final = (
+    32 * 1024
+)  # the index of a declared key has to stay in memory: rows do not come in its order
 _UNUSABLE: Final = (
     sqlite3.SQLITE_FULL,
     sqlite3.SQLITE_IOERR,
@@ -43,17 +45,17 @@ class CatalogDamagedError(StorageError):
 
 
 class CatalogMovedError(StorageError):
-    """The catalog's file was deleted or replaced during a transaction: the next one is on the new file."""
+    """The catalog's file was deleted or replaced during a transaction; the next one uses the new file."""
 
 
 class CatalogUnusableError(StorageError):
-    """SQLite or the system does not let the catalog be used: the disk is full, the file stays locked, ..."""
+    """SQLite or the system refuses to use the catalog: the disk is full, the file stays locked, ..."""
 
 
 class Database:
     """Connections to one file, for several threads and processes, and for forked children.
 
-    The file may be replaced or deleted while it is open: the next transaction is on the new one.
+    The file may be replaced or deleted while it is open: the next transaction uses the new one.
     """
 
     def __init__(self, path: Path) -> None:
@@ -64,7 +66,7 @@ class Database:
         self._process = os.getpid()
         self._inherited: list[Pool] = []  # a parent's connections, which a child must not even close
         self._identity: tuple[int, int] | None = None
-        self._opened = 0  # how many files have been
+        self._opened = 0  # number of files opened so far
         self._closed = False
 
     def open(self) -> None:
@@ -89,7 +91,7 @@ class Database:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep out the other threads and processes that would bring the catalog up to date; reentrant in a thread.
+        """Locks out other threads and processes that update the catalog; reentrant in a thread.
 
         Raises:
             CatalogUnusableError: The lock cannot be taken.
@@ -127,7 +129,7 @@ class Database:
     @property
     def identity(self) -> int:
         """Tells the file of the last transaction from others that were at its path."""
-        return self._opened  # not its number, which a new file may be given when nobody has the old one open
+        return self._opened  # not the inode: a new file may get that of one that nobody has open
 
     def is_current(self) -> bool:
         """Whether the file of the last transaction still is the one at its path."""
@@ -146,17 +148,17 @@ class Database:
         """In a forked child: SQLite forbids to carry a connection over a fork, and to close it in the child."""
         if self._process != os.getpid():
             self._process = os.getpid()
-            self._lock = threading.Lock()  # held by a thread that is not here, perhaps
+            self._lock = threading.Lock()  # a thread of the parent may hold the old one
             self._inherited.append(self._engine.pool)
             self._engine.dispose(close=False)
-            self._identity = None  # nothing keeps the file's number from being given again
+            self._identity = None  # the child has no file open, so the inode may be used again
 
     def _open(self) -> None:
         make_private(self.path.parent)
         for _ in range(_ATTEMPTS):
             if not _is_catalog(self._engine, self.path):
                 self._make()
-            # The number of a file may be given again once nobody has it open: a connection of ours stays in the pool.
+            # An inode may be used again once nobody has its file open: one of our connections stays in the pool.
             identity = _identity(self.path)
             try:
                 with self._engine.connect():
@@ -185,7 +187,7 @@ class Database:
                 self._create()
 
     def _create(self) -> None:
-        """Make an empty catalog beside the file and rename it: nobody ever opens half of one."""
+        """Make an empty catalog beside the file and rename it, so that nobody opens an incomplete one."""
         self._engine.dispose()
         new = self.path.with_name(f"{self.path.name}.new")
         _remove(new)
@@ -208,7 +210,7 @@ class Database:
 
 
 class MemoryDatabase:
-    """The same in the memory of this process: one connection, which threads use one after another."""
+    """A database in the memory of this process: one connection, which threads use one after the other."""
 
     path = None
 
@@ -224,7 +226,7 @@ class MemoryDatabase:
         self._closed = False
 
     def open(self) -> None:
-        """Nothing is to be opened before the first transaction."""
+        """Does nothing: the first transaction opens it."""
 
     def close(self) -> None:
         """Forget everything; closing twice is fine."""
@@ -264,17 +266,17 @@ class MemoryDatabase:
 
     @property
     def identity(self) -> int:
-        """Tells the database of the last transaction from those before it."""
+        """A number that identifies the database of the last transaction, among those before it."""
         return self._opened
 
     def is_current(self) -> bool:
-        """Whether the database of the last transaction still is the one."""
+        """Whether the database of the last transaction is still in use."""
         return self._is_made and self._process == os.getpid()
 
     def _leave_parent(self) -> None:
         if self._process != os.getpid():
             self._process = os.getpid()
-            self._turn = threading.RLock()  # held by a thread that is not here, perhaps
+            self._turn = threading.RLock()  # a thread of the parent may hold the old one
             self._inherited.append(self._engine.pool)
             self._engine.dispose(close=False)
             self._is_made = False
@@ -291,7 +293,7 @@ def _engine(path: Path, *, lock: Path | None = None) -> Engine:
         with contextlib.nullcontext() if lock is None else _shared(lock):
             connection: Any = dialect.connect(*args, **kwargs)
             try:
-                # Opens what SQLite keeps beside the file, by name: it would take a new file's for that of the old.
+                # Opens SQLite's files beside this one, by name: later it might find those of a new file instead.
                 connection.execute("PRAGMA schema_version").fetchone()
             except BaseException:
                 connection.close()
@@ -302,7 +304,7 @@ def _engine(path: Path, *, lock: Path | None = None) -> Engine:
 
 
 def _prepared(engine: Engine) -> Engine:
-    """An engine whose connections have our settings and functions."""
+    """An engine whose connections have the settings and functions of catalogs."""
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
@@ -313,7 +315,7 @@ def _prepared(engine: Engine) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
-        # A transaction that writes takes the lock at once: one that has read before cannot wait for it.
+        # A transaction that writes takes the lock at once: SQLite lets none wait for it that has read before.
         write = connection.get_execution_options().get("tupli_write")
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
@@ -323,7 +325,7 @@ def _prepared(engine: Engine) -> Engine:
 def _is_catalog(engine: Engine, path: Path) -> bool:
     """Whether the file is a catalog of this version and nothing else; False too if it is missing.
 
-    A file is opened only if nobody else can write it, and never with a rollback journal: ours have none.
+    A file is opened only if nobody else can write it, and never with a rollback journal, which catalogs have not.
     """
     if not _is_ours(path):
         return False
@@ -367,7 +369,7 @@ def _create_tables(connection: Connection) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Delete a database and what SQLite keeps beside it (which would be taken for the next one's)."""
+    """Delete a database and SQLite's files beside it, which would be taken for those of the next one."""
     for suffix in ("", "-wal", "-shm", "-journal"):  # the file first: nobody may open it without the others
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
@@ -386,7 +388,7 @@ def _lock_file(path: Path) -> Path:
 
 @contextlib.contextmanager
 def _exclusive(path: Path) -> Iterator[None]:
-    """Hold the lock of those who create or replace the file."""
+    """Hold the lock for creating or replacing the file."""
     fd = locked(_lock_file(path))
     try:
         yield
@@ -406,7 +408,7 @@ def _shared(lock: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _usable(path: Path) -> Iterator[None]:
-    """Errors of the system, where the file is opened, as the one after which another file is taken."""
+    """Turns errors of the system on opening the file into the one after which another file is taken."""
     try:
         yield
     except OSError as err:
@@ -415,7 +417,7 @@ def _usable(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _translated(path: Path | None) -> Iterator[None]:
-    """Errors of SQLite and the system as those of this package."""
+    """Turns errors of SQLite and the system into those of this package."""
     named = "the catalog in memory" if path is None else f"catalog {str(path)!r}"
     try:
         yield

@@ -1,8 +1,8 @@
-"""What the catalog holds of a recording, read from its index and what is noted beside it; by several processes where
-there are many recordings to read.
+"""Reads the catalog's entry of a recording from its index and the notes beside it; with several processes if there are
+many recordings.
 
-Such a process must not run the caller's script again, as those of `multiprocessing` do; it ends with the process that
-started it, and leaves Ctrl-C to that one. A recording that it fails to read is read here.
+Such a process must not run the caller's script again, as those of `multiprocessing` do. It ends with the process that
+started it, and leaves Ctrl-C to that one. A recording that it fails to read is read in this process.
 """
 
 from __future__ import annotations
@@ -34,17 +34,20 @@ from tupli_mcap.storage.sidecar import Notes, Sidecar
 
 __all__ = ["Entry", "entry_of", "read_ahead", "rows_of", "runs_of"]
 
-_MOST_EPISODES = 50_000  # of a recording that another process reads: its rows are in memory twice
-_TRIAL = 1.0  # seconds of reading here before it is known whether more processes are worth their start
-_WORTH = 3.0  # seconds that must be left then
+_MOST_EPISODES = 50_000  # of a recording that another process reads, since its rows are in memory twice
+_TRIAL = 1.0  # seconds of reading in this process, to estimate whether more processes pay
+_WORTH = 3.0  # estimated seconds that must be left for them
 _MOST_WORKERS = 8
 
 
 class Entry(NamedTuple):
     """A recording to catalogue.
 
-    stamp: taken before it was read. live: somebody writes to it. runs: JSON of a list. numbers: of all
-    its episodes, deleted ones too.
+    Attributes:
+        stamp: of the file, taken before it was read.
+        live: somebody writes to it.
+        runs: JSON of a list.
+        numbers: of all its episodes, deleted ones too.
     """
 
     stamp: RecordingStamp
@@ -66,21 +69,21 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
     path = root / relative
     stamp, notes, live = stamp_of(root, relative), Notes.read(path, root), is_locked(path)
     with Recording(path) as recording:
-        live |= is_locked(path)  # a writer may have come or gone meanwhile
+        live |= is_locked(path)  # again, since a writer may have begun or ended in the meantime
         numbers = recording.index["episode"].tolist()
         rows = rows_of(recording, notes.about(recording.metadata), live=live)
         yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
 
 
 def runs_of(recording: Recording) -> str:
-    """JSON: a list of the runs that a recording's episodes are of."""
+    """JSON: a list of the runs of a recording's episodes."""
     known = {id(run): run for run in recording.listed_runs()}
     return jsonvalue.dumps(list(known.values()))
 
 
 def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
-    """An entry for each recording that other processes read, once starting them is worth it; None for each that the
-    caller has to read."""
+    """An entry for each recording that another process has read; None for each that the caller has to read, as long as
+    more processes do not pay."""
     begun, workers = time.monotonic(), min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
     if workers == 1 or multiprocessing.current_process().daemon:  # which may start none
         workers = 0
@@ -175,7 +178,7 @@ def rows_of(
 
 
 def _places(recording: Recording) -> list[int]:
-    """The place of each episode's run among the different ones, in their order."""
+    """The index of each episode's run among the recording's runs."""
     places: dict[int, int] = {}
     return [places.setdefault(id(run), len(places)) for run in recording.listed_runs()]
 

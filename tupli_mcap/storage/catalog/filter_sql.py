@@ -1,11 +1,11 @@
-"""Filters as SQL: which rows may match, by the columns and indexes that there are.
+"""Turns filters into SQL that finds all rows which may match, with the columns and indexes there are.
 
-SQL answers coarsely where a database sees values otherwise than Python: numbers of metadata are compared as the nearest
-floats, texts that SQL and Python may order differently not at all. Each comparison thus is a condition that is true of
-all rows that match, and says whether it is exact, true of no others. What is found by a condition that is not exact is
-asked again in Python (`tupli_mcap.schema.predicate`), so that a filter means the same everywhere.
+A database may compare values differently from Python: numbers in metadata are compared as the nearest floats, texts
+that SQL and Python may order differently are not compared. So each comparison becomes a condition that is true for
+all matching rows, and that says whether it is exact: true for no others. Python checks the rows that an inexact
+condition finds again (`tupli_mcap.schema.predicate`), so that a filter means the same everywhere.
 
-All of it is SQL of any database, but for what looks into metadata where no key was declared: `metadata_sql`.
+Everything is SQL of any database, but looking into metadata without a declared key is not: see `metadata_sql`.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ Condition = ColumnElement[bool]
 Source = Select[Any] | CompoundSelect[Any]
 """A query of ids of episodes."""
 
-# A statement has so many comparisons with so many values each at most: databases have limits of both.
+# Most comparisons in a statement, and most values in each: databases limit both.
 _MOST_COMPARISONS: Final = 64
 _MOST_VALUES: Final = 250
 
@@ -115,7 +115,7 @@ _CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
 
 
 class Narrowed(NamedTuple):
-    """A condition that is true of all rows a filter is true of; `exact`: and of no others."""
+    """A condition that is true for all rows that match a filter; if `exact`, for no others."""
 
     condition: Condition
     exact: bool
@@ -127,7 +127,7 @@ _ALL: Final = Narrowed(true(), exact=False)
 def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
     """The condition on rows of `EPISODE` joined with `RECORDING` of a filter that is `bound` to episode headers.
 
-    indexed: the paths of declared keys that `VALUE` holds, and their numbers there.
+    `indexed` has the paths of declared keys that `VALUE` holds, and their numbers there.
     """
     parts = list(filter.filters) if filter.type is FilterType.AND else [filter]
     kept, room = [], _MOST_COMPARISONS
@@ -213,7 +213,7 @@ def _leaves(filter: BaseFilter) -> Iterator[BaseFilter]:
 
 
 def merged(filter: BaseFilter) -> BaseFilter:
-    """The same filter, where parts of an OR that ask one key for one value each are one IN."""
+    """The same filter; parts of an OR that compare one key with one value each become one IN."""
     if filter.type not in COMBINING:
         return filter
     parts = [merged(part) for part in filter.filters]
@@ -239,7 +239,7 @@ def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], negated:
 
 
 def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
-    """Where all filters are true; what asks `VALUE` for one key is asked together."""
+    """The condition that all filters are true; comparisons of one key in `VALUE` are joined."""
     parts: list[Narrowed] = []
     values: dict[int, list[list[Condition]]] = {}
     few = not negated and any(_names_few(part) for part in filters)
@@ -263,7 +263,7 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
 
 
 def _names_few(filter: BaseFilter) -> bool:
-    """Whether a filter names episodes or recordings: looking at each is quicker than finding others by a value."""
+    """Whether a filter names episodes or recordings: checking each is quicker than finding others by a value."""
     is_equal = filter.type in (FilterType.EQ, FilterType.IN)
     return is_equal and path_of(filter)[0] in ("id", "recording")
 
@@ -299,14 +299,14 @@ def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
 
 
 def _occurs(wanted: str, column: ColumnElement[Any]) -> Condition:
-    """Where a text occurs in those of a column, as far as SQL can tell; `lower` knows A to Z at least."""
+    """The condition that a text occurs in a column, as far as SQL can tell; `lower` handles at least A to Z."""
     if not wanted.isprintable() or len(wanted) > _LONGEST_PATTERN:
         return column.is_not(None)
     return func.lower(column).contains(small_letters(wanted), autoescape=True)
 
 
 def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
-    """A comparison of 64-bit integers with a number of any size; only in order may that have a fraction."""
+    """A comparison of 64-bit integers with a number of any size; it may have a fraction only if it is an order."""
     if filter.type is FilterType.IN:
         return _one_of(column, [int(v) for v in filter.value if _LEAST_INTEGER <= v <= _MOST_INTEGER])
     kind, wanted = filter.type, filter.value
@@ -382,7 +382,7 @@ def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[An
 
 
 def _in_metadata(filter: BaseFilter) -> Condition:
-    """A comparison, other than NE, with what SQL finds in metadata."""
+    """A comparison, other than NE, with a value that SQL finds in metadata."""
     path = path_of(filter)[1:]
     wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
     texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
@@ -423,7 +423,7 @@ def _number_in_metadata(kind: FilterType, value: ColumnElement[Any], near: float
 
 
 def _of_groups(filter: BaseFilter) -> Narrowed:
-    """A comparison with groups, of which the column has a list in JSON."""
+    """A comparison with groups; the column has a list of them in JSON."""
     if filter.type not in (FilterType.EQ, FilterType.IN):
         return _ALL
     groups = filter.value if filter.type is FilterType.IN else [filter.value]
@@ -452,7 +452,7 @@ def _of_ids(filter: BaseFilter) -> Narrowed:
 
 
 def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:
-    """Where a column holds one of the values; of many values, anything between them."""
+    """The condition that a column holds one of the values; for many values, anything between them."""
     if len(values) <= _MOST_VALUES:
         return column.in_(values) if values else false()
     return column.between(min(values), max(values))

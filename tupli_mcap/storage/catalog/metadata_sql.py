@@ -1,7 +1,7 @@
-"""What SQL finds at a path of metadata, where no key was declared: in SQLite as its JSON functions give it, in
-PostgreSQL as `jsonb`.
+"""Finds values at a path of metadata, without a declared key: in SQLite with its JSON functions, in PostgreSQL as
+`jsonb`.
 
-Only metadata that are `readable` are looked into: of others, PostgreSQL makes an error.
+Use it only on metadata that are `readable`: PostgreSQL raises an error for others.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class _At(FunctionElement[Any]):
 
 
 class value_at(_At):  # noqa: N801 - it is used as a function
-    """The value, to be compared with a text, a number or a flag; NULL if there is none.
+    """The value, to compare with a text, a number or a flag; NULL if there is none.
 
-    A comparison may also be true of values of another kind: the databases order them each in their own way.
+    A comparison may also be true for values of another kind, which each database orders differently.
     """
 
     type = _Scalar()

@@ -1,4 +1,4 @@
-"""The order of episodes: by a fact or a value of their metadata, and where a page of them goes on."""
+"""The order of episodes, by a field or a value of their metadata, and the condition for the next page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _OF_RECORDING: Final = {"recording": RECORDING.c.path, "benchmark_id": RECORDING
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 
 
-_BY_RECORDING: Final = 2  # values decide: its path and the number of the episode
+_BY_RECORDING: Final = 2  # number of values for the order by recording: path, number of the episode
 
 
 class After(NamedTuple):
@@ -36,10 +36,10 @@ class After(NamedTuple):
 
 
 class Sort(NamedTuple):
-    """What episodes are put in the order of: a key as filters name it, such as `return` or `metadata.score`.
+    """A key to sort episodes by, as filters name it, such as `return` or `metadata.score`.
 
-    Numbers come before texts, and what has neither comes last, also where the order falls; so do metadata that SQL
-    cannot look into. Episodes with the same value follow each other by recording (path) and number.
+    Numbers come before texts; episodes with neither come last, in a falling order too, as do metadata that SQL cannot
+    look into. Episodes with equal values are ordered by recording (path) and number.
     """
 
     key: str
@@ -52,7 +52,7 @@ class Sort(NamedTuple):
 
 
 class Place(NamedTuple):
-    """One of the values that decide on the place of an episode; none is NULL."""
+    """One of the values that decide the place of an episode; none is NULL."""
 
     value: ColumnElement[Any]
     descending: bool
@@ -79,10 +79,10 @@ def places(
 
 
 def beyond(connection: Connection, order: Sequence[Place], after: After) -> ColumnElement[bool]:
-    """What comes after an episode, which need not be there any more where it is put in order by its recording alone.
+    """The condition for episodes after a given one. If they are ordered by recording alone, that one may be deleted.
 
     Raises:
-        NotFoundError: it is not there any more.
+        NotFoundError: it was deleted, and the order depends on its values.
     """
     reached: Sequence[Any] | None
     if len(order) == _BY_RECORDING:

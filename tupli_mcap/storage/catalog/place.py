@@ -1,7 +1,7 @@
-"""Where the catalog of a storage lies: in a directory of this user's, never in the storage.
+"""The path of a storage's catalog: in a directory of this user, never in the storage.
 
-A storage may have been written by somebody else, and opening a database runs what its file and the files beside it say.
-So a catalog is opened only where nobody else can write: `<cache>/catalogs/<storage>/`, where `<cache>` is
+Somebody else may have written the storage, and a database file and the files beside it can make SQLite run code. So a
+catalog is opened only where nobody else can write: `<cache>/catalogs/<storage>/`, where `<cache>` is
 `$TUPLI_MCAP_CACHE_DIR`, else the platform's user cache directory, and `<storage>` is a hash of the storage's real path,
 device and inode. All of it may be deleted at any time.
 """
@@ -30,7 +30,7 @@ _REMOTE: Final = re.compile(
     r"|fuse\.(?!fuse-overlayfs$).*"
 )
 _OCTAL: Final = re.compile(r"\\([0-7]{3})")
-_FORGOTTEN: Final = 90 * 86_400  # seconds after which the catalog of a storage that nobody opened goes
+_FORGOTTEN: Final = 90 * 86_400  # seconds after which a catalog that nobody opened is deleted
 
 
 def cache_dir() -> Path:
@@ -44,7 +44,7 @@ def catalog_path(root: Path) -> Path | None:
     """The catalog of the storage in a directory; None if the cache directory is on a network file system.
 
     Raises:
-        OSError: There is no place for it, or others may write there.
+        OSError: The directory cannot be made, or others may write there.
     """
     real = Path(os.path.realpath(root))
     status = real.stat()
@@ -71,21 +71,21 @@ def make_private(directory: Path) -> None:
 
 
 def is_private(path: Path) -> bool:
-    """Whether a file or directory, no link, is this user's, and nobody else may write to it."""
+    """Whether a file or directory (no link) belongs to this user, and nobody else may write to it."""
     status = path.lstat()
     kind = stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)
     return kind and status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o022
 
 
 def _is_remote(directory: Path) -> bool:
-    """Whether a directory is on a network file system; no where the system does not say."""
+    """Whether a directory is on a network file system; False if the system does not say."""
     here, found, longest = os.path.realpath(directory), "", -1
     with contextlib.suppress(OSError):
         for line in _MOUNTS.read_text("utf-8", "surrogateescape").splitlines():
             _, point, kind, *_ = line.split(" ")
             point = _OCTAL.sub(lambda match: chr(int(match[1], 8)), point)
             if len(point) >= longest and f"{here}/".startswith(f"{point.rstrip('/')}/"):
-                found, longest = kind, len(point)  # of two at one point, the later one is seen
+                found, longest = kind, len(point)  # the later one of two at one point counts
     return _REMOTE.fullmatch(found) is not None
 
 

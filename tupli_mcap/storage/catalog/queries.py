@@ -1,6 +1,6 @@
-"""What is written to the tables of a catalog and asked of them, each in a transaction of the caller's.
+"""Changes and queries of the tables of a catalog, each within a transaction of the caller.
 
-The tables may lie in any SQL database: in the catalog of a directory, or in that of a server.
+The tables may be in any SQL database: in the catalog of a directory, or in that of a server.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def put_recording(
     rows: Iterable[EpisodeRow],
     runs: str,
 ) -> None:
-    """Adds a recording in place of what was known of it. `runs` is JSON: a list of those that its episodes are of.
+    """Adds a recording, or replaces its entry. `runs` is JSON: a list of its episodes' runs.
 
     Raises:
         FormatError: A row's metadata is not a strict JSON object.
@@ -142,7 +142,7 @@ def find_episodes(
 
 
 def each_once(headers: Iterable[EpisodeHeader], user: str) -> list[EpisodeHeader]:
-    """Each episode once: of one that several people have stored, the user's own, or else the first."""
+    """Each episode once: if several people have stored it, the user's own, or else the first."""
     found: dict[str, EpisodeHeader] = {}
     for each in headers:
         if each.id not in found or each.created_by == user:
@@ -336,7 +336,7 @@ def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
 
 
 def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:
-    """Puts what rows hold at declared keys into `VALUE`."""
+    """Puts the values of rows at declared keys into `VALUE`."""
     values = []
     for row in rows if indexed else ():
         metadata = load_metadata(row.metadata)
@@ -351,7 +351,7 @@ def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[t
 def _add_recording(
     connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str, runs: str
 ) -> int:
-    """Adds a recording without episodes, in place of what was known of it; returns its id."""
+    """Adds a recording without episodes, or replaces its entry; returns its id."""
     remove_recording(connection, relpath)
     values = {
         "path": escape_text(relpath),
@@ -375,7 +375,7 @@ def _environment(runs: str) -> str:
 def insert_all(
     connection: Connection, table: Table, fields: Sequence[str], rows: Sequence[tuple[Any, ...]]
 ) -> None:
-    """Inserts rows as the driver takes them: SQLAlchemy would prepare each value of each row."""
+    """Inserts rows through the driver: SQLAlchemy would prepare each value of each row."""
     if connection.dialect.name == "postgresql":
         _copy(connection, table, fields, rows)
         return
@@ -386,7 +386,7 @@ def insert_all(
 def _copy(
     connection: Connection, table: Table, fields: Sequence[str], rows: Sequence[tuple[Any, ...]]
 ) -> None:
-    """Inserts rows by PostgreSQL's COPY, of which SQLAlchemy knows nothing."""
+    """Inserts rows with PostgreSQL's COPY, which SQLAlchemy does not support."""
     named = connection.dialect.identifier_preparer.quote
     statement = f"COPY {named(table.name)} ({', '.join(map(named, fields))}) FROM STDIN"
     driver: Any = connection.connection.dbapi_connection

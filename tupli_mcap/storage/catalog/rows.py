@@ -152,7 +152,7 @@ def is_indexed(path: tuple[str, ...]) -> bool:
 
 
 def indexed_value(row: StoredRow, metadata: object, path: tuple[str, ...]) -> tuple[Any, Any] | None:
-    """What `value` holds of an episode at a path (number, text); None if nothing is there."""
+    """The entry of an episode at a path in `value` (number, text); None if it has none."""
     if path[0] != "metadata":
         stored = getattr(row, path[0])
         return (None, indexed_text(stored)) if isinstance(stored, str) else (stored, None)
@@ -166,13 +166,13 @@ def indexed_value(row: StoredRow, metadata: object, path: tuple[str, ...]) -> tu
 
 
 def indexed_text(text: str) -> str:
-    """What is indexed of a text: its beginning, as PostgreSQL indexes no long ones. In order as the texts are, but that
-    two texts may begin alike."""
+    """The indexed part of a text: its beginning, since PostgreSQL indexes no long texts. It has the order of the texts,
+    but two texts may have the same beginning."""
     return escape_text(text)[:_INDEXED_CHARACTERS]
 
 
 def nearest_float(number: float) -> float:
-    """The float next to a number, in the order of the numbers: of an integer beyond all floats, an infinity."""
+    """The nearest float, which keeps the order of numbers; an infinity for an integer beyond all floats."""
     try:
         return float(number)
     except OverflowError:
@@ -180,7 +180,7 @@ def nearest_float(number: float) -> float:
 
 
 def load_metadata(text: str) -> Any:
-    """The metadata that a stored text stands for."""
+    """The metadata in a stored text."""
     return jsonvalue.loads(text) if '"$' in text else json.loads(text)
 
 
@@ -195,7 +195,7 @@ def _searchable(text: str) -> str:
             if isinstance(_STRICT.decode(text), dict):
                 return text
         except (ValueError, RecursionError):
-            pass  # a defect, or a key twice: the slow way below decides
+            pass  # a defect, or a key that occurs twice: the slow way below decides
     value = jsonvalue.loads(text)
     if not isinstance(value, dict):
         raise FormatError(f"expected the metadata of an episode to be a JSON object, found {text!r:.60}")

@@ -91,7 +91,7 @@ EPISODE: Final = Table(
     ),  # whether SQL may look into the metadata
     Column("success", NUMBER),  # 0 or 1 where the metadata say it
     Column("run", NUMBER, nullable=False),  # its place among the recording's
-    Column("exact", TEXT),  # JSON of the fields of which the columns do not say all
+    Column("exact", TEXT),  # JSON of the fields that the columns cannot hold exactly
 )
 
 INDEXED_FACTS: Final = ("n_tuples", "episode_return", "created_at")
@@ -113,7 +113,7 @@ TALLY: Final = Table(
     Column("return_sum", Float),  # of those
     Column("return_least", Float),
     Column("return_most", Float),
-    Column("told", NUMBER, nullable=False),  # how many say whether they succeeded
+    Column("told", NUMBER, nullable=False),  # number of episodes that say whether they succeeded
     Column("succeeded", NUMBER, nullable=False),
     Column("first", NUMBER, nullable=False),  # the least and greatest `created_at`
     Column("last", NUMBER, nullable=False),
@@ -140,7 +140,7 @@ VALUE: Final = Table(
 
 
 def episodes_of(recording_id: int, row_id: ColumnElement[int]) -> ColumnElement[bool]:
-    """Where a column of row ids names an episode of a recording."""
+    """The condition that a column of row ids names an episode of a recording."""
     first = recording_id << EPISODE_BITS
     return and_(row_id >= first, row_id < first + (1 << EPISODE_BITS))
 
@@ -157,5 +157,5 @@ def in_order() -> ColumnElement[bool]:
 
 
 def first_of(recording: ColumnElement[int]) -> ColumnElement[int]:
-    """The id of the first episode that a recording may have."""
+    """The smallest possible id of an episode of a recording."""
     return recording * (1 << EPISODE_BITS)

@@ -1,4 +1,4 @@
-"""What is known of recordings without a look at their episodes: how many, how long, how good, since when."""
+"""Sums over the episodes of recordings: how many, how long, how good, since when."""
 
 from __future__ import annotations
 
@@ -33,11 +33,13 @@ _LARGE: Final = 1e290
 
 
 class Tally(NamedTuple):
-    """A recording, and sums over its episodes that may be seen.
+    """A recording, and sums over its visible episodes.
 
-    returns, return_sum, return_least, return_most: of the episodes whose return is a number; None where there is none.
-    told, succeeded: how many episodes say whether they succeeded, and how many did. first, last: when the first
-    and the last of them ended (ns since 1970, UTC). runs: what the episodes are of, as `EpisodeHeader.run`.
+    Attributes:
+        returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is.
+        told, succeeded: number of episodes that say whether they succeeded, and of those that did.
+        first, last: when the first and the last of them ended (ns since 1970, UTC).
+        runs: of the episodes, as `EpisodeHeader.run`.
     """
 
     recording: str
@@ -67,7 +69,7 @@ def recordings_seen(seen: Seen) -> ColumnElement[bool]:
 
 
 def tally(connection: Connection, recording_id: int) -> None:
-    """Makes the sums of a recording anew."""
+    """Computes the sums of a recording anew."""
     connection.execute(delete(TALLY).where(TALLY.c.recording_id == recording_id))
     groups = (EPISODE.c.recording_id, EPISODE.c.created_by, EPISODE.c.published_in)
     sums = (
@@ -87,7 +89,7 @@ def tally(connection: Connection, recording_id: int) -> None:
 
 
 def _sum_of_returns() -> ColumnElement[float]:
-    """Their sum, infinite if some are so large that PostgreSQL, which knows no infinite sums of numbers, might fail."""
+    """The sum of returns; infinite if some are so large that PostgreSQL might fail, which refuses infinite sums."""
     found = EPISODE.c.episode_return
     usual = func.sum(case((func.abs(found) < _LARGE, found), else_=0.0))
     return case(
@@ -103,9 +105,9 @@ def tallies(
     seen: ColumnElement[bool] | None = None,
     of: ColumnElement[bool] | None = None,
 ) -> Iterator[Tally]:
-    """The recordings of which some episodes may be seen, by their paths.
+    """The recordings with visible episodes, in the order of their paths.
 
-    seen: a condition on TALLY.c.created_by and .published_in. of: one on RECORDING.
+    `seen` is a condition on TALLY.c.created_by and .published_in, `of` one on RECORDING.
     """
     recording = [RECORDING.c[name] for name in Tally._fields[:7] if name != "recording"]
     sums = [

@@ -1,4 +1,4 @@
-"""Artifacts in a directory: `<sha256>` holds the bytes, `<sha256>.json` what is known about them."""
+"""Artifacts in a directory: `<sha256>` holds the bytes, `<sha256>.json` their metadata."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class BenchmarkFiles:
                 write_bytes(self._path(uri), to_json(document))
 
     def edit(self, uri: str, changes: Mapping[str, str], by: str, *, dry_run: bool) -> BenchmarkHeader:
-        """Shows other metadata from now on. What it was stored with, and its id, stay."""
+        """Changes the metadata that are shown. The stored metadata, and the id, stay."""
         if not changes or not changes.get("name", "x").strip():
             raise StorageError(
                 f"expected a name or a description of the benchmark, found {dict(changes)!r:.100}"
@@ -111,11 +111,11 @@ class BenchmarkFiles:
         return self._say(uri, lambda edits: (*edits, edit), dry_run)
 
     def undo_edit(self, uri: str, *, dry_run: bool) -> BenchmarkHeader:
-        """Takes the last edit back."""
+        """Undoes the last edit."""
 
         def shortened(edits: _Edits) -> _Edits:
             if not edits:
-                raise StorageError(f"benchmark {uri}: nothing was edited that could be taken back")
+                raise StorageError(f"benchmark {uri} has no edit to take back")
             return edits[:-1]
 
         return self._say(uri, shortened, dry_run)
@@ -190,7 +190,7 @@ class BenchmarkFiles:
 
 
 def name_in(document: dict[str, Any]) -> str:
-    """What a document calls its environment."""
+    """The name of the environment in a document."""
     environment = document.get("environment")
     name = environment.get("name") if isinstance(environment, dict) else ""
     return name if isinstance(name, str) else ""
@@ -205,7 +205,7 @@ def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | Non
     try:
         content = unpack(query.serialized)
     except FormatError:
-        # Text of somebody else's making: kept as it is, and never executed by us.
+        # A foreign text: kept unchanged, and never executed.
         told = {"hash": query.hash, "serialized": query.serialized, "metadata": plain(query.metadata)}
         uri = sha256(canonical_json(told))
         document = {

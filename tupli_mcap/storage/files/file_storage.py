@@ -56,11 +56,11 @@ class _Settings(BaseModel):
 class FileStorage(TupliStorage):
     """A storage in the directory `root` (`storage_base_dir` is PyTupli's name for it), which the first write makes.
 
-    Any number of threads and processes may use one directory at once. The recordings are the truth: files put
-    into the directory by other means are found, and what is removed from it is gone.
+    Any number of threads and processes may use one directory at once. The files alone count: recordings that are copied
+    into the directory are found, and those that are removed from it are gone.
 
     Raises:
-        StorageError: `root` is no directory, and none can be made there, or it may not be looked at.
+        StorageError: `root` is no directory, and none can be made there, or it cannot be read.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class FileStorage(TupliStorage):
                 f"cannot use the storage {str(self.root)!r}: {err}; choose another path"
             ) from err
         self._lock = Lock(self.root / ".lock")
-        self.import_lock = Lock(self.root / ".import.lock")  # two imports of one file would copy it twice
+        self.import_lock = Lock(self.root / ".import.lock")  # so that two imports do not copy one file twice
         self._benchmarks = BenchmarkFiles(self.root / "benchmarks", self._lock)
         self._artifacts = ArtifactFiles(self.root / "artifacts", self._lock)
         self._catalog = SyncedCatalog(self.root, self._settings().declared_keys)
@@ -112,9 +112,9 @@ class FileStorage(TupliStorage):
     def edit_benchmark(
         self, uri: str, *, name: str | None = None, description: str | None = None, dry_run: bool = False
     ) -> BenchmarkHeader:
-        """Gives a benchmark another name or description, which lists, filters and bundles show from now on.
+        """Gives a benchmark another name or description, which lists, filters and bundles then show.
 
-        Its id, its episodes and the metadata that it was stored with stay; who edited it and when is kept.
+        Its id, its episodes and its stored metadata stay; the edit keeps the user's name and the time.
 
         Raises:
             NotFoundError: There is no such benchmark.
@@ -125,7 +125,7 @@ class FileStorage(TupliStorage):
         return self._benchmarks.edit(uri, changes, user_name(), dry_run=dry_run)
 
     def undo_benchmark_edit(self, uri: str, *, dry_run: bool = False) -> BenchmarkHeader:
-        """Takes the last edit of a benchmark back.
+        """Undoes the last edit of a benchmark.
 
         Raises:
             NotFoundError: There is no such benchmark.
@@ -254,7 +254,7 @@ class FileStorage(TupliStorage):
         return self._catalog.count(filter)
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
-        """The answer of the catalog, brought up to date, to a question such as those of `catalog.queries`."""
+        """The result of a function of a connection to the up-to-date catalog, such as those of `catalog.queries`."""
         return self._catalog.ask(question)
 
     @property
@@ -274,16 +274,16 @@ class FileStorage(TupliStorage):
         return self._recordings.delete(self._catalog.headers(filter))
 
     def deleted_episodes(self) -> list[str]:
-        """The ids of the episodes that are deleted, as long as `compact` has not freed their space.
+        """The ids of deleted episodes that can be restored, because `compact` has not freed their space.
 
-        Where no episode of a recording was left, it was removed, and nothing of it can be restored.
+        A recording whose episodes were all deleted was removed and cannot be restored.
         """
         return self._recordings.deleted()
 
     def restore_episodes(self, ids: Iterable[str] | None = None) -> int:
-        """Takes back the deletion of episodes, by default of all that `deleted_episodes` names; returns how many.
+        """Restores deleted episodes, by default all that `deleted_episodes` names; returns their number.
 
-        Ids of others are ignored.
+        Other ids are ignored.
         """
         return self._recordings.restore(set(self._recordings.deleted() if ids is None else ids))
 
@@ -365,7 +365,7 @@ class FileStorage(TupliStorage):
         require_signature: bool = False,
         signers: Sequence[str] = (),
     ) -> str:
-        """Take in what `bundle` wrote, see `read_bundle`; returns the benchmark's id."""
+        """Import a file that `bundle` wrote, see `read_bundle`; returns the benchmark's id."""
         return read_bundle(
             self, Path(path), trust=trust, require_signature=require_signature, signers=signers
         )

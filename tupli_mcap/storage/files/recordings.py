@@ -1,4 +1,4 @@
-"""Recordings in a directory: their paths, and what is noted, deleted and freed of their episodes."""
+"""Recordings in a directory: finds their paths, publishes, deletes and restores episodes, and frees space."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
 class RecordingFiles:
-    """The recordings below a storage's root: where they lie, and what is changed of their episodes.
+    """The recordings below a storage's root, and changes of their episodes.
 
-    Several processes may record, publish and delete at once. The next question to the catalog notices.
+    Several processes may record, publish and delete at once. The next query of the catalog sees the changes.
     """
 
     def __init__(self, root: Path, lock: Lock, catalog: SyncedCatalog) -> None:
@@ -41,7 +41,7 @@ class RecordingFiles:
         self._catalog = catalog
 
     def new_path(self, benchmark_id: str, name: str) -> Path:
-        """A path below the benchmark's directory that nobody else is given: time (UTC), name and random digits."""
+        """A unique path below the benchmark's directory: time (UTC), name and random digits."""
         directory = self._root / "recordings" / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ class RecordingFiles:
         """The file of a catalogued recording.
 
         Raises:
-            NotFoundError: It is not one, or not below the root.
+            NotFoundError: There is none with this path, or it is not below the root.
         """
         if not isinstance(recording, str):
             raise NotFoundError(
@@ -78,7 +78,7 @@ class RecordingFiles:
         return found
 
     def of_recording(self, path: Path) -> list[EpisodeHeader]:
-        """The episodes of a recording that has just been ingested, without a look at the others."""
+        """The episodes of a recording that was just catalogued, without a query of the others."""
         wanted = FilterEQ(key="recording", value=path.relative_to(self._root).as_posix())
         return self._catalog.known(wanted) or self._catalog.headers(wanted)
 
@@ -90,7 +90,7 @@ class RecordingFiles:
         """
         match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
         if match:
-            # What the catalog knows already may be out of date in all but where the episode is.
+            # The catalog may be out of date, so only the place of the episode is taken from it.
             found = self._catalog.known(FilterEQ(key="id", value=uri), limit=1)
             if found and self._holds(found[0]):
                 return found[0]
@@ -122,7 +122,7 @@ class RecordingFiles:
             ) from err
 
         with self._lock:
-            # without a step, or deleted since: the next query notices
+            # without a step, or deleted in the meantime: the next query notices
             if path.exists() and self._catalog.put(relative) == 0:
                 self._remove(path)
 
@@ -137,10 +137,10 @@ class RecordingFiles:
             sidecar.write(path)  # the next query notices
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> int:
-        """Delete episodes, all of them or none: by notes beside their recordings, or with these where nothing else is
-        left in them.
+        """Delete episodes, all of them or none: by notes beside their recordings; recordings without other episodes
+        are removed.
 
-        Returns how many there still were.
+        Returns the number of episodes that were still there.
         """
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
@@ -175,7 +175,7 @@ class RecordingFiles:
         return found
 
     def restore(self, ids: Collection[str]) -> int:
-        """Take back what is noted of deleted episodes; returns how many there were."""
+        """Restore deleted episodes; returns their number."""
         restored = 0
         with self._lock:
             self._finish_deletion()
@@ -192,7 +192,7 @@ class RecordingFiles:
         return restored
 
     def _finish_deletion(self) -> None:
-        """Do what is left of a deletion that was broken off; only recordings that are listed are touched."""
+        """Finish a deletion that was interrupted; only recordings in its list are changed."""
         deletion = Deletion.read(self._root)
         if deletion.deleted:
             listed = {item.relative for item in scan(self._root)}
@@ -205,7 +205,7 @@ class RecordingFiles:
             path = self._root / relative
             try:
                 metadata = metadata_at(path)
-            except FormatError:  # no more is known of it; a repair may need its note
+            except FormatError:  # it is damaged; a repair may need its note
                 metadata = {"uuid": note.uuid}
             if not note.is_about(metadata):  # replaced since
                 continue
@@ -219,7 +219,7 @@ class RecordingFiles:
         Deletion().write(self._root)
 
     def _left(self, path: Path, uuid: str | None = None) -> set[int]:
-        """The numbers of the episodes of a recording that are not deleted; none of another one than that of `uuid`."""
+        """The numbers of a recording's episodes that are not deleted; empty if it has another uuid than `uuid`."""
         notes = Notes.read(path, self._root)
         with Recording(path) as recording:
             if uuid not in (None, recording.uuid):
@@ -240,9 +240,9 @@ class RecordingFiles:
         self.remove_directory(path.parent)
 
     def remove_directory(self, directory: Path) -> None:
-        """Remove the directory of a benchmark's recordings if it is empty and the benchmark gone.
+        """Remove the directory of a benchmark's recordings if it is empty and the benchmark is deleted.
 
-        While there is one, somebody may be about to record to it.
+        While the benchmark exists, somebody may be about to record to it.
         """
         if directory.parent != self._root / "recordings":
             return
@@ -252,14 +252,14 @@ class RecordingFiles:
 
     def compact(self) -> int:
         """Rewrite the recordings that hold deleted episodes, and remove the temporary files of killed processes;
-        returns how many bytes that freed.
+        returns the number of bytes that this freed.
 
-        Those that are being written are left alone. Episodes that stay keep their ids.
+        Recordings that are being written stay unchanged. Episodes that stay keep their ids.
         """
         freed = files.remove_left(files.left_below(self._root))
         with self._lock:
             self._finish_deletion()
-        for name in _OLD_CATALOG:  # earlier versions kept it here; it is opened no more
+        for name in _OLD_CATALOG:  # left by earlier versions, which had the catalog here
             with contextlib.suppress(OSError):
                 (self._root / name).unlink()
         for item in sorted(scan(self._root)):

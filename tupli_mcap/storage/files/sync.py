@@ -1,4 +1,4 @@
-"""The catalog of a directory, brought up to date with its recordings before each question."""
+"""The catalog of a directory, updated with its recordings before each query."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ _TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
 
 
 class SyncedCatalog:
-    """What the catalog knows of the recordings below a storage's root. Several processes may ask and record at once.
+    """The catalog of the recordings below a storage's root. Several processes may query and record at once.
 
-    The files are the truth. Before each question the catalog is brought up to date with those that have
-    appeared, changed (by size, time stamps and inode) or gone; recordings that are being written are read anew each
-    time. The catalog lies in this user's cache directory, or in memory: a question writes nothing below the root.
+    The files alone count. Before each query the catalog is updated with files that have appeared, changed (by size,
+    time stamps and inode) or gone; recordings that are being written are read anew each time. The catalog is in this
+    user's cache directory, or in memory: a query writes nothing below the root.
     """
 
     def __init__(self, root: Path, declared_keys: Iterable[str]) -> None:
         self._root = root
         self._declared_keys = list(declared_keys)
         self._opened: Catalog | None = None
-        self._synced = -1  # the catalog that has been brought up to date
-        self._undeclared = True  # its keys are still to be declared
+        self._synced = -1  # identity of the catalog that is up to date
+        self._undeclared = True  # its keys have yet to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
         self.skipped: dict[str, str] = {}
-        """Recordings that are not listed, and why, as of the last question."""
+        """Recordings that the last query did not list, and why."""
 
     def close(self) -> None:
         if self._opened is not None:
@@ -63,7 +63,7 @@ class SyncedCatalog:
             self._opened = None
 
     def known(self, filter: BaseFilter, *, limit: int | None = None) -> list[EpisodeHeader]:
-        """What the catalog knows already, without a look at the files; it may be out of date, or nothing."""
+        """The episodes in the catalog, without an update; they may be out of date, or none."""
         with contextlib.suppress(*_TROUBLE):
             return self._catalog.episodes(filter, limit=limit)
         return []
@@ -77,7 +77,7 @@ class SyncedCatalog:
         return self._settled(lambda: self._catalog.count(filter))
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
-        """What a question finds in the tables of the catalog, which is up to date."""
+        """The result of a function of a connection to the up-to-date catalog."""
         return self._settled(lambda: self._catalog.ask(question))
 
     def explain(self, filter: BaseFilter | None) -> str:
@@ -96,7 +96,7 @@ class SyncedCatalog:
         """Empty the catalog and fill it from the files."""
 
         def make() -> None:
-            with self._catalog.alone():  # nobody sees half of it
+            with self._catalog.alone():  # nobody sees an incomplete catalog
                 self._catalog.reset()
                 self._warned.clear()
                 self._sync()
@@ -104,7 +104,7 @@ class SyncedCatalog:
         self._with_usable_catalog(make)
 
     def put(self, relative: str) -> int:
-        """Catalogue one recording; returns how many episodes it holds, -1 where nobody can know yet.
+        """Catalogue one recording; returns its number of episodes, -1 if it is not known yet.
 
         Raises:
             FormatError: It is damaged.
@@ -114,12 +114,12 @@ class SyncedCatalog:
             alone = self._catalog.alone()
             with alone, contextlib.suppress(CatalogMovedError), entry_of(self._root, relative) as entry:
                 return self._put(relative, entry)
-            return -1  # the next question fills the new one
+            return -1  # the next query fills the new catalog
 
         return self._with_usable_catalog(put)
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
-        """Asks a catalog that is up to date, again if somebody has replaced it meanwhile."""
+        """Queries the up-to-date catalog, again if somebody replaced it in the meantime."""
 
         def settle() -> _T:
             for _ in range(_ATTEMPTS):
@@ -133,7 +133,7 @@ class SyncedCatalog:
         return self._with_usable_catalog(settle)
 
     def _with_usable_catalog(self, work: Callable[[], _T]) -> _T:
-        """What `work` returns, done again where the catalog fails: with a new one if it is damaged, then in memory."""
+        """The result of `work`; if the catalog fails, with a new one if it was damaged, else with one in memory."""
         try:
             try:
                 return work()
@@ -159,11 +159,11 @@ class SyncedCatalog:
 
     @functools.cached_property
     def _empty(self) -> Catalog:
-        """What is listed before the first write makes the directory: nothing."""
+        """An empty catalog, for the time before the first write makes the directory."""
         return Catalog(None)
 
     def _use_memory(self, err: StorageError) -> Catalog:
-        """Go on with a catalog in memory: what is recorded can be listed even where nothing can be written."""
+        """Go on with a catalog in memory, so that recordings can be listed even if nothing can be written."""
         advice = "TUPLI_MCAP_CACHE_DIR names another place; meanwhile the catalog is made in memory"
         warnings.warn(f"{err}; {advice}", stacklevel=7)
         self.close()
@@ -171,9 +171,9 @@ class SyncedCatalog:
         return self._opened
 
     def _declare_keys(self) -> None:
-        """Declares the keys in a catalog that was opened or made anew, perhaps by another process.
+        """Declares the keys in a catalog that was just opened, or made anew by any process.
 
-        Done once its rows are in it: making an index of them is quicker than adding each to one.
+        This comes after its rows are in it: to index all at once is faster than to add each.
         """
         if self._undeclared:
             for key in self._declared_keys:
@@ -190,7 +190,7 @@ class SyncedCatalog:
 
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
-        self.skipped = {}  # they are no part of the catalog, and so are met again
+        self.skipped = {}  # the catalog does not hold them, so each update finds them again
         if not self._changes():
             self._declare_keys()
             return True
@@ -200,7 +200,7 @@ class SyncedCatalog:
             return self._catalog.identity == self._synced
 
     def _follow(self, changes: Mapping[str, Path | None]) -> None:
-        """Brings what has changed into the catalog."""
+        """Applies changes of files to the catalog."""
         present = [relative for relative, path in changes.items() if path is not None]
         with (
             progress(len(changes), "Cataloguing recordings") as bar,
@@ -214,9 +214,9 @@ class SyncedCatalog:
                 bar.advance(1)
 
     def _changes(self) -> dict[str, Path | None]:
-        """Recordings that the catalog does not know as they are; None for those that are gone.
+        """Recordings that are new or have changed, by path; None for those that are gone.
 
-        The latter come first: a file that was moved is no copy of itself.
+        The latter come first, so that a moved file does not count as a copy of itself.
         """
         catalogued = self._catalog.recordings()
         if self._catalog.identity != self._synced:
@@ -231,13 +231,13 @@ class SyncedCatalog:
         )
         for item in listed:
             path = self._root / item.relative
-            # What a live writer's journal holds is in no time stamp.
+            # A live writer's journal changes without a new time stamp.
             if catalogued.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
                 changes[item.relative] = path
         return changes
 
     def _try_to_put(self, relative: str, entry: Entry | None) -> None:
-        """Catalogue a recording by its entry, or else read it here."""
+        """Catalogue a recording by its entry; without one, read the recording here."""
         stamp = RecordingStamp(0, 0, 0)
         try:
             if entry is None:
@@ -261,7 +261,7 @@ class SyncedCatalog:
             warnings.warn(f"skipped a recording: {why}", stacklevel=6)
 
     def _put(self, relative: str, entry: Entry) -> int:
-        """Catalogue a recording unless it is a copy; returns how many episodes it holds."""
+        """Catalogue a recording unless it is a copy; returns its number of episodes."""
         if not self._is_copy(relative, entry):
             self._catalog.put_recording(
                 relative,
@@ -274,7 +274,7 @@ class SyncedCatalog:
         return len(entry.numbers)
 
     def _is_copy(self, relative: str, entry: Entry) -> bool:
-        """Whether another recording holds the first or the last episode of this one, which then is left out."""
+        """Whether another recording holds the first or the last episode of this one; such a copy is left out."""
         if not self._catalog.copies(relative, entry.uuid):
             return False
         for number in {*entry.numbers[:1], *entry.numbers[-1:]}:
@@ -289,7 +289,7 @@ class SyncedCatalog:
 
 
 def _is_exhausted(err: BaseException | None) -> bool:
-    """Whether the process has too many open files or no memory: no fault of the recording that met it."""
+    """Whether the process has too many open files or no memory, which is no fault of the recording."""
     while err is not None and not isinstance(err, OSError):
         err = err.__cause__
     return err is not None and err.errno in (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
