@@ -1,16 +1,16 @@
-"""Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, hand them on.
+"""Record reinforcement-learning episodes as MCAP files, index them into datasets, train on them, share them.
 
 wrappers, vector, sb3      record an environment, or many
-recording                  one file: read, written, recovered, edited, checked, signed
-journal, mcap, messages    what protects the steps of a killed process; the container; what is in it
+recording                  one file: read, written, recovered, edited, verified, signed
+journal, mcap, messages    keeps the steps of a killed process; the container; the messages in it
 spaces, environment        leaves of Gymnasium's spaces; environments as data, and rebuilt
-schema                     the records and filters of PyTupli
-storage, benchmark         benchmarks and recordings in a directory or on a server; environments that have a place there
-dataset, torch             `open`: episodes wherever they lie; DataLoaders
+schema                     the models and filters of PyTupli
+storage, benchmark         recordings in a directory or on a server; environments that are stored and loaded again
+dataset, torch             `open`: episodes of files, directories and servers; DataLoaders
 server, page, remote       shares a storage over HTTP; its pages, and `browse`; reads files at URLs
-viewer, plots              shows recordings in Rerun and Foxglove, live too; draws them without a viewer
-doctor, replay             what is odd in a recording; the same actions once more
-trust, signing             whom this user trusts, and who signed
+viewer, plots              shows episodes in Rerun and Foxglove, live too; draws figures
+doctor, replay             finds defects of the data; steps an environment with recorded actions
+trust, signing             which code and keys this user trusts; signatures
 cli                        the commands
 errors, progress, files, jsonvalue, arrays    what all of them use
 """
@@ -83,7 +83,7 @@ if TYPE_CHECKING:
         write_rollout as write_rollout,
     )
 
-# Where each public name lives; imported on first use, so that `import tupli_mcap` stays quick.
+# The module of each public name, imported on first use, so that `import tupli_mcap` is quick.
 _HOMES = {
     "benchmark": "TupliEnvWrapper",
     "dataset": "Dataset TupliDataset filter_recording open",

@@ -1,4 +1,4 @@
-"""What arrays are called in annotations, and those that are nested in dicts and tuples."""
+"""Names of array types for annotations, and functions for arrays nested in dicts and tuples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DType = np.dtype[Any]
 
 
 def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
-    """The arrays of nested dicts and tuples, each through a function; None stays None."""
+    """Applies a function to each array of nested dicts and tuples; None stays None."""
     if tree is None:
         return None
     if isinstance(tree, Mapping):
@@ -26,5 +26,5 @@ def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
 
 
 def arrays_at(tree: Any, place: Any) -> Any:
-    """What the arrays of nested dicts and tuples have at a place: an index, a slice, or a tuple of these."""
+    """Indexes each array of nested dicts and tuples with `place`: an index, a slice, or a tuple of these."""
     return map_arrays(tree, operator.itemgetter(place))

@@ -72,11 +72,11 @@ class TupliError(Exception):
 
 
 class SpaceError(TupliError):
-    """A Gymnasium space that cannot be represented, or does not equal the recorded one."""
+    """A Gymnasium space cannot be recorded, or does not equal the recorded one."""
 
 
 class StepError(TupliError):
-    """A step that cannot be stored exactly; everything recorded before it is safe."""
+    """A step cannot be stored exactly; everything recorded before it is safe."""
 
 
 class FormatError(TupliError):
@@ -84,7 +84,7 @@ class FormatError(TupliError):
 
 
 class RecordingError(TupliError):
-    """A recording cannot be written: it exists, is in use, is closed, or the disk refuses."""
+    """A recording cannot be opened, read or written: it exists, is in use, is closed, or the system refuses."""
 
 
 class StorageError(TupliError):
@@ -118,7 +118,7 @@ class UntrustedError(TupliError):
 
 
 class SignatureError(TupliError):
-    """A signature or a key is missing, of an unknown signer, or does not fit what it should have signed."""
+    """A signature or a key is missing, is unknown, or does not fit what was signed."""
 
 
 class MissingExtraError(TupliError, ImportError):
@@ -158,12 +158,12 @@ class SaysWhatIsMeant:
 
 
 def missing_extra(what: str, extra: str) -> MissingExtraError:
-    """The error to raise where an extra is not installed; `what` says what needs which package."""
+    """The error for an extra that is not installed; `what` says what needs which package."""
     return MissingExtraError(f"{what}: {install_line(extra)}")
 
 
 def install_line(extra: str) -> str:
-    """The command that installs an extra, from where this package came: an index, a checkout, a directory, a file."""
+    """The command that installs an extra from the source of this package: an index, a checkout, a directory, a file."""
     import shlex
 
     checkout = Path(__file__).absolute().parents[1]
@@ -178,7 +178,7 @@ def install_line(extra: str) -> str:
 
 
 def _origin() -> str | None:
-    """The directory or file that pip installed this package from; None where it was an index."""
+    """The directory or file that pip installed this package from; None if it was an index."""
     import json
     from importlib.metadata import PackageNotFoundError, distribution
     from urllib.parse import unquote, urlsplit
@@ -198,7 +198,7 @@ def memory_for(what: Callable[[], str]) -> Iterator[None]:
         yield
     except MemoryError as err:
         raise RecordingError(
-            f"{what()} takes more memory than there is ({err or 'out of memory'}); read fewer episodes at a time"
+            f"{what()} needs more memory than there is ({err or 'out of memory'}); read fewer episodes at a time"
         ) from err
 
 

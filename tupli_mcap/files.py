@@ -1,12 +1,12 @@
-"""Files that take their place as a whole: the only place that makes temporary files and puts files at their paths.
+"""Atomic writes: the only module that makes temporary files and puts files at their paths.
 
-1. A new file is written in a directory of its own beside its goal. Nobody can foresee the name of that directory, and
-   only its owner may enter it, so nobody can prepare anything in it: a symbolic link, say.
-2. Its writer holds a lock on the directory until the file is at its goal. A process that dies loses the lock.
-3. The file is synced, then renamed to its goal, or linked where nothing may be replaced; then the names are synced.
+1. A new file is written in a new directory beside its goal. That directory has a random name, and only its owner may
+   enter it, so nobody can prepare anything in it, such as a symbolic link.
+2. The writer holds a lock on the directory until the file is at its goal. A process that dies loses the lock.
+3. The file is synced, then renamed to its goal, or linked if nothing may be replaced; then the directory is synced.
 
-So a goal is the old file or the new one, and a temporary file that nobody holds was left by a process that was killed.
-A recording and a journal that are begun are files instead of directories, locked themselves.
+So the goal is always the old file or the new one, and a temporary file without a lock was left by a killed process.
+The temporary files of recordings and journals are not in directories, and are locked themselves.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ __all__ = [
     "write_bytes",
 ]
 
-_NEW = "new"  # the file in its directory; no suffix, so that nobody takes it for a recording
-# The last two are of earlier versions; those with the number of a process were not locked.
+_NEW = "new"  # name of the file in its directory; without a suffix it does not look like a recording
+# The last two are from earlier versions; those with the number of a process were not locked.
 _TEMPORARY = re.compile(
     r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp|\.[0-9a-f]{16}\.tmp|\..+\.(?P<pid>[0-9]{1,9})\.tmp"
 )
-_MOMENT = 60.0  # seconds in which a file that is still empty is locked by its writer
+_MOMENT = 60.0  # seconds after which a writer has surely locked its new file
 _NO_SYNC = (errno.EINVAL, errno.ENOTSUP)  # not every file system syncs directories
 
 
 def temporary_path(directory: Path) -> Path:
-    """A path for a temporary file in a directory, which nobody can foresee."""
+    """A random path for a temporary file in a directory."""
     return directory / f".tupli-mcap-{secrets.token_hex(16)}.tmp"
 
 
 def create(path: Path, permissions: int = 0o666) -> int:
-    """A descriptor of a new, empty file; what is at its path goes.
+    """A descriptor of a new, empty file; a file at its path is removed first.
 
     Raises:
-        OSError: the system refuses, or somebody else has made a file there at this moment.
+        OSError: the system refuses, or somebody else makes a file there at the same time.
     """
     path.unlink(missing_ok=True)  # also a link that somebody has prepared
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, permissions)
@@ -72,20 +72,21 @@ def hold(fd: int) -> None:
 
 @contextlib.contextmanager
 def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
-    """The path of a file to make, which becomes `goal` when the block ends without an error.
+    """Yields the path of a file to make; it becomes `goal` when the block ends without an error.
 
-    A directory may be made instead, whose files the block syncs; it replaces nothing: not with `overwrite`.
+    The block may make a directory instead, whose files it has to sync; a directory replaces nothing, so pass
+    `overwrite=False`.
 
     Raises:
-        FileExistsError: `goal` exists by then, and not `overwrite`.
-        OSError: the system refuses; `goal` is as it was.
+        FileExistsError: `goal` exists by then, without `overwrite`.
+        OSError: the system refuses; `goal` is unchanged.
     """
     with private_directory(goal.parent, shown=goal) as directory:
         new = directory / _NEW
         yield new
         sync(new)
         put(new, goal, overwrite=overwrite)
-        with contextlib.suppress(OSError):  # the file is there, whatever becomes of its name in a power loss
+        with contextlib.suppress(OSError):  # the file is there, even if its name may not survive a power loss
             sync(goal.parent)
 
 
@@ -116,16 +117,16 @@ def private_directory(parent: Path, *, shown: Path) -> Iterator[Path]:
 
 
 def write_bytes(goal: Path, data: bytes, *, overwrite: bool = True, permissions: int = 0o666) -> None:
-    """Writes a file as a whole; raises as `replacing` does."""
+    """Writes a file atomically; raises as `replacing` does."""
     with replacing(goal, overwrite=overwrite) as new, os.fdopen(create(new, permissions), "wb") as file:
         file.write(data)
 
 
 def put(new: Path, goal: Path, *, overwrite: bool) -> None:
-    """Gives a file its path, instead of the file that is there if `overwrite`.
+    """Gives a file its path; with `overwrite` it replaces the file there.
 
     Raises:
-        FileExistsError: there is one, and not `overwrite`.
+        FileExistsError: there is a file, without `overwrite`.
         OSError: the system refuses.
     """
     if overwrite:
@@ -160,16 +161,16 @@ def sync(path: Path) -> None:
         os.close(fd)
 
 
-# ---- what killed processes have left
+# ---- files left by killed processes
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file of that name is a temporary one."""
+    """Whether a file with this name is a temporary one."""
     return _TEMPORARY.fullmatch(name) is not None
 
 
 def left_in(directory: Path) -> list[Path]:
-    """The temporary files of killed processes in a directory, but not in those below it.
+    """The temporary files of killed processes in a directory, without its subdirectories.
 
     Raises:
         OSError: the directory cannot be read.
@@ -179,7 +180,7 @@ def left_in(directory: Path) -> list[Path]:
 
 
 def left_below(root: Path) -> Iterator[Path]:
-    """The temporary files of killed processes in a directory and in all below it; links are not followed."""
+    """The temporary files of killed processes in a directory and its subdirectories; links are not followed."""
     for directory, below, names in os.walk(root):
         place = Path(directory)
         temporary = sorted(name for name in (*below, *names) if is_temporary(name))
@@ -188,7 +189,7 @@ def left_below(root: Path) -> Iterator[Path]:
 
 
 def remove_left(paths: Iterable[Path]) -> int:
-    """Removes temporary files that nobody holds, and no others; returns how many bytes that frees."""
+    """Removes temporary files that nobody holds, and no others; returns the number of bytes that this frees."""
     freed = 0
     for path in paths:
         with _unheld(path) as unheld, contextlib.suppress(OSError):
@@ -262,5 +263,5 @@ def _remove(path: Path) -> None:
 
 
 def as_file_name(name: str) -> str:
-    """A name of letters, digits, `_`, `-`, `+` and dots that a file may have, of at most 80 bytes."""
+    """A file name made of `name`: letters, digits, `_`, `-`, `+` and dots, at most 80 bytes."""
     return re.sub(r"[^\w.+-]+", "_", name).encode()[:80].decode(errors="ignore")

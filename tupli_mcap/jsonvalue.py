@@ -1,7 +1,7 @@
 """Python and NumPy values as JSON text, exactly and both ways.
 
-What JSON has stays plain: strings, finite floats, integers, booleans, None, lists, dicts with string keys.
-Everything else is an object with one key that starts with `$`:
+Values that JSON has are written plainly: strings, finite floats, integers, booleans, None, lists, dicts with string
+keys. Any other value is an object with one key that starts with `$`:
 
 `$float`: "nan", "inf" or "-inf"
 `$int`: hexadecimal digits of an integer of more than 64 bits, and at most 1024
@@ -9,11 +9,11 @@ Everything else is an object with one key that starts with `$`:
 `$str`: code points of a string with lone surrogates, which UTF-8 cannot carry
 `$bytes`, `$bytearray`: base64
 `$tuple`, `$set`, `$frozenset`: a list of values
-`$dict`: `[key, value]` pairs, where a key is no string or starts with `$`
+`$dict`: `[key, value]` pairs, if a key is no string or starts with `$`
 `$numpy`: `{"dtype", "shape", "data"}`, the bytes in C order as base64; a scalar has no shape
 `$numpy_str`, `$numpy_bytes`: a scalar of these types, whose trailing NULs an array would drop
 
-As such a dict of the user is written as `$dict`, a `$` key is always a tag. The text is strict JSON.
+A dict of the user with such a key is written as `$dict`, so a `$` key is always a tag. The text is strict JSON.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ _KINDS = "biufcSUMm"
 _BRACKETS_A_LEVEL = 3  # {"$dict": [[key, ...
 _MAX_CODE_POINT = 0x10FFFF
 _SCALARS = {type(None), bool, float, int, str}
-# Python refuses to convert very long decimal integers, and few other JSON readers take more than 64 bits.
+# Few other JSON readers take integers of more than 64 bits.
 _EXACT_INT_BITS = 64
-_PLAIN_INT_BITS = 1024  # and no integer may have more: beyond 4300 digits Python refuses to print it
+_PLAIN_INT_BITS = 1024  # no integer may have more: Python does not print those beyond 4300 digits
 _LONG_NUMBER = re.compile(r"\d{309}")  # 1024 bits are 309 digits at most
-_SAME_HASH = 64  # keys of one hash: Python compares each of them with all others
+_SAME_HASH = 64  # most keys with one hash: Python compares each of them with all others
 
 
 def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
@@ -67,10 +67,11 @@ def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
 
 
 def dumps_any(value: Any) -> str:
-    """Return `dumps` of any value at all: a tensor is stored as an array, what else has no exact form as its `repr`.
+    """Return `dumps` of any value: a tensor is stored as an array, any other object without an exact form as its
+    `repr`.
 
-    An object without a `repr` becomes the name of its type, an entry of a dict that is nested too deep (or in
-    itself) the `repr` of the entry.
+    An object without a `repr` becomes the name of its type. An entry of a dict that is nested too deep (or in
+    itself) becomes the `repr` of the entry.
     """
     try:
         return dumps(value, fallback=_nearest)
@@ -89,7 +90,7 @@ def _shallow(value: Any) -> Any:
 
 
 def _nearest(value: Any) -> Any:
-    """An array of what holds one (a tensor of PyTorch or JAX), else what `shown` returns."""
+    """The array in a tensor of PyTorch or JAX, else the text of `shown`."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value.__array__())
     except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
@@ -97,7 +98,7 @@ def _nearest(value: Any) -> Any:
 
 
 def shown(value: Any) -> str:
-    """Return the `repr` of any value at all, or the name of its type if it has none (an integer of 5,000 digits)."""
+    """Return the `repr` of any value, or the name of its type if it has none (an integer of 5,000 digits)."""
     try:
         return repr(value)
     except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
@@ -105,11 +106,11 @@ def shown(value: Any) -> str:
 
 
 def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH) -> str:
-    """Return JSON text that a filter can look into: NumPy scalars are numbers, arrays and tuples are lists.
+    """Return JSON text for filters: NumPy scalars are numbers, arrays and tuples are lists.
 
-    What JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) is tagged as by `dumps`.
-    Keys that are numbers, booleans or None become strings as the standard library's `json` makes them, unless
-    two keys then meet. `max_depth` is for what is printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does.
+    Values that JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) are tagged as by `dumps`.
+    Keys that are numbers, booleans or None become strings as in the standard library's `json`, unless two keys become
+    equal. `max_depth` is for text that is only printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does.
     """
     return _text(_Encoder(None, plain=True, max_depth=max_depth), value)
 
@@ -118,7 +119,7 @@ def loads(text: str | bytes) -> Any:
     """Return the value of a text that `dumps` or `dumps_plain` wrote; nothing in the text is executed.
 
     Raises:
-        FormatError: anything that is not such a text.
+        FormatError: the text is something else.
     """
     try:
         if isinstance(text, bytes):
@@ -126,7 +127,7 @@ def loads(text: str | bytes) -> Any:
         brackets = _depth_of(text)
         number = _from_decimal if _LONG_NUMBER.search(text) else None
         value = json.loads(text, object_hook=_restore, parse_constant=_refuse_constant, parse_int=number)
-        if brackets > MAX_DEPTH:  # a level takes one bracket at least
+        if brackets > MAX_DEPTH:  # each level takes at least one bracket
             _check_levels(value, 0)
         return value
     except UnicodeDecodeError as err:
@@ -138,7 +139,7 @@ def loads(text: str | bytes) -> Any:
 
 
 class _UnstorableError(TypeError):
-    """Carries the path up to the top; a path made on the way down would cost every value."""
+    """Collects the path on its way up, so that values that can be stored need no path."""
 
     def __init__(self, value: Any) -> None:
         super().__init__(value)
@@ -159,7 +160,7 @@ def _text(encoder: _Encoder, value: Any) -> str:
 
 
 class _Encoder:
-    """Turns a value into what `json.dumps` takes as it is."""
+    """Turns a value into one that `json.dumps` takes."""
 
     def __init__(self, fallback: Fallback | None, *, plain: bool, max_depth: int = MAX_DEPTH) -> None:
         self.fallback = fallback
@@ -195,13 +196,13 @@ class _Encoder:
         if isinstance(value, (set, frozenset)):
             tag = "$set" if isinstance(value, set) else "$frozenset"
             _check_hashes(list(value))
-            # Sorted by text: the order of a set differs from process to process.
+            # Sorted by text: the order of a set differs between processes.
             return {tag: sorted(self._items(value, depth), key=json.dumps)}
         if isinstance(value, (bytes, bytearray)):
             return {"$bytes" if isinstance(value, bytes) else "$bytearray": _base64(value)}
         if isinstance(value, complex):
             return {"$complex": [self.encode(value.real, depth + 1), self.encode(value.imag, depth + 1)]}
-        if isinstance(value, str):  # from here subclasses: enumerations and the like
+        if isinstance(value, str):  # from here on subclasses, such as enumerations
             return self.encode(str.__str__(value), depth + 1)
         if isinstance(value, int):
             return self.encode(int.__int__(value), depth + 1)
@@ -248,7 +249,9 @@ class _Encoder:
             if len(named) == len(items) and all(type(name) is str for name in named):
                 return named
         _check_hashes(list(value))
-        exact = _Encoder(self.fallback, plain=False, max_depth=self.max_depth)  # a list is no key
+        exact = _Encoder(
+            self.fallback, plain=False, max_depth=self.max_depth
+        )  # exact: a list cannot be a key
         return {"$dict": [[exact.encode(key, depth + 1), item] for key, item in items.items()]}
 
     def _numpy(self, value: Any, depth: int) -> Any:
@@ -274,7 +277,7 @@ class _Encoder:
 
 
 def _json_key(key: Any) -> Any:
-    """Return the name `json` gives a key, or the key itself where it gives none."""
+    """Return the string that `json` makes of a key, or the key itself if it makes none."""
     if isinstance(key, np.generic):
         key = key.item()
     if type(key) is str:
@@ -299,7 +302,7 @@ def _base64(data: bytes | bytearray) -> str:
 
 
 def _depth_of(text: str) -> int:
-    """How deep brackets are nested, or their number where that is small."""
+    """How deep brackets are nested, or their number if that is small."""
     most = text.count("[") + text.count("{")
     if most <= MAX_DEPTH:
         return most
@@ -317,14 +320,14 @@ def _depth_of(text: str) -> int:
 
 
 def _levels(value: Any) -> int:
-    """How many levels a value is in itself, without what is in it."""
+    """The number of levels that a value adds by itself, without its contents."""
     if value is None or isinstance(value, (bool, float, int, str)):
         return 0 if type(value) in _SCALARS else 1
     return max(1, value.ndim) if isinstance(value, np.ndarray) else 1
 
 
 def _check_levels(value: Any, depth: int) -> None:
-    """Raises ValueError where `dumps` would for the depth of a value."""
+    """Raises ValueError if `dumps` would, because of the depth of a value."""
     if type(value) in _SCALARS:
         return
     if depth + _levels(value) > MAX_DEPTH:
@@ -340,9 +343,10 @@ def _check_levels(value: Any, depth: int) -> None:
 
 
 def _check_hashes(keys: list[Any]) -> None:
-    """Raises ValueError if too many keys have the same hash: making a dict or a set of them takes their number squared.
+    """Raises ValueError if too many keys have the same hash: a dict or a set of n such keys takes n squared
+    comparisons.
 
-    Integers have the same one if they differ by a multiple of 2**61 - 1.
+    Integers have the same hash if they differ by a multiple of 2**61 - 1.
     """
     if len(keys) > _SAME_HASH:
         hashes = sorted(map(hash, keys))
@@ -435,7 +439,7 @@ def _from_numpy(value: Any) -> Any:
     if not all(type(length) is int and length >= 0 for length in shape):
         raise ValueError("not a shape")
     dtype = np.dtype(name)
-    # The size is a claim: it has to agree with the bytes that are here before anything is allocated.
+    # The size is a claim: it must agree with the bytes before anything is allocated.
     if dtype.itemsize * math.prod(shape) != len(data):
         raise ValueError("bytes and shape do not agree")
     array = np.ndarray(tuple(shape), dtype, bytearray(data)).copy()

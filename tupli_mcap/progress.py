@@ -13,12 +13,12 @@ from typing import Any
 __all__ = ["Progress", "alone", "progress"]
 
 _PATIENCE = 1.0  # seconds without a bar
-_shown: list[object] = []  # what shows at the moment: at most one
+_shown: list[object] = []  # the bar or other display that shows at the moment: at most one
 
 
 class Progress:
-    """Counts steps, or bytes; shows a bar once it is worth it, where somebody can see it, and no other one shows. Safe
-    from several threads."""
+    """Counts steps, or bytes, and shows a bar after a second, if somebody can see it and no other one shows.
+    Thread-safe."""
 
     def __init__(self, total: int, what: str, *, in_bytes: bool) -> None:
         self._total = total
@@ -41,13 +41,13 @@ class Progress:
                 self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
 
     def expect(self, steps: int) -> None:
-        """`steps` more are to be done; or fewer, where negative."""
+        """Adds `steps` to the total; a negative number makes it smaller."""
         with self._lock:
             self._total += steps
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left to be done."""
+        """Whether all steps are done."""
         return self._done >= self._total
 
     def hide(self) -> None:
@@ -75,7 +75,7 @@ class Progress:
         columns = [*Bar.get_default_columns()]
         if self._in_bytes:
             columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
-        # What is printed to stdout stays there, whatever the bar does.
+        # The bar must not touch stdout.
         self._bar = Bar(
             *columns, console=Console(stderr=True), transient=True, auto_refresh=False, redirect_stdout=False
         )
@@ -85,7 +85,7 @@ class Progress:
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Shows no bar while something else shows."""
+    """Keeps bars away while something else shows, for the block."""
     mark = object()
     for bar in [each for each in _shown if isinstance(each, Progress)]:
         bar.hide()
@@ -98,7 +98,7 @@ def alone() -> Iterator[None]:
 
 @contextmanager
 def progress(total: int, what: str, *, in_bytes: bool = False) -> Iterator[Progress]:
-    """A `Progress` that is gone when the block ends."""
+    """A `Progress` that is closed when the block ends."""
     shown = Progress(total, what, in_bytes=in_bytes)
     try:
         yield shown

@@ -1,7 +1,7 @@
-"""Ed25519 keys: those that people have for SSH, to sign bundles with and to know each other by.
+"""Ed25519 keys: people sign bundles with their SSH keys, and trust those of others.
 
 Public keys are 64 hex digits inside this package, and shown as `ssh-keygen -l` shows them. Reading OpenSSH's public
-keys needs nothing installed; signing and checking need the extra `sign`.
+keys needs no other package; signing and checking need the extra `sign`.
 """
 
 from __future__ import annotations
@@ -107,9 +107,9 @@ def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
 
 
 def find_key(text: str) -> trust.TrustedKey:
-    """A public key, given as the name or fingerprint of a trusted one, as the path of its file, or itself.
+    """A public key, given as the name or fingerprint of a trusted one, as the path of its file, or as its own text.
 
-    A bare word is a name and never a file, unless it ends in `.pub`: somebody else may have put a file of that name
+    A bare word is a name and never a file, unless it ends in `.pub`: somebody else may have put a file with that name
     into the working directory.
 
     Raises:
@@ -153,7 +153,7 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
         except TypeError:
             if secret is None:
                 raise
-            key = load(data, password=None)  # a passphrase for a key that has none
+            key = load(data, password=None)  # the key has no passphrase
     except TypeError as err:
         raise PassphraseNeededError(f"{path}: the key is encrypted, and needs a passphrase") from err
     except (ValueError, library.UnsupportedAlgorithm) as err:
@@ -183,7 +183,7 @@ def _read(path: Path) -> bytes:
 
 
 class _Library(NamedTuple):
-    """What is used of `cryptography`."""
+    """The parts of `cryptography` that are used."""
 
     InvalidSignature: Any
     UnsupportedAlgorithm: Any

@@ -1,4 +1,4 @@
-"""Which environments this user's machine may rebuild by running code from a file, and whose keys it believes.
+"""The environments that this user's machine may rebuild by running code from a file, and the keys that it trusts.
 
 A digest (the SHA-256 of an environment, see `tupli_mcap.environment`) is trusted when the user's own
 configuration directory holds a signature of it, made with a secret key that never leaves that directory. A
@@ -30,7 +30,7 @@ from tupli_mcap.errors import TupliError, os_reason
 
 _KEY_BYTES = 32
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
-# Names what is signed, so that the key can never be made to sign something else that looks like a digest.
+# Is signed with the digest, so that no signature made for another purpose passes for one of a digest.
 _PURPOSE = b"tupli_mcap environment v1\0"
 _PURPOSE_OF_KEYS = b"tupli_mcap public key v1\0"
 _PURPOSE_OF_VOUCHERS = b"tupli_mcap voucher v1\0"
@@ -71,7 +71,7 @@ def trust(digest: str) -> None:
 
 
 def untrust(digest: str) -> bool:
-    """Forget a digest, also as vouched for by keys; returns whether it was trusted until now.
+    """Forget a digest, and all keys' statements about it; returns whether it was trusted.
 
     Raises:
         TupliError: The digest is not 64 hex digits, or the signature cannot be removed.
