@@ -84,7 +84,7 @@ def test_without_seals_only_what_shows_to_be_whole_counts(tmp_path: Path) -> Non
     place = tmp_path / "r.mcap"
     place.write_bytes(story.moments[-1].file)
     journal_path(place).write_bytes(story.moments[-1].journal or b"")
-    with pytest.warns(UserWarning, match=r"started anew since.*1 step\(s\) in its journal.*left out"):
+    with pytest.warns(UserWarning, match=r"was restarted afterwards.*1 step\(s\) in its journal.*left out"):
         assert Recording(place).num_steps == 3  # in the file: there was a flush
 
 

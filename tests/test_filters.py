@@ -542,7 +542,7 @@ class TestTimes:
                 r"'end' has no order: expected ==, != or in, found F\(.end.\) > 'terminal'",
             ),
             (F("n_tuples").contains("1"), "'n_tuples' is a whole number: expected such a value, found '1'"),
-            (F("ended").contains("2026"), "'ended' is a time, in which no text occurs: expected one of = !="),
+            (F("ended").contains("2026"), "'ended' is a time, which contains no text: expected one of = !="),
             (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
             (F("published_in") == 3, "'published_in' is a text: expected such a value, found 3"),
             (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),
@@ -776,7 +776,7 @@ class TestConstruction:
             (lambda: 1 < F("a") < 3, "no truth value"),
             (lambda: F("a") and F("b") > 1, 'F\\("a"\\) has no truth value: compare it'),
             (lambda: F("a") > 1 & F("b") < 3, r"needs parentheses: \(F\('a'\) > 1\) & \(F\('b'\) < 3\)"),
-            (lambda: F("a") | (F("b") > 1), "is compared with nothing"),
+            (lambda: F("a") | (F("b") > 1), "is not compared, or its comparison needs parentheses"),
             (lambda: ~F("a") == 1, "needs parentheses"),
             (lambda: F(3), "expected the name of a key, such as 'metadata.score', found 3"),  # type: ignore[arg-type]
             (lambda: F("a").isin("abc"), "isin on 'a' takes a list of values, found 'abc'"),
@@ -946,7 +946,7 @@ class TestColumns:
         [
             (F("rewards") > 0, "unknown filter key 'rewards': a step has reward, terminal, state, action"),
             (F("state.vel") > 0, "unknown filter key 'state.vel': state has pos, tag"),
-            (F("state") > 0, "'state' names several values a step"),
+            (F("state") > 0, "'state' names several values of a step"),
             (F("state.pos") > 0, r"needs 1 positions for values of shape \(2,\), found 0"),
             (F("state.pos.2") > 0, "needs a position from 0 to 1, found '2'"),
             (F("action.2") > 0, "action has 0, 1"),

@@ -266,7 +266,7 @@ def test_claims_are_refused(name: str, tmp_path: Path) -> None:
     path = tmp_path / "hostile.mcap"
     path.write_bytes(REFUSED[name]())
     with pytest.raises(
-        FormatError, match="expected|claims|places|names|gives|not the one its spaces|describes"
+        FormatError, match="expected|claims|places|names|gives|not that of its spaces|describes"
     ):
         Recording(path)
 

@@ -331,7 +331,9 @@ def test_a_file_that_was_copied_before_its_journal(
             warnings.simplefilter("always")
             with Recording(each) as recording:
                 found = {e.number: (e.end, e.final_state) for e in recording.episodes}
-        behind = any("before what its journal has left to it" in str(warning.message) for warning in caught)
+        behind = any(
+            "before the place where its journal goes on" in str(warning.message) for warning in caught
+        )
         told += behind
         recover_recording(each, tmp_path / "mended.mcap", overwrite=True)
         with Recording(tmp_path / "mended.mcap") as mended:
@@ -419,7 +421,7 @@ def test_steps_between_a_file_and_its_journal_are_missed(tmp_path: Path, space: 
     shutil.copy(journal_path(path), journal_path(old))
     with pytest.warns(
         UserWarning,
-        match="the first are missing, and all are left out: the file is damaged, or was copied before",
+        match="are left out, because steps before them are missing: the file is damaged, or was copied before",
     ):
         Recording(old).close()
     with warnings.catch_warnings():

@@ -498,7 +498,7 @@ class TestSplit:
             {"max_bytes": 0},
             {"episodes": 1, "max_bytes": 9},
         ):
-            with pytest.raises(RecordingError, match="how many episodes or how many bytes"):
+            with pytest.raises(RecordingError, match="either a number of episodes or of bytes"):
                 split_recording(path, tmp_path / "new.mcap", **limits)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["part_0003.mcap", "run.mcap"]
 

@@ -721,7 +721,7 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     with recording:
         assert SIGNATURE_NAME not in recording.attachments
         assert 0 < recording.num_steps < 60
-    assert report.notes == ["its signature is left out: it is not of what could be saved"]
+    assert report.notes == ["its signature is left out: it does not fit what could be saved"]
     assert report.attachments_lost == []
     assert verify_recording(str(report.target)).problems == []
 

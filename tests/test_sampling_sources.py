@@ -290,10 +290,10 @@ def test_a_file_that_changes(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="its CRC differs|found another record"):
         steps.read(["states"], np.arange(10))
     listed = ListedEpisodes(str(path), np.array([0, 99]), np.array([7, 7]))
-    with pytest.raises(NotFoundError, match="episode 99 was listed, but is not there as it was"):
+    with pytest.raises(NotFoundError, match="episode 99 was listed, but is missing or shorter"):
         RecordedSteps([listed], Recording)
     longer = ListedEpisodes(str(path), np.array([0]), np.array([8]))
-    with pytest.raises(NotFoundError, match="episode 0 was listed, but is not there as it was"):
+    with pytest.raises(NotFoundError, match="episode 0 was listed, but is missing or shorter"):
         RecordedSteps([longer], Recording)
 
 

@@ -360,7 +360,10 @@ def test_nothing_is_ever_replaced(cart: Files, tmp_path: Path) -> None:
     cart().save_columns(tmp_path / "columns")
     before = (tmp_path / "columns" / "manifest.json").stat()
     for name in ("empty", "link", "columns", "0.mcap"):
-        with pytest.raises(StorageError, match=f"found something at .*{name}; choose another one"):
+        with pytest.raises(
+            StorageError,
+            match=f"expected an unused path for columns, but .*{name} exists; choose another one",
+        ):
             cart().with_tuple_filter(F("action") == 1).save_columns(tmp_path / name)
     assert (tmp_path / "columns" / "manifest.json").stat() == before
     assert not list((tmp_path / "empty").iterdir())

@@ -464,9 +464,9 @@ def _an_older_attachment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 FORGERIES: dict[str, tuple[Callable[[pytest.MonkeyPatch], dict[str, Any]], str]] = {
-    "definitions": (_other_definitions, "schema records say other than the data"),
+    "definitions": (_other_definitions, "schema records differ from those of the data"),
     "skipped": (_messages_among_the_definitions, "expected consecutive rows in it"),
-    "index": (_an_index_into_an_attachment, "chunk index records say other than the data"),
+    "index": (_an_index_into_an_attachment, "chunk index records differ from those of the data"),
     "behind the data": (_a_chunk_behind_the_data, "the end of the data"),
     "summary": (_metadata_in_the_summary, "expected no record with opcode 12 in the summary"),
     "twice": (_an_older_attachment, "'benchmark.json' is in it twice"),
@@ -488,7 +488,7 @@ def test_a_file_that_others_read_otherwise_does_not_fit(
     assert name in ("summary", "twice") or seen(tmp_path / "forged.mcap") != honest
     with Recording(bundle) as original, Recording(tmp_path / "forged.mcap") as forged:
         assert str(forged.read().rewards) == str(original.read().rewards)
-    expected = f"other readers may see something else in it than what is signed: .*{message}"
+    expected = f"other readers may see something else in it than was signed: .*{message}"
     with pytest.raises(SignatureError, match=expected):
         verified(tmp_path / "forged.mcap")
     with pytest.raises(SignatureError, match=expected):

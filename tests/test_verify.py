@@ -135,7 +135,7 @@ def test_the_journal_of_another_recording_is_told(tmp_path: Path) -> None:
     out = " ".join(out.split())  # lines are broken where paths are long
     assert code == 0
     assert _IN_JOURNAL not in out
-    assert "steps not yet in a chunk are not here" in out
+    assert "steps that were not yet in a chunk are missing" in out
     assert "lost: steps not yet in a chunk" in " ".join(tell("recover", path)[1].split())
 
 
@@ -313,8 +313,8 @@ def forge(recording: Recording, container: Container, mistake: str) -> None:
 
 
 MISTAKES = {
-    "step": "does not count from the one before",
-    "episode": "is not numbered as its episode",
+    "step": "has a step that does not follow the one before",
+    "episode": "has the number of another episode",
     "flag": "ends its episode before its last step",
     "bool": "neither 0 nor 1",
     "publish_time": "publish times equal to log times",
@@ -327,7 +327,7 @@ MISTAKES = {
     "length": "gives 59 of the 60 steps to episodes",
     "index_return": "its end and the index differ",
     "index_seed": "its start and the index differ",
-    "index_end": "other flags than the end",
+    "index_end": "flags that differ from the end",
     "index_final": "its end and the index differ",
     "index_time": "its end and the index differ",
 }
@@ -588,9 +588,7 @@ def test_rows_that_change_places_inside_an_episode_are_found(kept: int, tmp_path
     one, two = part.inner[i], other.inner[j]
     part.inner[i], other.inner[j] = one[:kept] + two[kept:], two[:kept] + one[kept:]
     path.write_bytes(model.encode())
-    wrong = [
-        item for item in verify_recording(path).problems if "does not count from the one" in item.message
-    ]
+    wrong = [item for item in verify_recording(path).problems if "does not follow the one" in item.message]
     assert [(item.channel, item.episode, item.step) for item in wrong] == [("/step", 1, 5), ("/step", 1, 12)]
 
 
