@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 PAGE = (Path(__file__).parents[1] / "docs" / "howto" / "server.md").read_text()
-SECTION = PAGE.split("\n## From one to another\n")[1].split("\n## ")[0]
+SECTION = PAGE.split("\n## From one user to another\n")[1].split("\n## ")[0]
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", SECTION, re.DOTALL)
 
 
