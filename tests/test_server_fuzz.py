@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import html
 import importlib.util
 from pathlib import Path
 from types import ModuleType
 
 import httpx
 import pytest
+from page_fuzz import MARK, Browser, wrong
 from persons import Person
 from serving import serving
 
@@ -39,8 +41,9 @@ def test_every_route_answers_as_the_document_says(
         request.getfixturevalue("postgres")  # skips where it is not installed
     with tool().fuzzer(engine, tmp_path, seed=1) as fuzzer:
         fuzzer.run(3)
+        fuzzer.run_pages(8)
     assert fuzzer.findings == {}
-    assert fuzzer.statuses["200"] > 30
+    assert fuzzer.statuses["200"] > 30 and fuzzer.statuses["page 200"] > 20
 
 
 def test_a_failure_and_an_answer_of_another_shape_are_found(
@@ -54,12 +57,33 @@ def test_a_failure_and_an_answer_of_another_shape_are_found(
         fuzzer.run(10, only="GET /v1/users")
         monkeypatch.setattr(items, "paged", lambda *_: answer(["no page"]))
         fuzzer.run(10, only="POST /v1/benchmarks/list")
+        fuzzer.run_pages(10, only="/users")
+    assert "/users: 500" in fuzzer.findings
     found = {tuple(what.split(": ")[:3]) for what in fuzzer.findings}
     assert ("GET /v1/users", "500") in found
     assert ("POST /v1/benchmarks/list", "200", "Response violates schema") in found
 
 
+def test_a_text_that_is_not_escaped_is_found() -> None:
+    headers = {"Content-Type": "text/html", "Content-Security-Policy": "default-src 'self'"}
+    for text, found in ((html.escape(MARK), []), (MARK, ["a text is on the page as it is"])):
+        request = httpx.Request("GET", "http://127.0.0.1/")
+        assert list(wrong(httpx.Response(200, headers=headers, text=text, request=request))) == found
+
+
 # --- what it has found ---
+
+
+def test_an_episode_without_pictures_has_no_film(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=20, seed=1)
+    with serving(Settings(tmp_path / "served")) as url:
+        Person(url, "admin").ask("POST", "/v1/users", {"username": "ann", "password": "ann's password"})
+        ann = Person(url, "ann")
+        ann.send((tmp_path / "run.mcap").read_bytes())
+        uri = ann.ask("POST", "/v1/episodes/list", {})["items"][0]["id"]
+        with Browser(url, "ann") as browser:
+            told = browser.client.get(f"/episode/{uri}/film.mp4")
+    assert told.status_code == 404
 
 
 def test_a_recording_of_two_users_is_cut_once(tmp_path: Path) -> None:

@@ -2,11 +2,13 @@
 
     python tools/server_fuzz.py --examples 200 --seed 1 --engine postgresql
 
-Schemathesis makes the requests from the document. In half of them, names and ids of what is there take the place of
-what it makes up, so that they get further than "there is no such thing". Who asks is drawn for each. Findings are
+Schemathesis makes the requests from the document; those to pages, and their forms, tests/page_fuzz.py draws. In half of
+them, names and ids of what is there take the place of what is made up, so that they get further than "there is no such
+thing". Who asks is drawn for each. Findings are
 
 - a failure of the server: a status of 500 or more, but "you keep as much as you may" (507);
-- an answer that the document does not tell of: its status, its media type, its JSON.
+- an answer that the document does not tell of: its status, its media type, its JSON;
+- a page with a text that is not escaped.
 
 Exit code 1 at a finding.
 """
@@ -21,6 +23,7 @@ import logging
 import random
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +41,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import buckets
 import postgres
+from page_fuzz import MARK, Browser, page_routes, wrong
+from pages import robot
 from persons import Person, RefusedError, announced, cart_benchmark
 from serving import serving
 
@@ -76,6 +81,8 @@ class Stock:
         self._users = 0
         record_rollouts("CartPole-v1", folder / "run.mcap", steps=30, seed=1)
         self._recording = (folder / "run.mcap").read_bytes()
+        robot(folder / "robot.mcap", text=MARK)
+        self._marked = (folder / "robot.mcap").read_bytes()
         self._benchmark = cart_benchmark()
         self.askers = {role: self._asker(role) for role in ROLES}
         self._owner = self._person()
@@ -87,7 +94,13 @@ class Stock:
         self._admin.ask("POST", "/v1/users", {"username": name, "password": f"{name}'s password"})
         if role:
             self._admin.ask("PUT", "/v1/groups/global/members", [{"user": name, "roles": [role]}])
-        return Person(self.url, name)
+        while True:
+            try:
+                return Person(self.url, name)
+            except AssertionError as err:  # those who were made up have tried too many passwords
+                if "wait a minute" not in str(err):
+                    raise
+            time.sleep(1)
 
     def _asker(self, role: str) -> Person:
         if not role:
@@ -115,6 +128,7 @@ class Stock:
         benchmark = owner.ask("POST", "/v1/benchmarks", self._benchmark)["id"]
         artifact = owner.ask("POST", "/v1/artifacts", headers=_METADATA, content=b"wind")["id"]
         recording = owner.send(self._recording)
+        owner.send(self._marked)
         told = {"filter": {"type": "EQ", "key": "recording", "value": recording}}
         episodes = [each["id"] for each in owner.ask("POST", "/v1/episodes/list", told)["items"]]
         for place in (f"benchmarks/{benchmark}", f"artifacts/{artifact}", f"episodes/{episodes[0]}"):
@@ -210,6 +224,34 @@ class Fuzzer:
             if only in ("", found.ok().label):
                 self._ask(found.ok(), names, examples)
 
+    def run_pages(self, examples: int, only: str = "") -> None:
+        """Asks for each page, and sends each form, or only that of one path."""
+        for number, route in enumerate(page_routes()):
+            if number % _RENEWED_EVERY == 0:
+                names = self._stock.renew()
+                keys, episodes = names["benchmark_id"], names["episode_id"]
+                known = {**names, "key": keys, "dataset": keys, "uri": episodes, "uris": episodes}
+                known |= {"filter": _TEXTS, "name": names["group"]}
+            if only in ("", route.path):
+                self._ask_page(route, known, examples)
+
+    def _ask_page(self, route: Any, known: dict[str, list[Any]], examples: int) -> None:
+        rng = random.Random(f"{self._seed} {route.methods} {route.path}")
+        with contextlib.ExitStack() as stack:
+            browsers = {
+                role: stack.enter_context(Browser(self._url, person.name))
+                for role, person in self._stock.askers.items()
+                if role != "reader"  # a token, which no page takes
+            }
+            for _ in range(examples):
+                role = rng.choice(list(browsers))
+                answer = browsers[role].ask(route, known, rng)
+                self.statuses[f"page {answer.status_code}"] += 1
+                for what in wrong(answer):
+                    sent = f"{answer.request.method} {answer.request.url} {answer.request.content[:500]!r}"
+                    told = f"as {role or 'nobody'}: {sent[:1500]}\n    {answer.content[:500]!r}"
+                    self.findings.setdefault(f"{route.path}: {what}", told)
+
     def _ask(self, operation: Any, names: dict[str, list[Any]], examples: int) -> None:
         rng = random.Random(f"{self._seed} {operation.label}")
         known = Known(names, rng)
@@ -277,6 +319,7 @@ def main() -> None:
         fuzzer(chosen.engine, Path(folder), chosen.seed, guests=not chosen.no_guests) as made,
     ):
         made.run(chosen.examples)
+        made.run_pages(chosen.examples)
     for what, first in made.findings.items():
         print(f"{what}\n    {first}\n")
     print(f"{made.statuses.total()} requests, {json.dumps(dict(made.statuses.most_common()))}")

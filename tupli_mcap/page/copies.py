@@ -16,6 +16,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from starlette.background import BackgroundTask
 from starlette.types import Receive, Scope, Send
 
+from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
@@ -103,14 +104,17 @@ def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
 
     Raises:
         MissingExtraError: PyAV is not installed.
-        RecordingError: the episode has no pictures.
+        NotFoundError: the episode has no pictures.
     """
     from tupli_mcap.replay import film
 
     recording = shelf.open(header.recording)
     position = int(recording.index["episode"].searchsorted(header.episode))
     with _folder() as folder:
-        film([recording.episodes[position]], folder / "episode.mp4")
+        try:
+            film([recording.episodes[position]], folder / "episode.mp4")
+        except RecordingError as err:
+            raise NotFoundError(str(err)) from err
         return folder / "episode.mp4"
 
 
