@@ -1206,7 +1206,7 @@ class TestProgram:
         assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")
         assert fails("frobnicate", code=2) == "No such command 'frobnicate'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
-        assert fails("info", code=2) == "Missing argument 'FILE|DIR'; see tupli-mcap info --help"
+        assert fails("info", code=2) == "Missing argument 'PATH|URL'; see tupli-mcap info --help"
 
     def test_debug_shows_the_traceback(self, here: Path) -> None:
         for args in (("--debug", "info", "none.mcap"), ("info", "none.mcap", "--debug")):

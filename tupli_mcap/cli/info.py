@@ -113,7 +113,7 @@ def info(
     filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
-    """Show what is in a recording, or in the recordings of a directory or a server.
+    """Show what is in a recording, a directory or a server.
 
     For a recording: its run, spaces, benchmark, returns and lengths of episodes,
     distributions of rewards, actions and states, channels and attachments. Distributions of

@@ -238,7 +238,7 @@ def episodes(
     limit: Limit = None,
     as_json: Json = False,
 ) -> None:
-    """List episodes of recordings, directories, storages and servers.
+    """List episodes of files, directories and servers.
 
     A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
     run.<name>, ...) with = != > >= < <= in, or ~ for a part of a text (run.name ~ "ppo"),
