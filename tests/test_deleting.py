@@ -74,7 +74,7 @@ def test_of_a_directory_by_filter(runs: Path) -> None:
 
 
 def test_never_a_whole_recording_by_the_way(runs: Path) -> None:
-    assert "nothing brings back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
+    assert "cannot bring back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
     assert seeds(runs) == [0, 1, 2, 3] * 2
     assert "say which" in run("delete", str(runs), code=2)
     run("delete", str(runs / "a.mcap"), "--episodes", "all", "--force")

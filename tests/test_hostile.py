@@ -621,14 +621,14 @@ def test_memory_that_runs_out_is_told(place: str, tmp_path: Path, monkeypatch: p
     if place == "open":
         monkeypatch.setattr(ChunkStore, "__init__", refuse)
         with pytest.raises(
-            RecordingError, match=r"opening a file of \d+ bytes takes more memory than there is"
+            RecordingError, match=r"opening a file of \d+ bytes needs more memory than there is"
         ):
             Recording(path)
         return
     dataset = TupliDataset.from_files(path)
     with Recording(path) as recording:
         monkeypatch.setattr(ChunkStore, "rows", refuse)
-        with pytest.raises(RecordingError, match=r"of \d+ steps takes more memory than there is \(Unable"):
+        with pytest.raises(RecordingError, match=r"of \d+ steps needs more memory than there is \(Unable"):
             if place == "read":
                 recording.read()
             elif place == "window":
@@ -643,7 +643,7 @@ def test_the_command_line_tells_that_memory_ran_out(
     begin_json("info")
     assert _report(MemoryError("Unable to allocate 18.3 GiB"), as_json=True) == 1
     out, err = capsys.readouterr()
-    assert "error: there is not enough memory" in err
+    assert "error: not enough memory" in err
     assert json.loads(out)["error"]["type"] == "MemoryError"
 
 

@@ -871,7 +871,7 @@ class TestFileStorage(StorageContract):
         assert storage.undo_benchmark_edit(header.id, dry_run=True).metadata.name == "cart pole"
         assert storage.undo_benchmark_edit(header.id).metadata.name == "cart pole"
         assert storage.undo_benchmark_edit(header.id).metadata == header.metadata
-        with pytest.raises(StorageError, match="nothing was edited"):
+        with pytest.raises(StorageError, match="has no edit to take back"):
             storage.undo_benchmark_edit(header.id)
         for nothing in ({}, {"name": " "}):
             with pytest.raises(StorageError, match="expected a name or a description"):
