@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tupli_mcap.dataset.which import choose_episodes, chosen_from
+from tupli_mcap.dataset.chosen import chosen_from
+from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import EpisodeData, Recording, write_recording
 from tupli_mcap.schema import F, parse_filter

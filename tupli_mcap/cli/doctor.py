@@ -79,7 +79,7 @@ def doctor(
     command exits with 1 if it finds an error (see --fail-on), or cannot read a file; it
     examines the other files all the same.
     """
-    from tupli_mcap.dataset.which import chosen_from
+    from tupli_mcap.dataset.chosen import chosen_from
     from tupli_mcap.doctor import Severity, examine
 
     if list_checks:

@@ -257,8 +257,8 @@ def trim(
     interrupted, and the state after its last step becomes its final state. An episode that
     loses its beginning loses its seed. The new recording has a new id, and no signature.
     """
+    from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.dataset.curate import trim_dataset
-    from tupli_mcap.dataset.which import chosen_ids
 
     begin, colon, stop = steps.partition(":")
     try:

@@ -48,7 +48,7 @@ _LONGEST_NAME = 24
 def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
     """Prints facts about the recordings of a directory or a server, or about the chosen episodes of them."""
     from tupli_mcap import open as open_dataset
-    from tupli_mcap.dataset.which import chosen_ids
+    from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.recording.about.success import success_of
     from tupli_mcap.recording.description import spread_of
     from tupli_mcap.storage.listing import find_recordings

@@ -128,7 +128,8 @@ def _chosen(
     source: str, episodes: str, wanted: BaseFilter | None
 ) -> Iterator[tuple[Recording, list[Episode]]]:
     """The chosen episodes and their recording. RecordingError if they are of several."""
-    from tupli_mcap.dataset.which import choose_episodes, chosen_from
+    from tupli_mcap.dataset.chosen import chosen_from
+    from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.recording import Recording
 
     if is_url(source) or not Path(source).is_dir():

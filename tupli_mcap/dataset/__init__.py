@@ -3,7 +3,8 @@
 opening            `open`: the dataset of a path, a URL, a storage, ...
 dataset            `Dataset`: filters, sorts, reads and saves episodes
 tupli, query       `TupliDataset`: PyTupli's interface; its three filters, and the columns read so far
-sources, which     lists and opens episodes; finds those that a word, a number or a filter means
+sources            lists and opens episodes
+which, chosen      finds those that a word, a number or a filter means: in one recording, in several
 keys               the values of episodes at a key
 columns/           whole columns: reads and saves them; as tables, and in the forms of other libraries
 access, items/     `windows`, `transitions`, and samples of them; reads steps by number

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from tupli_mcap.dataset.which import Chosen, Examinable, Subject, subjects_of
+from tupli_mcap.dataset.chosen import Chosen, Examinable, Subject, subjects_of
 from tupli_mcap.doctor.checks import CHECKS, Check
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
@@ -33,7 +33,7 @@ def examine(
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
             `TupliDataset` (its whole episodes: tuple filters do not count), a storage, or several of these.
             Deleted episodes are left out, except of an open `Recording`. Episodes chosen by
-            `dataset.which.chosen_from` are examined as chosen.
+            `dataset.chosen.chosen_from` are examined as chosen.
         checks: ids of the checks to run (see `CHECKS`); by default, all. skip: ids of those to leave out.
         thresholds: by the id of a check, values of its thresholds (see `CHECKS[id].thresholds`).
         episode_filter: examine only episodes that match it.

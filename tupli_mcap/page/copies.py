@@ -81,7 +81,7 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
         MissingExtraError: rerun-sdk is not installed.
         RecordingError: the episodes cannot be compared.
     """
-    from tupli_mcap.dataset.which import Chosen
+    from tupli_mcap.dataset.chosen import Chosen
     from tupli_mcap.viewer.plan import plans_of
     from tupli_mcap.viewer.sdk import rerun_sdk
     from tupli_mcap.viewer.targets import to_file

@@ -11,7 +11,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from tupli_mcap.dataset.which import Examinable, Subject, named_positions, subjects_of
+from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_of
+from tupli_mcap.dataset.which import named_positions
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes

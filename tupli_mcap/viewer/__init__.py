@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tupli_mcap.dataset.which import Source, chosen_from
+from tupli_mcap.dataset.chosen import Source, chosen_from
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.notebook import Display, in_notebook

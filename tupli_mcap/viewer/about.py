@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tupli_mcap.dataset.which import Chosen
+from tupli_mcap.dataset.chosen import Chosen
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.dataset.which import Source, chosen_from
+from tupli_mcap.dataset.chosen import Source, chosen_from
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording

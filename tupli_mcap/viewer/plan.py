@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.dataset.which import Chosen, extremes
+from tupli_mcap.dataset.chosen import Chosen, extremes
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording

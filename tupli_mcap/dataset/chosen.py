@@ -1,0 +1,325 @@
+"""Finds the episodes that a user means in files, directories, servers, datasets and storages.
+
+Storages take long to import, and most files need none, so they are imported where they are needed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
+
+import numpy as np
+
+from tupli_mcap.dataset.which import (
+    WORDS,
+    Positions,
+    bounds_of,
+    candidates,
+    extreme,
+    named_positions,
+    positions_of,
+)
+from tupli_mcap.errors import FilterError, RecordingError, TupliError
+from tupli_mcap.recording import Recording
+from tupli_mcap.remote import is_server, is_url, shown
+
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.sources import Source as EpisodeSource
+    from tupli_mcap.dataset.tupli import TupliDataset
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader
+    from tupli_mcap.storage import TupliStorage
+
+__all__ = [
+    "Chosen",
+    "Examinable",
+    "Source",
+    "Subject",
+    "chosen_from",
+    "chosen_ids",
+    "extremes",
+    "subjects_of",
+]
+
+_CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
+_MOST_OPEN: Final = 200
+Source = Recording | str | os.PathLike[str]
+Examinable: TypeAlias = Union[Source, "Listed", "TupliDataset", "TupliStorage"]
+
+
+@runtime_checkable
+class Listed(Protocol):
+    """The part of a `Dataset` that this module needs; it may not import `dataset`."""
+
+    def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
+        """The source that opens its recordings, and its episodes that match the filter."""
+
+
+class Chosen(NamedTuple):
+    """Episodes of a recording, by position."""
+
+    recording: Recording
+    positions: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A recording and how to open it.
+
+    Attributes:
+        choose: returns the positions of the chosen episodes in order.
+        error: why it cannot be opened, if that is known already.
+    """
+
+    name: str
+    open: Callable[[], AbstractContextManager[Recording]]
+    choose: Callable[[Recording], Positions]
+    error: TupliError | None = None
+
+
+def subjects_of(
+    source: Examinable | Chosen | Iterable[Examinable | Chosen], episode_filter: BaseFilter | None
+) -> Iterator[Subject]:
+    """The recordings of a path, a directory, a recording, a dataset (each once), a storage, or several of those.
+
+    The filter does not apply to `Chosen`, which are chosen already.
+
+    Raises:
+        RecordingError: it is none of those.
+        FilterError: the filter names an unknown field.
+    """
+    from tupli_mcap.dataset.tupli import TupliDataset
+    from tupli_mcap.storage import TupliStorage
+
+    if isinstance(source, str) and is_server(source):
+        server = _server(source)
+        yield from _of_headers(server, server.episodes(None, episode_filter))
+    elif isinstance(source, str | os.PathLike):
+        yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
+    elif isinstance(source, Recording):
+        choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
+        yield Subject(source.name, lambda: nullcontext(source), choose)
+    elif isinstance(source, TupliDataset):
+        dataset = source if episode_filter is None else _narrowed(source, episode_filter)
+        yield from _of_headers(dataset._query.source, dataset.preview())
+    elif isinstance(source, Listed):
+        yield from _of_headers(*source._episodes(episode_filter))
+    elif isinstance(source, TupliStorage):
+        yield from subjects_of(TupliDataset(source), episode_filter)
+    elif isinstance(source, Chosen):  # before other iterables, since it is a tuple
+        recording, positions = source
+        yield Subject(
+            recording.name, lambda: nullcontext(recording), lambda _: np.asarray(positions, np.int64)
+        )
+    elif isinstance(source, Iterable):
+        for item in source:
+            yield from subjects_of(item, episode_filter)
+    else:
+        raise RecordingError(f"expected a path, Recording, Dataset or storage, found {source!r:.80}")
+
+
+def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
+    from tupli_mcap.storage.listing import find_recordings
+
+    error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
+    files = [name]
+    if not is_url(name):
+        try:
+            files = [str(file) for file in find_recordings(Path(name))]
+        except TupliError as err:
+            files, error = [], err
+    for file in files:
+        yield Subject(file, partial(Recording, file, cache_bytes=_CACHE_BYTES), choose)
+    if not files:
+        yield Subject(name, _unopened, _all, error)
+
+
+def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iterator[Subject]:
+    by_recording: dict[str, list[EpisodeHeader]] = {}
+    for header in headers:
+        by_recording.setdefault(header.recording, []).append(header)
+    for name, group in by_recording.items():
+        numbers = [header.episode for header in group]
+        yield Subject(name, partial(source.open, name, numbers), partial(positions_of, headers=group))
+
+
+def _narrowed(dataset: TupliDataset, episode_filter: BaseFilter) -> TupliDataset:
+    own = dataset._query.episode_filter
+    return dataset.with_episode_filter(episode_filter if own is None else own & episode_filter)
+
+
+def _all(recording: Recording) -> Positions:
+    return np.arange(len(recording.index))
+
+
+def _unopened() -> AbstractContextManager[Recording]:
+    raise RecordingError("there is nothing to open")
+
+
+@contextlib.contextmanager
+def chosen_from(
+    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+) -> Iterator[list[Chosen]]:
+    """The chosen episodes of recordings, which are open within the block.
+
+    Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a
+    number is that of each recording which has it; a file in it that cannot be read is left out with a warning.
+
+    Raises:
+        RecordingError: a source cannot be opened, or has no such episode.
+        FilterError: the choice of episodes, or the filter, has no meaning.
+    """
+    given = [sources] if isinstance(sources, Recording | str | os.PathLike) else list(sources)
+    text = (
+        episodes
+        if isinstance(episodes, str)
+        else ",".join(map(str, ["all"] if episodes is None else episodes))
+    )
+    wanted = _parsed(filter) if isinstance(filter, str) else filter
+    with ExitStack() as stack:
+        chosen: list[Chosen] = []
+        for source in given:
+            if not isinstance(source, Recording) and is_server(os.fspath(source)):
+                chosen += _of_server(os.fspath(source), text, wanted, stack)
+                continue
+            if not isinstance(source, Recording) and _is_directory(source):
+                chosen += _of_directory(Path(source), text, wanted, stack)
+                continue
+            if not isinstance(source, Recording):
+                source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
+            among = candidates(source, wanted)
+            chosen.append(Chosen(source, named_positions(source, among, text, wanted)))
+        if not chosen:
+            raise RecordingError("expected a recording to show, found none; give its path")
+        yield chosen
+
+
+def chosen_ids(
+    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+) -> set[str]:
+    """The ids of the episodes that `chosen_from` gives, with the same errors."""
+    with chosen_from(sources, episodes, filter) as chosen:
+        return {item.recording.episodes[at].id for item in chosen for at in item.positions}
+
+
+def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
+    """The last, the best and the worst of some episodes, each with a caption: `199 (last, best)`."""
+    returns = np.concatenate([item.recording.index["return"][list(item.positions)] for item in chosen])
+    bounds = np.cumsum([0, *(len(item.positions) for item in chosen)])
+    words: dict[int, list[str]] = {}
+    for word in ("last", "best", "worst"):
+        at = len(returns) - 1 if word == "last" else extreme(word, returns)
+        words.setdefault(at, []).append(word)
+    found: dict[int, list[int]] = {}
+    told = []
+    for at, said in words.items():
+        which = int(np.searchsorted(bounds, at, side="right")) - 1
+        recording, positions = chosen[which]
+        position = positions[at - int(bounds[which])]
+        found.setdefault(which, []).append(position)
+        told.append(f"{recording.index['episode'][position]} ({', '.join(said)})")
+    return [Chosen(chosen[which].recording, positions) for which, positions in found.items()], told
+
+
+def _parsed(text: str) -> BaseFilter:
+    from tupli_mcap.schema import parse_filter
+
+    return parse_filter(text)
+
+
+def _is_directory(source: str | os.PathLike[str]) -> bool:
+    return not is_url(os.fspath(source)) and Path(source).is_dir()
+
+
+def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
+    from tupli_mcap.dataset.sources import numbers_by_recording
+
+    server = _server(address)
+    headers = server.episodes(None, filter)
+    numbers = np.array([header.episode for header in headers])
+    returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
+    named: dict[int, None] = {}
+    for item in (item.strip().lower() for item in text.split(",")):
+        if item not in WORDS:
+            first, last = bounds_of(item, text)
+            named.update(dict.fromkeys(np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()))
+        elif headers:
+            everywhere = {"all": range(len(numbers)), "first": [0], "last": [len(numbers) - 1]}
+            named.update(dict.fromkeys(everywhere.get(item) or [extreme(item, returns)]))
+    if not named:
+        why = "" if filter is None else f" that matches {filter}"
+        where = shown(address)
+        raise RecordingError(f"{where} has no episode {text!r}{why}; see tupli-mcap episodes {where}")
+    chosen = numbers_by_recording([headers[i] for i in named])
+    _check_few(len(chosen), shown(address))
+    opened = {name: stack.enter_context(server.open(name, wanted)) for name, wanted in chosen.items()}
+    return [
+        Chosen(recording, np.flatnonzero(np.isin(recording.index["episode"], chosen[name])).tolist())
+        for name, recording in opened.items()
+    ]
+
+
+def _server(address: str) -> EpisodeSource:
+    from tupli_mcap.dataset.sources import StorageSource
+    from tupli_mcap.storage import storage_at
+
+    return StorageSource(storage_at(address))
+
+
+def _check_few(recordings: int, where: str) -> None:
+    if recordings > _MOST_OPEN:
+        raise RecordingError(
+            f"expected episodes of at most {_MOST_OPEN} recordings, found {recordings} in {where}; choose fewer"
+        )
+
+
+def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
+    from tupli_mcap.storage.listing import find_recordings
+
+    items = list(dict.fromkeys(item.strip().lower() for item in text.split(",")))
+    named: dict[str, dict[str, tuple[float, list[int]]]] = {item: {} for item in items}  # by item and file
+    paths = find_recordings(folder)
+    if not paths:
+        raise RecordingError(f"{folder} holds no recording (.mcap)")
+    for path in paths:
+        try:
+            with Recording(path, cache_bytes=_CACHE_BYTES) as recording:
+                among = candidates(recording, filter)
+                for item in items:
+                    with contextlib.suppress(RecordingError):  # another one of the directory may have it
+                        positions = named_positions(recording, among, item, filter)
+                        named[item][str(path)] = float(recording.index["return"][positions[0]]), positions
+        except FilterError:
+            raise
+        except TupliError as err:
+            warnings.warn(f"{err}; it is left out", stacklevel=4)
+    chosen: dict[str, dict[int, None]] = {}
+    for item in items:
+        for file in _files_of(item, {file: total for file, (total, _) in named[item].items()}):
+            chosen.setdefault(file, {}).update(dict.fromkeys(named[item][file][1]))
+    if not chosen:
+        why = "" if filter is None else f" that matches {filter}"
+        raise RecordingError(
+            f"{folder} has no episode {text!r}{why} in any recording; see tupli-mcap ls {folder}"
+        )
+    _check_few(len(chosen), str(folder))
+    return [
+        Chosen(stack.enter_context(Recording(file, cache_bytes=_CACHE_BYTES)), list(positions))
+        for file, positions in chosen.items()
+    ]
+
+
+def _files_of(item: str, returns: dict[str, float]) -> list[str]:
+    """The files in which an item chooses an episode, among those that have one; `returns` are the returns by file."""
+    files = list(returns)
+    if not files or item not in ("best", "worst", "first", "last"):
+        return files
+    if item in ("first", "last"):
+        return [files[0 if item == "first" else -1]]
+    return [files[extreme(item, list(returns.values()))]]
