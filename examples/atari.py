@@ -1,4 +1,4 @@
-"""Breakout from stacked frames: each frame is stored once, and comes back stacked."""
+"""Record Breakout with stacked frames: each frame is stored once, and comes back stacked."""
 
 import ale_py
 import gymnasium as gym

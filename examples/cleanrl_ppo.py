@@ -36,7 +36,7 @@ for _ in range(UPDATES):
         delta = rewards[t] + 0.99 * following * going_on - values[t]
         advantages[t] = advantage = delta + 0.99 * 0.95 * going_on * advantage
         following, going_on = values[t], 1 - dones[t]
-    valid = dones.flatten() == 0  # the step after an end is a reset, whose action counts for nothing
+    valid = dones.flatten() == 0  # the call after an end is a reset, which ignores its action
     batch = [
         one.flatten(0, 1)[valid] for one in (states, actions, log_probs, advantages, advantages + values)
     ]

@@ -1,4 +1,4 @@
-"""What is good of a recording is kept: filtered, sorted, parted, annotated, saved; the rest is deleted."""
+"""Keep the good episodes of a recording: filter, sort, annotate, split and save them, and delete the rest."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ for name, part in (("train", train), ("test", test)):
 
 # the same as `tupli-mcap split train.mcap -o parts/train.mcap --episodes 10`
 parts = tupli_mcap.split_recording("train.mcap", "parts/train.mcap", episodes=10)
-print("parted   ", *(f"{part.path} ({part.steps} steps)" for part in parts))
+print("split    ", *(f"{part.path} ({part.steps} steps)" for part in parts))
 
 for path in ("all.mcap", "train.mcap"):  # a recording is one file
     Path(path).unlink()

@@ -1,4 +1,4 @@
-"""Three runs, one of which is to be found again: by its time, its returns and what was noted of it."""
+"""Record three runs, and find one of them again: by its time, its returns and its metadata."""
 
 import gymnasium as gym
 
@@ -6,7 +6,7 @@ import tupli_mcap
 
 
 def record(policy, gain):
-    """Five episodes of pushing the way the pole leans, and turns."""
+    """Records five episodes; pushes the cart the way the pole leans and turns."""
     with tupli_mcap.RecordEpisodes(
         gym.make("CartPole-v1"), "runs/", name=policy, metadata={"gain": gain}, tags=["by hand"]
     ) as env:

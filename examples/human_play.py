@@ -24,7 +24,7 @@ def keys():
 
 
 def human(state, action):
-    """The key that was pressed last; what was pushed before goes on."""
+    """The action of the key that was pressed last; without a key, the action before."""
     position, _, angle, _ = state
     lean = "/" if angle > 0.02 else "\\" if angle < -0.02 else "|"
     print(f"\r{' ' * round(30 + 12 * position)}{lean}".ljust(70), end="", flush=True)

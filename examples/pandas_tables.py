@@ -1,4 +1,4 @@
-"""Recorded episodes as tables: a row an episode, and a row a step."""
+"""Recorded episodes as tables: one row per episode, and one row per step."""
 
 import gymnasium as gym
 

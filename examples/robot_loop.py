@@ -1,4 +1,4 @@
-"""A robot that is recorded in its own control loop: two cameras, joints and an instruction; no Gymnasium environment.
+"""Record a robot in its own control loop: two cameras, joints and an instruction, without a Gymnasium environment.
 
 python examples/robot_loop.py [DIRECTORY]
 """
@@ -26,14 +26,14 @@ TASKS = ["put the red cup on the tray", "open the drawer", "pick up the screw"]
 
 
 class Robot:
-    """Stands in for the driver of a real one."""
+    """Stands in for the driver of a real robot."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
         self._joints = np.zeros(6, np.float32)
 
     def observe(self, instruction: str) -> dict[str, object]:
-        """What its sensors say now."""
+        """Reads the sensors."""
         return {
             "front": self._random.integers(0, 255, (48, 64, 3), dtype=np.uint8),
             "wrist": self._random.integers(0, 255, (32, 32, 3), dtype=np.uint8),

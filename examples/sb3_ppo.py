@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3, trained and evaluated; both are recorded."""
+"""Record the training and the evaluation of Stable-Baselines3's PPO."""
 
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
