@@ -134,7 +134,7 @@ def test_what_d3rlpy_does_not_have(tmp_path: Path, cartpole: TupliDataset) -> No
     with pytest.raises(SamplingError, match="expected at least one step, found an empty dataset"):
         mdp_dataset(texts.with_episode_filter(F("n_tuples") > 100))
     buffer = replay_buffer(cartpole)
-    with pytest.raises(SamplingError, match="expected to read only"):
+    with pytest.raises(SamplingError, match="this buffer of recorded steps is read-only"):
         buffer.append_episode(buffer.episodes[0])
 
 

@@ -110,7 +110,7 @@ def test_what_a_storage_refuses(tmp_path: Path) -> None:
         SamplingError, match="expected transitions with all fields, found none of next_states, term"
     ):
         RecordedStorage(dataset.transitions(fields=["states", "actions", "rewards"]))
-    with pytest.raises(SamplingError, match="expected to read only"):
+    with pytest.raises(SamplingError, match="a RecordedStorage is read-only"):
         RecordedStorage(transitions).set(0, None)
     with pytest.raises(RuntimeError, match="doesn't allow writing"):
         replay_buffer(transitions, 4).extend(RecordedStorage(transitions)[:2])

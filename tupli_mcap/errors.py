@@ -64,7 +64,7 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
 }
-"""What other libraries call the columns of steps, and what we do; the first that there is is meant."""
+"""Other libraries' names of the columns of steps, and ours: the error names the first of ours that the object has."""
 
 
 class TupliError(Exception):
@@ -99,16 +99,16 @@ class NotFoundError(StorageError, KeyError):
 
 
 class FilterError(TupliError, ValueError):
-    """A filter that has no meaning: an unknown key, a value that cannot be compared, bad syntax.
+    """An invalid filter: an unknown key, a value that cannot be compared, bad syntax.
 
     Attributes:
-        position: the character (from 0) of the filter's text where that is; None where it has no text.
+        position: the character (from 0) of the filter's text where the mistake is; None for a filter without a text.
     """
 
     position: int | None = None
 
     def at(self, position: int) -> Self:
-        """The same error, which says where it is."""
+        """The same error with a position."""
         self.position = position
         return self
 
@@ -140,18 +140,18 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 class SaysWhatIsMeant:
-    """Objects whose attributes are known: a wrong name says which one is meant, in notebooks too."""
+    """Suggests the name that may be meant when an attribute does not exist, in notebooks too."""
 
-    if not TYPE_CHECKING:  # where types are checked, a name that is not there is an error
+    if not TYPE_CHECKING:  # type checkers must still report unknown names
 
         def __getattr__(self, name: str) -> Any:
             known = dir(type(self))
-            if name in known:  # a property whose own code went wrong
+            if name in known:  # a property that raised AttributeError
                 return object.__getattribute__(self, name)
             meant = "" if name.startswith("_") else did_you_mean(name, [n for n in known if n[0] != "_"])
-            if name in _OTHERWISE and "read" in known:  # what has columns only once they are read
+            if name in _OTHERWISE and "read" in known:  # columns exist only in the result of `read`
                 meant = f" (read() gives its columns: read().{_OTHERWISE[name][0]})"
-            # with the object, too, Python would add a hint of its own
+            # without `obj=`: with it, Python would add a hint of its own
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}{meant}", name=name
             )

@@ -189,7 +189,7 @@ def left_below(root: Path) -> Iterator[Path]:
 
 
 def remove_left(paths: Iterable[Path]) -> int:
-    """Removes temporary files that nobody holds, and no others; returns the number of bytes that this frees."""
+    """Removes temporary files that nobody holds; returns the number of bytes freed."""
     freed = 0
     for path in paths:
         with _unheld(path) as unheld, contextlib.suppress(OSError):

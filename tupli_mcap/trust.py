@@ -1,4 +1,4 @@
-"""The environments that this user's machine may rebuild by running code from a file, and the keys that it trusts.
+"""The environments whose code from a file this user lets run, and the keys that the user trusts.
 
 A digest (the SHA-256 of an environment, see `tupli_mcap.environment`) is trusted when the user's own
 configuration directory holds a signature of it, made with a secret key that never leaves that directory. A

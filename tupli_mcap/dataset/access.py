@@ -70,7 +70,7 @@ class RandomAccess(SaysWhatIsMeant):
         steps without such an info. The field "frames" gives the recorded pictures of the states.
 
         Raises:
-            SamplingError: no episode is long enough, or an argument has no meaning.
+            SamplingError: no episode is long enough, or an argument is invalid.
         """
         steps, fields = self._with_more(fields)
         made = Windows(steps, length, stride, pad, history, fields=fields)
@@ -85,7 +85,7 @@ class RandomAccess(SaysWhatIsMeant):
         `Transition`; "infos", "info.<key>" and "frames" are as for `windows`.
 
         Raises:
-            SamplingError: the dataset is empty, or an argument has no meaning.
+            SamplingError: the dataset is empty, or an argument is invalid.
         """
         steps, fields = self._with_more(fields)
         return Transitions(steps, n_step, discount, fields=fields).of_episodes(self._values_now())

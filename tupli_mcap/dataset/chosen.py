@@ -173,7 +173,7 @@ def chosen_from(
 
     Raises:
         RecordingError: a source cannot be opened, or has no such episode.
-        FilterError: the choice of episodes, or the filter, has no meaning.
+        FilterError: the choice of episodes, or the filter, is invalid.
     """
     given = [sources] if isinstance(sources, Recording | str | os.PathLike) else list(sources)
     text = (

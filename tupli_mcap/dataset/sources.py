@@ -50,7 +50,7 @@ _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two b
 
 
 class DatasetError(TupliError, ValueError):
-    """A request to a dataset has no meaning: batches without steps, a negative seed."""
+    """An invalid request to a dataset: batches without steps, a negative seed."""
 
 
 class Source(Protocol):

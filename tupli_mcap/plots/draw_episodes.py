@@ -25,7 +25,7 @@ _UNITS = (("h", 3600.0), ("min", 60.0), ("s", 1.0))
 
 
 class _Axis(NamedTuple):
-    """The x axis of all panels: what it counts, and how many of that are one on it."""
+    """The x axis of all panels: what it counts, its label, and how many seconds are one unit of it ("time" only)."""
 
     x: X
     label: str
@@ -40,7 +40,7 @@ class _Axis(NamedTuple):
         return cls(x, f"time ({unit})", scale)
 
     def course(self, run: PlottedRun, name: str) -> tuple[Array, Array, Array]:
-        """Of the episodes of a run in the order of this axis: where each lies, its number, how it ended."""
+        """The episodes of a run in the order of this axis: the place, the number and the end of each."""
         at = run.places(self.x) / self.scale
         order = np.argsort(at, kind="stable")
         return at[order], run.numbers(name)[order], run.rows["end"][order]
@@ -49,7 +49,7 @@ class _Axis(NamedTuple):
 def add_episodes(page: Page, groups: Sequence[Group], x: X) -> None:
     """Panels of groups that have episodes.
 
-    Lengths that are all the same have no panel: the head says them.
+    There is no panel of lengths if all are equal: the head says the length.
     """
     page.heading("Episodes")
     axis = _Axis.of(x, groups)
@@ -103,7 +103,7 @@ def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axe
 def _draw_group(
     name: str, courses: Sequence[tuple[Array, Array, Array]], colour: str, axes: Any, *, dots: bool
 ) -> None:
-    """A running mean of a run; of several, their mean and interval as far as all of them go, and thin lines."""
+    """A running mean of one run. Of several, their mean and interval up to the end of the shortest, and thin lines."""
     lines = []
     for at, values, _ in courses:
         mean = running_mean(values, _window(len(values)))
@@ -126,7 +126,7 @@ def _draw_group(
 
 
 def _draw_one(at: Array, values: Array, ends: Array, name: str, axes: Any) -> None:
-    """A dot for each episode and a running mean; of many episodes, bands; of successes, the mean only."""
+    """A dot for each episode and a running mean; bands if there are many episodes; for success, only the mean."""
     if name != SUCCESS and len(at) > _MOST_DOTS:
         where, mean, low, tenth, ninetieth, high = bands(values, _GROUPS)
         where = at[where.astype(np.int64)]

@@ -1,4 +1,4 @@
-"""Panels of one episode, one below the other over the same steps."""
+"""Panels of one episode, below each other, over the same steps."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_trace(page: Page, measured: Measured, trace: Trace, *, several: bool) ->
             Cell(partial(_draw_picture, *picture), height, right=0.06, left=0.06) for picture in pictures
         ]
         page.add(cells, 7, tight=True)
-    if trace.length == 1:  # a panel for one point says no more
+    if trace.length == 1:  # a panel of one point shows nothing more
         page.text(_step_lines(measured, trace))
         return
     add = partial(_add_panel, page, trace)
@@ -81,7 +81,7 @@ def _step_lines(measured: Measured, trace: Trace) -> list[str]:
 def _add_panel(
     page: Page, trace: Trace, draw: Callable[..., None], height: float = _HEIGHT, label: str = ""
 ) -> None:
-    """A panel whose axis counts steps; without a label, the numbers are left to a panel below."""
+    """A panel whose axis counts steps; without a label, only a panel below shows the numbers."""
 
     def draw_over_steps(axes: Any) -> None:
         draw(axes)
@@ -93,7 +93,7 @@ def _add_panel(
 
 
 def _add_values(add: Callable[..., None], trace: Trace, leaves: Sequence[LeafValues], steps: bool) -> None:
-    """Lines of numbers, then of choices; a table where there are too many. steps: values hold for a whole step."""
+    """Lines of numbers, then of choices; a table if there are too many. steps: values are constant during a step."""
     numbers = [leaf for leaf in leaves if leaf.kind == "numbers"]
     if sum(len(leaf.elements) for leaf in numbers) > _MOST_LINES:
         add(partial(_draw_table, trace, numbers, True), _TABLE_HEIGHT)
@@ -110,7 +110,7 @@ def _add_values(add: Callable[..., None], trace: Trace, leaves: Sequence[LeafVal
 
 
 def by_scale(values: Array) -> list[list[int]]:
-    """Columns of a table (points, n) in groups that one axis can show: of about the same size, a few each."""
+    """Groups of the columns of a table (points, n), each for one axis: a few columns with values of a similar size."""
     sizes = np.abs(np.nan_to_num(values)).max(axis=0, initial=0)
     groups: list[list[int]] = []
     largest = 0.0
@@ -152,7 +152,7 @@ def _draw_choice(trace: Trace, leaf: LeafValues, i: int, axes: Any) -> None:
 
 
 def _draw_table(trace: Trace, leaves: Sequence[LeafValues], scaled: bool, axes: Any) -> None:
-    """A row for each dimension; scaled: its colours from its smallest to its largest value in the episode."""
+    """A row for each dimension. scaled: the colours of a row span its smallest to its largest value in the episode."""
     table = np.concatenate([trace.values[leaf.leaf.name] for leaf in leaves], axis=1).T
     if scaled:
         low, high = (end.reduce(table, axis=1, initial=np.nan)[:, None] for end in (np.fmin, np.fmax))

@@ -1,4 +1,4 @@
-"""Panels of values: histograms, bars of choices, heat maps of many dimensions, and maps of where the states lie."""
+"""Panels of values: histograms, bars of choices, heat maps of many dimensions, and maps of visited states."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEVELS = (0, 1, 5, 10, 25, 50, 75, 90, 95, 99, 100)  # percents of the quantiles
 _MOST_PANELS = 16
 _HEIGHT, _MAP_HEIGHT, _TABLE_HEIGHT = 1.15, 2.1, 1.7
 _BINS, _MAP_BINS, _MOST_MAPS = 40, 60, 4
-_NAMED_BARS, _BARS, _TICKS = 12, 40, 24  # of more, the values are not named, an outline, not all numbered
+_NAMED_BARS, _BARS, _TICKS = 12, 40, 24  # above these: no names; an outline; few numbers
 _SCALES = 10  # how much the sizes of dimensions in one heat map may differ for a linear scale
 
 
@@ -89,7 +89,7 @@ def _draw_quantiles(dimensions: Sequence[Dimension], axes: Any) -> None:
     style.heat_map(axes, table.T, "value", cmap="RdBu_r", norm=norm, origin="lower")
     axes.set_title(f"quantiles of each of the {len(dimensions)} dimensions")
     axes.set_yticks(range(len(LEVELS)), [f"{level}%" for level in LEVELS], fontsize=7.5)
-    # Where there are several leaves, a line between them and a name below each; else numbers.
+    # Several leaves get a line between them and a name below each; one leaf gets numbers.
     starts = [at for at, (_, i) in enumerate(dimensions) if i == 0]
     names = [short_path(dimensions[start][0][0].leaf) for start in starts]
     if len(starts) == 1:
@@ -134,7 +134,7 @@ def _draw_named(leaves: Leaves, names: Sequence[str], axes: Any) -> None:
 
 
 def _draw_bars(shares: Sequence[Array], start: int, axes: Any) -> None:
-    """Bars over the whole numbers from `start` on; outlines where there are many, or several recordings."""
+    """Bars over the whole numbers from `start` on; outlines if there are many numbers, or several recordings."""
     edges = start - 0.5 + np.arange(len(shares[0]) + 1)
     if len(shares) == 1 and len(shares[0]) <= _BARS:
         axes.bar(edges[:-1] + 0.5, shares[0], 0.8, color=style.BLUE)
@@ -177,13 +177,13 @@ def _draw_shares(leaf: LeafValues, axes: Any) -> None:
 
 
 def most_varying(states: Sequence[Leaves]) -> list[int]:
-    """Which of the dimensions (at most four) vary most in the first recording, the largest deviation first."""
+    """The dimensions (at most four) with the largest standard deviation in the first recording, in descending order."""
     stds = np.array([leaves[0].std[i] for leaves, i in _dimensions(states)])
     return [at for at in np.argsort(-stds, kind="stable").tolist() if 0 < stds[at] < LARGEST][:4]
 
 
 def add_coverage(page: Page, states: Sequence[Leaves], names: Sequence[str]) -> None:
-    """Where the states lie: of one recording over two pairs of dimensions; of several, over one pair for each."""
+    """Maps of the states: of one recording, over two pairs of dimensions; of several, over one pair for each."""
     varying = most_varying(states)
     pairs = [sorted(varying[:2])] if len(varying) > 1 else []
     if len(varying) > 2 and len(names) == 1:

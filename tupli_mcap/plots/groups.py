@@ -21,7 +21,7 @@ _STARTED = re.compile(r"[-_. ]+\d{10}$")  # the time (s) at the end of CleanRL's
 
 
 class PlottedRun(NamedTuple):
-    """The recordings of a run: several where it went on in several files, or recorded in several processes."""
+    """The recordings of a run: several if it went on in a new file, or recorded in several processes."""
 
     recordings: list[Measured]
 
@@ -40,7 +40,7 @@ class PlottedRun(NamedTuple):
         )
 
     def places(self, x: X) -> Array:
-        """Where each of `rows` lies: its number; the steps of the run, or the seconds since its start, when it ended.
+        """The place of each of `rows` on the x axis: its number, or the steps or seconds of the run until its end.
 
         Steps of episodes that were not chosen count.
         """
@@ -83,8 +83,8 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
     """Groups in the order of their first recordings.
 
     Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
-    settings, and the same environment and split. A run that names no seed is by itself, with all files that it went on
-    in; so is a recording that was made of others.
+    settings, and the same environment and split. A run that names no seed is a group by itself, with all its files; so
+    is a recording that was made of others.
     """
     found: dict[Any, dict[Any, list[Measured]]] = {}
     uuids = set()
@@ -106,7 +106,7 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 
 
 def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
-    """The name of a group, with what tells its key from those of other groups with this name."""
+    """The name of a group, with the parts of its key that differ from other groups of the same name."""
     differing = [parts for parts in zip(key, *keys, strict=False) if len(set(parts)) > 1]
     told = ", ".join(Path(str(own)).name for own, *_ in differing if own)
     return f"{name} ({told})" if told else name
@@ -127,7 +127,7 @@ def _seedless(one: Measured) -> tuple[str, ...] | None:
 
 
 def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
-    """Which numbers of episodes get a panel: success, then some of infos and metadata that vary; and notes."""
+    """The numbers of episodes that get a panel (success, then some that vary of infos and metadata), and notes."""
     known = dict.fromkeys(key for group in groups for one in group.recordings for key in one.numbers)
     shown, notes = [SUCCESS] if SUCCESS in known else [], []
     for start in (INFO, METADATA):

@@ -1,4 +1,4 @@
-"""Reads what a report shows of a recording: numbers of its episodes, values of its steps, and episodes step by step."""
+"""Reads a recording for a report: numbers of its episodes, values of its steps, and some episodes step by step."""
 
 from __future__ import annotations
 
@@ -122,9 +122,9 @@ def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES
 
 
 def _read(recording: Recording, positions: Array, most: int) -> tuple[dict[str, Array], int]:
-    """The steps of some episodes by leaf, (steps, size), but for images and variable size; and how many they are.
+    """The steps of some episodes by leaf, (steps, size), without images and leaves of variable size; and their number.
 
-    A few megabytes at a time, until there are `most`.
+    Reads a few megabytes at a time, until there are `most` steps.
     """
     leaves = [leaf for leaf in recording.layout.leaves if leaf.kind != "variable" and not leaf.apart]
     parts: dict[str, list[Array]] = {leaf.name: [] for leaf in leaves}
@@ -197,13 +197,13 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
 
 
 def _seeds(recording: Recording, positions: Array) -> list[int]:
-    """Each seed once."""
+    """The different seeds."""
     seeds = recording.seeds
     return sorted({seed for i in positions.tolist() if (seed := seeds[i]) is not None})
 
 
 def _random_episodes(positions: Array, lengths: Array, most: int) -> Array:
-    """All positions, or those of random episodes (always the same) of at most so many steps; of one at least."""
+    """All positions if they have at most so many steps; else a random choice (always the same) of at least one."""
     order = np.random.default_rng(0).permutation(len(positions))
     fitting = max(1, int(np.searchsorted(np.cumsum(lengths[order]), most, side="right")))
     return positions[np.sort(order[:fitting])]

@@ -41,12 +41,12 @@ def report(
     """Numbers of the episodes of a recording, its states, actions and rewards, and one episode; or several compared.
 
     The numbers are returns, lengths, success, and some of infos (their means) and of metadata.
-    Runs that differ by their seeds only are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
-    the runs, see `plots.statistics.mean_interval`), as far as all of them go. They are those whose names are the same
-    without `seed3`, or without the `seed` of their settings.
+    Runs that differ only by their seeds are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
+    the runs, see `plots.statistics.mean_interval`), up to the end of the shortest. Two runs differ only by their seeds
+    if their names are equal without `seed3`, or without the `seed` of their settings.
 
-    At most 128 MiB of steps and 20,000 infos of a recording are read: of longer ones, randomly chosen episodes; the
-    report says so. Nothing in a file is executed.
+    At most 128 MiB of steps and 20,000 infos of a recording are read. Of a longer one, randomly chosen episodes are
+    read, and the report says so. Nothing in a file is executed.
 
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
@@ -86,10 +86,10 @@ def report(
 class Report:
     """A page of pictures.
 
-    figure: matplotlib's, to be changed or saved in other ways. measured: the numbers behind it, a recording each.
-    groups: what has a colour of its own: a recording, or runs that differ by their seeds only.
+    figure: the matplotlib figure, which you may change, or save in other ways. measured: its numbers, by recording.
+    groups: each has a colour of its own: a recording, or runs that differ only by their seeds.
     traces: the episodes that are shown step by step, each with its recording.
-    notes: what is not shown, and what is a sample.
+    notes: sentences on what is not shown, and what is a sample.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class Report:
         return texts.html_fragment(self.title, self.facts, self.notes, svg, self.measured)
 
     def _draw(self, *, whole: bool) -> Any:
-        """The page; else without its head and its notes."""
+        """Draws the page; unless `whole`, without its head and its notes."""
         page = Page()
         if whole:
             texts.add_facts(page, self.title, self.facts, several=len(self.measured) > 1)
@@ -203,8 +203,8 @@ def _saved(figure: Any, format: str) -> bytes:
 
 
 def _shorten_names(measured: Sequence[Measured]) -> None:
-    """The names of several runs where all differ; else file names without directories and extension, longer where two
-    would be the same."""
+    """The names of the runs if all differ; else file names without directories and extension, or longer parts of the
+    paths if two would be equal."""
     names = [one.run.name[:_LONGEST_NAME] for one in measured]
     if len(measured) > 1 and all(names) and len(set(names)) == len(names):
         for one, name in zip(measured, names, strict=True):

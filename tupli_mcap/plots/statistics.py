@@ -25,7 +25,7 @@ Kind = Literal["numbers", "choices", "picture", "variable", "empty"]
 
 
 def drawable_numbers(values: Array) -> Array:
-    """As float64, with NaN for what cannot be drawn."""
+    """The numbers as float64, with NaN for those that cannot be drawn."""
     numbers = np.asarray(values, np.float64)
     return np.where(np.abs(numbers) <= LARGEST, numbers, np.nan)
 
@@ -34,10 +34,10 @@ class LeafValues:
     """The values of one leaf in some steps; every array has an entry for each element.
 
     kind: "numbers" (a Box), "choices" (a Discrete, ...: `counts` are kept), "picture" (only shown in a trace),
-    "variable" or "empty" (nothing is kept). elements: which of the flattened leaf are looked at; values: theirs,
-    (elements, steps). nan, infinite: how many values are. mean, std, least, most: of the finite values (population
-    standard deviation), NaN where there is none. counts: of choices, how often each value occurs, from `starts` on.
-    value_names: names of the values of a choice, or none.
+    "variable" or "empty" (nothing is kept). elements: indexes of the used elements of the flattened leaf; values: their
+    values, (elements, steps). nan, infinite: the numbers of such values. mean, std, least, most: of the finite values
+    (population standard deviation), NaN if there is none. counts: of choices, how often each value occurs, from
+    `starts` on. value_names: names of the values of a choice, or none.
     """
 
     nan: Array = np.empty(0)

@@ -24,7 +24,7 @@ _PIECE = 256 << 10  # least bytes of a piece
 _RANGE = 8 << 20  # bytes of each request of fsspec for a whole file
 _SECONDS_VARIABLE = "TUPLI_MCAP_REMOTE_SECONDS"
 _SECONDS = 120.0
-# Who finds no credentials in the environment asks the cloud's machine for them.
+# Without credentials in the environment, obstore would ask the cloud's machine for them.
 _WHERE_MACHINES_ASK = ("//169.254.", "//metadata.google.internal")
 _CLIENT = {"connect_timeout": "10s", "allow_http": True}
 # A body may take any time while bytes arrive; a broken request is retried for a minute.

@@ -11,7 +11,7 @@ Range = tuple[int, int]  # half-open: first byte, and the one after the last
 
 _LARGEST_GAP = 1 << 20
 _LARGEST_PIECE = 8 << 20
-# To save requests, gaps may be fetched too, up to a fifth of the wanted bytes, or so many bytes. Between two chunks are
+# To save requests, gaps are fetched too, up to a fifth of the wanted bytes, or so many bytes. Between two chunks are
 # the message indexes of the first, a seventh of a file of small steps: without this rule, reading a whole field would
 # take a request for each chunk.
 _WASTE = 5

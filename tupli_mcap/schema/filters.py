@@ -92,7 +92,7 @@ class BaseFilter(BaseModel):
     so that a filter equals the one that is read from its JSON.
 
     Raises:
-        FilterError: The filter has no meaning. (Validation of data, `model_validate` and so on, raises
+        FilterError: The filter is invalid. (Validation of data, `model_validate` and so on, raises
             pydantic's ValidationError with the same words.)
     """
 

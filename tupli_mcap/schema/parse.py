@@ -135,7 +135,7 @@ def parse_filter(text: str) -> BaseFilter:
     """The filter that a text describes.
 
     Raises:
-        FilterError: The text is no filter, or a comparison in it has no meaning; the message names the character
+        FilterError: The text is no filter, or a comparison in it is invalid; the message names the character
             (from 0) and what was expected there.
     """
     tokens = _checked_tokens(text)

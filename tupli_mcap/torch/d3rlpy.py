@@ -1,7 +1,7 @@
 """Datasets for d3rlpy: in memory, or read as they are sampled.
 
-An episode of d3rlpy's is a run of steps that follow each other: an episode, or what a tuple filter leaves of it between
-two cuts. Observations are an array, or a list of the arrays in a Dict or Tuple space; d3rlpy makes float32 of batches.
+An episode of d3rlpy is a sequence of consecutive steps. A tuple filter that leaves out steps of an episode cuts it into
+several. Observations are an array, or a list of the arrays in a Dict or Tuple space; d3rlpy makes float32 of batches.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def mdp_dataset(dataset: TupliDataset | SavedColumns, **options: Any) -> MDPData
 
 
 def replay_buffer(dataset: TupliDataset | SavedColumns, **options: Any) -> RecordedReplayBuffer:
-    """A replay buffer that reads what is sampled, within the dataset's cache; it keeps the rewards (4 bytes a step).
+    """A replay buffer that reads transitions when they are sampled, and keeps only the rewards (4 bytes a step).
 
     The same random numbers give the same batches as `mdp_dataset`. A batch of transitions is read at once;
     trajectories, and transitions of another picker than d3rlpy's basic one, are read episode by episode.
@@ -72,7 +72,7 @@ def replay_buffer(dataset: TupliDataset | SavedColumns, **options: Any) -> Recor
 
 
 class RecordedEpisode:
-    """An episode as d3rlpy's `EpisodeBase`, read when it is asked for something; its columns are not kept."""
+    """An episode as d3rlpy's `EpisodeBase`. Each access reads a column, and nothing keeps it."""
 
     def __init__(self, buffer: RecordedBuffer, number: int) -> None:
         self._buffer = buffer
@@ -118,7 +118,7 @@ class RecordedEpisode:
 
     @property
     def transition_count(self) -> int:
-        """One less where the episode did not end: the action after its last step is not known."""
+        """The number of steps, minus one if the last step is no terminal: d3rlpy needs the action after it."""
         return len(self._rows) - (not self.terminated)
 
     def whole(self) -> Episode:
@@ -151,7 +151,7 @@ class _Episodes(Sequence[RecordedEpisode]):
 
 
 class RecordedBuffer:
-    """Recorded transitions by number, as d3rlpy's `BufferProtocol`; nothing can be appended."""
+    """Recorded transitions by number, as d3rlpy's `BufferProtocol`; read-only."""
 
     def __init__(self, steps: Steps) -> None:
         rows = np.arange(len(steps))
@@ -177,7 +177,7 @@ class RecordedBuffer:
             SamplingError: always.
         """
         raise SamplingError(
-            "expected to read only: this buffer is what has been recorded; d3rlpy's MixedReplayBuffer adds another one"
+            "this buffer of recorded steps is read-only; add steps to another, and join both in a MixedReplayBuffer"
         )
 
     @property
@@ -267,7 +267,7 @@ def _actions_of(steps: Steps) -> tuple[ActionSpace, int]:
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return ActionSpace.CONTINUOUS, space.shape[0]
     raise SamplingError(
-        f"expected Discrete actions from 0, or a Box of one dimension, found {space}: d3rlpy has no other"
+        f"expected Discrete actions from 0, or a Box of one dimension, found {space}: d3rlpy supports no others"
     )
 
 
@@ -284,7 +284,7 @@ def _arrays(column: Any) -> Iterator[Array]:
     elif isinstance(column, np.ndarray):
         yield _two_dimensional(column)
     else:
-        raise SamplingError("expected states of a fixed size, found some that vary: d3rlpy has arrays only")
+        raise SamplingError("expected states of a fixed size, found some that vary: d3rlpy takes only arrays")
 
 
 def _two_dimensional(column: Array) -> Array:

@@ -49,16 +49,16 @@ def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
     """Checks that a state dict is of these items, with the same options.
 
     Raises:
-        SamplingError: it is another's.
+        SamplingError: it is of other items, or of other options.
     """
     if not isinstance(state, Mapping) or not {"items", *expected} <= set(state):
         raise SamplingError(
-            f"expected the state dict of such a dataset, with {', '.join(['items', *expected])}, found {state!r:.80}"
+            f"expected a state dict with the keys {', '.join(['items', *expected])}, found {state!r:.80}"
         )
     if state["items"] != identity:
         raise SamplingError(
-            "expected a state dict of the same items, found one of another dataset: the episodes, the filters, or "
-            "how items are cut out of them differ; resume with what the state was saved from"
+            "expected a state dict of the same items, found one of other episodes, filters or options of items; "
+            "resume with the dataset that the state was saved from"
         )
     for name, value in expected.items():
         if state[name] != value:

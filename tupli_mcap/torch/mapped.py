@@ -43,14 +43,14 @@ class MapDataset(Dataset[dict[str, Any]]):
         return Samples(self._reader.read(np.asarray(indices)), len(indices))
 
     def state_dict(self) -> dict[str, Any]:
-        """Says which items these are; where an epoch stands, the sampler knows."""
+        """Identifies the items. The position in an epoch is in the state of the sampler."""
         return {"items": self._reader.items.identity}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Checks that the state is one of the same items.
 
         Raises:
-            SamplingError: it is another's.
+            SamplingError: it is of other items.
         """
         check_state(state_dict, self._reader.items.identity, {})
 

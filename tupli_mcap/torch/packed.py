@@ -101,7 +101,7 @@ def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: d
     """The batch of another process, in the memory that this one shares.
 
     Raises:
-        RuntimeError: it is dead.
+        RuntimeError: that process is dead.
     """
     try:
         storage = rebuild(*arguments)

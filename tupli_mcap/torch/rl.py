@@ -1,4 +1,4 @@
-"""Transitions for TorchRL: TensorDicts with the keys it expects, in a storage that reads what is sampled."""
+"""Transitions for TorchRL: TensorDicts with the keys it expects, in a storage that reads them when they are sampled."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
     files itself.
 
     Raises:
-        SamplingError: they are no transitions over one step, or lack fields; for several steps TorchRL has
-            `MultiStepTransform`.
+        SamplingError: the items are no transitions over one step, or lack fields. (For several steps, use TorchRL's
+            `MultiStepTransform`.)
     """
 
     def __init__(self, transitions: Transitions) -> None:
@@ -94,7 +94,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         Raises:
             SamplingError: always.
         """
-        raise SamplingError("expected to read only: a RecordedStorage is what has been recorded")
+        raise SamplingError("a RecordedStorage is read-only; add steps to another storage")
 
     def _empty(self) -> None:
         self.set(None, None)
@@ -107,7 +107,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         """Checks that a state is of the same transitions.
 
         Raises:
-            SamplingError: it is of others.
+            SamplingError: it is of other transitions.
         """
         check_state(state_dict, self._transitions.identity, {})
 

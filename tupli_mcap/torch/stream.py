@@ -23,8 +23,8 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
 
     With a shuffle, chunks are read in a random order, and the items of many chunks at a time are mixed: each chunk is
     read about once an epoch. (`MapDataset` with `shuffle=True` is the exact shuffle.) Every item comes once an epoch,
-    in one of the ranks and one of the workers. `state_dict` says where the epoch stands, to the next batch: used by
-    torchdata's `StatefulDataLoader`, with as many workers as before, or by hand where there is none.
+    in one of the ranks and one of the workers. `state_dict` is the position in the epoch: the next batch. torchdata's
+    `StatefulDataLoader` saves and loads it, with the same number of workers; without workers, call it yourself.
 
     The same seed, epoch and number of workers give the same order. Without a shuffle, the number of workers does not
     matter; nor does it if `streams` is given and a multiple of it. Otherwise each worker reads different chunks.
@@ -35,13 +35,13 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         seed: decides the order together with `set_epoch`; without `set_epoch` each epoch has the same order, as in
             PyTorch's DistributedSampler. None draws a new order each time from PyTorch's random numbers
             (`torch.manual_seed`), and is for one rank only.
-        drop_last: only full batches, the same number in every rank, as gradients that are averaged over ranks need.
-        rank, ranks: the part of the items; by default that of `torch.distributed`, if it is initialised.
+        drop_last: only full batches, and the same number in every rank: training that averages gradients needs this.
+        rank, ranks: which of how many parts of the items; by default that of `torch.distributed`, if initialised.
         streams: number of parts of the order; by default the number of workers.
         worker_cache_bytes: budget of each worker for decoded chunks; chunks of half as many bytes are mixed.
 
     Raises:
-        SamplingError: an argument has no meaning.
+        SamplingError: an argument is invalid.
     """
 
     def __init__(

@@ -84,7 +84,7 @@ def _bars(values: Any) -> Any:
     bars, places = (tensor_array([column], ["episode"]) for column in (means, bounds[:-1]))
     return rr.BarChart(
         bars, abscissa=places, widths=np.diff(bounds), color=_BAR
-    )  # as wide as the episodes it stands for
+    )  # a bar is as wide as the episodes that it averages
 
 
 def card(recording: Recording) -> str:

@@ -1,4 +1,4 @@
-"""Reads episodes as blocks of rows that are sent to Rerun at once, with the positions of the rows on the timelines."""
+"""Reads episodes as blocks of rows, each sent to Rerun at once, with the positions of the rows on the timelines."""
 
 from __future__ import annotations
 

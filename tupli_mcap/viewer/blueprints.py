@@ -21,7 +21,7 @@ _ABOVE, _ALONE, _BESIDE = (
     12.0,
     6.0,
 )  # of all pictures: above plots of states, without them, in the other column
-_CROWDED = 10.0  # shares of plots that leave no room for pictures in the same column
+_CROWDED = 10.0  # above this sum of shares of plots, the column has no room for pictures
 _SHARES: dict[type, float] = {
     Words: 2.0,
     Infos: 2.0,
@@ -44,7 +44,7 @@ def blueprint_of(
     axis = _newest() if scene.grows else _time_axis(linked=scene.linked)
     pictures = [panel for panel in scene.beside if isinstance(panel, Picture | Camera)]
     beside = [panel for panel in scene.beside if not isinstance(panel, Picture | Camera)]
-    if not scene.states and not pictures:  # texts move to the place of states
+    if not scene.states and not pictures:  # without states, texts take their place
         states, beside = beside, []
     else:
         states = scene.states
@@ -54,7 +54,7 @@ def blueprint_of(
         if group
     ]
     plots = sum(share for _, share in left)
-    crowded = plots > _CROWDED  # so pictures stand beside them, not above
+    crowded = plots > _CROWDED  # so pictures are beside them, not above
     if pictures and not crowded:
         left.insert(0, (_pictures(pictures, roots, axis), _ABOVE if states else _ALONE))
     returns = rrb.BarChartView(

@@ -1,7 +1,7 @@
 """Makes a layout for Foxglove: a JSON file that makes it plot the fields of a recording's `/step` messages.
 
-Foxglove decodes the recording itself; the layout says which panel shows which field. Wide leaves get no plot, nor does
-float16, which messages hold as bits.
+Foxglove decodes the recording itself; the layout says which panel shows which field. It has no plots of wide leaves,
+nor of float16, which messages store as bits.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ _LONGEST = 80  # characters of a part of an entity path
 
 
 def escaped(text: str) -> str:
-    """Any text as one part of an entity path. One that must be cut or changed gets a checksum, to stay unique."""
+    """Any text as one part of an entity path. A text that must be cut or changed gets a checksum, to stay unique."""
     import rerun
 
     shown = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[:_LONGEST])
@@ -43,7 +43,7 @@ def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:
 
 
 def _text(key: object) -> str:
-    """A key of a space; UTF-8, and so the viewer, has no lone surrogates."""
+    """A key of a space as valid UTF-8, which the viewer needs: without lone surrogates."""
     return str(key).encode("utf-8", "replace").decode()
 
 

@@ -61,7 +61,7 @@ class Plan(NamedTuple):
     identity: str
     parts: Sequence[Part]
     shown: str
-    listed: bool = False  # it is one of several, so the viewer lists them
+    listed: bool = False  # it is one of several, so the viewer shows its list of recordings
 
     @property
     def blueprint(self) -> Any:
@@ -123,7 +123,7 @@ def _send_block(place: Place, scene: Scene, block: Block) -> None:
 
 
 def times_of(block: Block) -> Times:
-    """Where a block's rows lie on the timelines."""
+    """The positions of a block's rows on the timelines."""
     return Times(block.number, block.times, block.recording.labels.step_seconds, block.seams)
 
 
@@ -214,7 +214,7 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
 
 
 def _told_in_turn(parts: Sequence[Part]) -> Iterator[str]:
-    """For each episode, its begin on the timeline, and its facts."""
+    """For each episode, its first step on the timeline, and its facts."""
     yield "\n"
     for part in parts:
         recording, positions = part.chosen

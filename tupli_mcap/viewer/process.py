@@ -51,7 +51,7 @@ def viewer_program() -> Path:
 
 
 def run_quietly(program: Path, *arguments: str) -> str:
-    """What the program prints.
+    """Runs a program; returns what it prints.
 
     Raises:
         ViewerError: it cannot be run, or fails.

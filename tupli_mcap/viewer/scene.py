@@ -56,7 +56,7 @@ class Scene:
     beside: list[Panel] = field(default_factory=list)  # images, texts and infos, next to the plots
     unseen: list[str] = field(default_factory=list)
     rows: int = 0
-    grows: bool = False  # rows are added while it is shown
+    grows: bool = False  # whether rows are added while it is shown
 
     @property
     def panels(self) -> list[Panel]:

@@ -124,7 +124,7 @@ def _await_viewer(url: str) -> None:
     parts = urlsplit(url)
     try:
         address = parts.hostname, parts.port
-    except ValueError:  # not a port: the SDK says what is wrong
+    except ValueError:  # no valid port: the SDK raises the error
         return
     if None in address or not parts.scheme.startswith("rerun"):
         return

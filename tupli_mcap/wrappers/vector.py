@@ -42,10 +42,10 @@ from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, met
 class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
-    Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file stores the first sub-environment,
-    or, if that lives in another process, what `gymnasium.make_vec` knows of it. A metadata callback is copied for each
-    sub-environment. With `max_bytes` or `max_seconds`, a full file is left when no sub-environment is within an
-    episode; if there is always one that is, at a `reset` of all.
+    Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file describes the first
+    sub-environment; if that is in another process, as far as `gymnasium.make_vec` knows it. Each sub-environment gets
+    a copy of the metadata callback. With `max_bytes` or `max_seconds`, a new file begins as soon as the old one is full
+    and no sub-environment is within an episode; if one always is, at the next `reset` of all.
 
     Args:
         autoreset_mode: "NextStep", "SameStep" or "Disabled"; by default what the environment declares
@@ -135,7 +135,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         try:
             result = self.env.step(actions)
             states, rewards, terminals, timeouts, infos = result
-        except Exception:  # a step that an environment refuses may be no step
+        except Exception:  # an environment that raises may not have made a step
             work.state = DONE
             raise
         except BaseException:  # Ctrl-C: some environments may have taken it
@@ -181,7 +181,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             self._work.ask(self._forget, np.flatnonzero(taken[0] & np.logical_or(terminals, timeouts)))
 
     def _go_on(self, taken: Any, result: Any) -> None:
-        """In another file, if this one is full; and with what is to be on the disk."""
+        """Flushes and syncs if that is due, and begins a new file if this one is full."""
         self._writer.flush_if_due()
         self._writer.sync_step()
         if self.rotation.is_due(self._writer) and not self._recorder.is_running:
@@ -215,7 +215,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             if self._watches:
                 work.ask(self._forget, range(self.num_envs) if mask is None else np.flatnonzero(mask))
         except BaseException as err:
-            if work.is_whole_after(err):  # wherever the environments are now: the running episodes are over
+            if work.is_whole_after(err):  # the running episodes are over, whatever the environments did
                 work.state = BEGUN
                 self._recorder.refuse()
                 work.state = DONE
@@ -226,7 +226,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         return result
 
     def _sub_environments(self) -> list[Any]:
-        """Those in this process; of the others no drawn seed can be known."""
+        """The sub-environments in this process; the seeds that others draw are unknown."""
         envs = getattr(self.env.unwrapped, "envs", None)
         return list(envs) if isinstance(envs, list | tuple) else []
 
@@ -248,7 +248,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         return facts
 
     def _watch(self, taken: Any, result: Any) -> None:
-        """Callbacks and infos of a batch."""
+        """Calls the callbacks with a batch, and records its infos."""
         (stepped, actions), ask, before = taken, self._work.ask, self._states
         self._states = ask(self._each_state, result[0])
         self._recorder.put_infos(stepped, ask(self._asked, before, stepped, actions, result))
@@ -258,7 +258,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         return copy.deepcopy(list(iterate(self.env.observation_space, states)))
 
     def _asked(self, before: Any, stepped: Any, actions: Any, result: Any) -> list[dict[str, Any]]:
-        """What is to be recorded with the infos, by sub-environment; metadata are in `_texts` afterwards."""
+        """The infos to record, by sub-environment; puts metadata into `_texts`."""
         _, rewards, terminals, timeouts, infos = result
         entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         chosen = list(iterate(self.env.action_space, actions))

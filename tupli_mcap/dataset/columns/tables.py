@@ -1,4 +1,4 @@
-"""Datasets as tables of pandas or Arrow: a row for each step, or for each episode."""
+"""Datasets as tables of pandas or Arrow: one row per step, or one per episode."""
 
 from __future__ import annotations
 

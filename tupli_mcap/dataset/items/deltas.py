@@ -57,8 +57,8 @@ class DeltaWindows(StepItems[DeltaWindow]):
     Args:
         deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time"), the distances from
             the step: `{"state": [-2, -1, 0], "action": range(16)}`.
-        unit: "steps"; "seconds", where each step takes `step_seconds`; or "clock": seconds between the recorded times,
-            of which the nearest is taken.
+        unit: "steps"; "seconds", where each step takes `step_seconds`; or "clock", seconds by the recorded times: the
+            step with the nearest time is taken.
         step_seconds: time that a step takes (s).
 
     Raises:

@@ -36,7 +36,7 @@ class Sampler:
         seed: an integer from 0; None takes a random one.
 
     Raises:
-        SamplingError: an argument has no meaning, or weights are negative, NaN, infinite, all zero or too few.
+        SamplingError: an argument is invalid, or weights are negative, NaN, infinite, all zero or too few.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Sampler:
         """Sets the weights of some items (of some episodes with `by="episodes"`), from the next batch on.
 
         Raises:
-            SamplingError: the sampler has no weights, a place does not exist, or a weight has no meaning.
+            SamplingError: the sampler has no weights, a place does not exist, or a weight is invalid.
         """
         if self._tree is None:
             raise SamplingError(

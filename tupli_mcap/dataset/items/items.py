@@ -165,7 +165,7 @@ class Items(ABC, Generic[T]):
         """The value of an expression over `EpisodeHeader` for each episode (float64).
 
         Raises:
-            SamplingError: the items belong to no dataset, which alone knows its episodes; or a value is no number.
+            SamplingError: the items are of no dataset, so their episodes are unknown; or a value is no number.
         """
         if self._values_of is None:
             raise SamplingError(

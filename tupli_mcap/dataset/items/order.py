@@ -61,7 +61,7 @@ class Order:
         buffer: number of items in the blocks in use; by default 65,536, or as many as half the cache holds.
 
     Raises:
-        SamplingError: an argument has no meaning.
+        SamplingError: an argument is invalid.
     """
 
     def __init__(

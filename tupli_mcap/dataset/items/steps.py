@@ -34,7 +34,7 @@ _TOGETHER = 1 << 16  # rows that are looked at together
 
 
 class SamplingError(TupliError, ValueError):
-    """A request for steps has no meaning: a window longer than every episode, negative weights."""
+    """An invalid request for steps: a window longer than every episode, negative weights."""
 
 
 class Steps(Protocol):

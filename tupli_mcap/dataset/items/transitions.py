@@ -59,7 +59,7 @@ class Transitions(StepItems[Transition]):
     earlier.
 
     Raises:
-        SamplingError: an argument has no meaning, a field is unknown, or rewards of variable size would be summed.
+        SamplingError: an argument is invalid, a field is unknown, or rewards of variable size would be summed.
     """
 
     def __init__(

@@ -61,7 +61,7 @@ class Windows(Items[Window]):
     nearest one ("repeat"), or are zero ("zero"; None in a list), and `mask` marks them.
 
     Raises:
-        SamplingError: no episode is long enough, an argument has no meaning, or a field is unknown.
+        SamplingError: no episode is long enough, an argument is invalid, or a field is unknown.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """A storage on a server.
 
 client, people, recordings    `TupliAPIClient`: the methods of a storage, for people, and for recordings
-session, answers, tokens      requests with a sign-in; their answers and errors; where tokens are kept
+session, answers, tokens      signed-in requests; their answers and errors; the user's tokens
 outbox, waiting               recordings that are written on this machine first, and sent in the background
 upload                        sending one recording
 """

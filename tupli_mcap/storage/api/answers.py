@@ -27,7 +27,7 @@ __all__ = [
 
 LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
-_ANEW: Final = (410, 460)  # an upload that is gone, or has come with wrong bytes: it is begun anew
+_ANEW: Final = (410, 460)  # an upload that expired or got wrong bytes: begin it again
 _NO_ROUTE: Final = ("Not Found", "Method Not Allowed")  # as Starlette says it
 _WHICH: Final = "is it a tupli-mcap server, of a version like this one?"
 _T = TypeVar("_T")
@@ -53,14 +53,14 @@ class Page(BaseModel):
 
 
 class TokenPair(BaseModel):
-    """What a server gives who signs in."""
+    """The tokens of a sign-in."""
 
     access_token: str
     refresh_token: str
 
 
 def as_told(kind: type[_T], value: Any) -> _T:
-    """An answer as a model, or a list of models. StorageError if it does not fit."""
+    """Parses an answer as a model or a list of models. StorageError if it does not fit."""
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as err:
@@ -71,9 +71,9 @@ def as_told(kind: type[_T], value: Any) -> _T:
 
 
 def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
-    """The error that a refusal of the server at `url` stands for.
+    """The error for a refusal of the server at `url`.
 
-    sign_in: what to do if somebody else should ask; empty where nobody has to be signed in.
+    sign_in: tells the user how to sign in; empty for requests that need no sign-in.
     """
     status = response.status_code
     try:

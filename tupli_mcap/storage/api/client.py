@@ -51,11 +51,11 @@ _EPISODE_ID: Final = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 class TupliAPIClient(People, Recordings, TupliStorage):
     """A storage on the server at `url`: `tupli-mcap serve` starts one.
 
-    Without a URL it is that of TUPLI_MCAP_URL, of the last `login` or `set_url`, or of this machine. Recordings are
-    written on this machine first and sent in the background: recording neither waits for the server nor fails with it.
-    Every query waits until the server has all that this process has recorded, and of recordings that still grow the
-    ended episodes; so does the end of the program. What a program could not send, the next one sends. Usable from any
-    thread; in another process it is opened anew.
+    Without a URL, it is the server in TUPLI_MCAP_URL, of the last `login` or `set_url`, or on this machine. Recordings
+    are written to this machine's disk first and sent in the background, so recording never waits for the server, nor
+    fails if it is down. Before a query, the client sends everything that this process has recorded: finished
+    recordings, and the ended episodes of growing ones; so it does at exit. The next program sends what this one could
+    not. Thread-safe; a copy in another process opens its own connections.
 
     Raises:
         StorageError: the URL is no web server's; later, the server does not answer, or refuses.
@@ -78,33 +78,33 @@ class TupliAPIClient(People, Recordings, TupliStorage):
 
     @property
     def username(self) -> str:
-        """Who is signed in; empty if nobody is."""
+        """The signed-in user; empty if nobody is signed in."""
         return self._session.username
 
     def set_url(self, url: str) -> None:
-        """Use another server from now on, also in clients that are made without a URL. What was recorded for the one
-        before is sent there all the same."""
+        """Use another server from now on, also in new clients without a URL. Recordings for the old server are still
+        sent there."""
         session = Session(url)
         session.tokens.use(session.url)
         self.close()
         self.__init__(url)  # type: ignore[misc]
 
     def waiting(self) -> list[Waiting]:
-        """What was recorded to the server on this machine, by this process or others, and is not there yet."""
+        """The recordings on this machine, by this process or others, that the server does not have yet."""
         return self._outbox.waiting()
 
     def waiting_elsewhere(self) -> dict[tuple[str, str], int]:
-        """How many recordings wait for other servers and users, by these (address, name)."""
+        """The number of recordings that wait for other servers and users, by (address, name)."""
         return self._outbox.waiting_elsewhere()
 
     def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
-        """Wait until the server has all that this process has recorded: of recordings that still grow, the ended
+        """Wait until the server has everything that this process has recorded; of growing recordings, the ended
         episodes.
 
-        everything: also what other processes have left. tell: called with the number of bytes just sent.
+        everything: send the recordings of ended processes, too. tell: called with the number of bytes just sent.
 
         Raises:
-            StorageError: the server does not answer, or refuses some of it; that stays on this machine.
+            StorageError: the server does not answer, or refuses a recording, which then stays on this machine.
         """
         self._outbox.flush(everything=everything, tell=tell)
 
@@ -139,7 +139,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         return found
 
     def _note(self, benchmark: Benchmark) -> None:
-        """Notes what recording asks for, when the server may be away: a benchmark, and who records."""
+        """Keeps what recording needs while the server is down: the benchmark, and the user's name."""
         self._benchmarks[benchmark.id] = benchmark
         outbox_of(self._session)
 
@@ -319,7 +319,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         outbox_of(self._session)
 
     def logout(self) -> None:
-        """Sign out, here and on the server, after everything was sent that was recorded."""
+        """Send everything that was recorded, then sign out, here and on the server."""
         self.flush()
         self._session.sign_out()
 
@@ -329,7 +329,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         return [as_told(model, item) for item in pages(self._session, path, told)]
 
     def _count(self, method: str, path: str, told: Any = None, **options: Any) -> int:
-        """How many episodes the server has changed; 0 where it had done so already, and the answer was lost."""
+        """How many episodes the server changed; 0 if an earlier attempt changed them and its answer was lost."""
         answer = self._session.ask(method, path, told, **options)
         return 0 if answer is None else as_told(dict[str, int], answer)["episodes"]
 
@@ -342,12 +342,12 @@ class TupliAPIClient(People, Recordings, TupliStorage):
 
 
 def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:
-    """A filter, checked as a storage here would, as the server takes it."""
+    """A filter as the server takes it, checked here first."""
     return {"filter": None if filter is None else bound(filter, model).model_dump(mode="json")}
 
 
 def _hash(uri: str, kind: str) -> str:
-    """An id that can stand in a path. NotFoundError for what is none: nothing has it."""
+    """An id for a path. NotFoundError for a text that cannot be an id."""
     if not is_hash(uri):
         raise _unknown(kind, uri)
     return uri

@@ -1,13 +1,13 @@
-"""Recordings that wait for a server: written here first, and sent behind by one thread, which tries again for as long
-as the server is away.
+"""Recordings that wait for a server: written here first, then sent by one background thread, which tries again while
+the server is down.
 
-1. They lie below the directory of this user's data, by server and user, until the server has acknowledged them.
-2. One that nobody writes to and that was not finished is what a killed process has left: it is finished first.
-3. Whoever sends one holds its lock, as a writer would: of several processes one sends it, the others wait for that.
-4. What is damaged is saved as far as it can be, and the original is put below `damaged/`.
-5. Who asks the server something while a recording goes on sends the episodes that have ended since, as a recording of
-   their own with its UUID. The server takes it for a part, and the finished recording for all of its parts. How many
-   episodes have gone is noted beside it, so that those that are deleted there do not come back with the whole.
+1. They are in the user's data directory, by server and user, until the server has acknowledged them.
+2. An unfinished recording without a writer was left by a killed process. It is finished before it is sent.
+3. A process that sends a recording holds its lock, as a writer does: one process sends it, the others wait.
+4. Of a damaged recording, as much as possible is saved and sent; the original is moved to `damaged/`.
+5. A query while a recording grows first sends the episodes that ended since the last one, as a recording with the same
+   UUID. The server takes this as a part; the finished recording later replaces all parts. A note beside the recording
+   says how many episodes were sent, so that those deleted on the server do not come back with the whole.
 """
 
 from __future__ import annotations
@@ -61,8 +61,7 @@ os.register_at_fork(after_in_child=_forget_turn)
 
 
 def outbox_of(session: Session) -> Outbox:
-    """The outbox of a session's server and user: one in a process, however many clients there are. What is left in it
-    is sent."""
+    """The outbox of a session's server and user, one per process. Starts to send what earlier processes left in it."""
     with _turn:
         key = (os.getpid(), session.identity)
         if key not in _outboxes:
@@ -80,7 +79,7 @@ class Waiting(NamedTuple):
 
 
 class Outbox:
-    """The recordings that a user sends to a server. Usable from any thread."""
+    """The recordings that a user sends to a server. Thread-safe."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -94,7 +93,7 @@ class Outbox:
         self._alone: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
 
     def new_path(self, benchmark_id: str, name: str) -> Path:
-        """Where a recording may be written; nothing is there yet."""
+        """A new path for a recording."""
         directory = self.directory / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -110,7 +109,7 @@ class Outbox:
         return path
 
     def waiting(self) -> list[Waiting]:
-        """What the server does not have yet."""
+        """The recordings that the server does not have yet."""
         found = []
         for path in self._paths():
             with contextlib.suppress(FileNotFoundError):
@@ -118,7 +117,7 @@ class Outbox:
         return found
 
     def waiting_elsewhere(self) -> dict[tuple[str, str], int]:
-        """How many recordings wait for other servers and users, by these."""
+        """The number of recordings that wait for other servers and users, by (address, name)."""
         found = {}
         for path in self.directory.parent.glob(f"*/{_WHOSE}"):
             waiting = len(list(path.parent.glob("*/*.mcap")))
@@ -132,13 +131,13 @@ class Outbox:
         return sorted(self.directory.glob("*/*.mcap"))
 
     def _is_ours(self, path: Path) -> bool:
-        """Whether this process was given the path, or that of the recording that goes on in it (`run_0001`)."""
+        """Whether this process records to the path, or to the first file of its series (`run` of `run_0001`)."""
         return not self._given.isdisjoint((path.stem, path.stem.rpartition("_")[0]))
 
     # --- sending ---
 
     def send(self, path: Path) -> None:
-        """Sends a finished recording behind."""
+        """Sends a finished recording in the background."""
         with self._turn:
             self._behind[path] = None
             self._refused.pop(path, None)
@@ -148,7 +147,7 @@ class Outbox:
             self._turn.notify_all()
 
     def send_left(self) -> None:
-        """Sends behind what processes have left that have ended."""
+        """Sends the recordings of ended processes in the background."""
         if self.directory.is_dir():
             files.remove_left(files.left_below(self.directory))
         for path in self._paths():
@@ -156,15 +155,15 @@ class Outbox:
                 self.send(path)
 
     def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
-        """Waits until all that this process has recorded is on the server: of what it records just now, the episodes
-        that have ended.
+        """Waits until the server has everything that this process has recorded; of growing recordings, the ended
+        episodes.
 
-        everything: also what other processes have left.
+        everything: send the recordings of ended processes, too.
 
         Raises:
-            UnreachableError: the server does not answer; the recordings stay here, and are sent when it does.
-            SignInError: nobody is signed in any more; likewise.
-            StorageError: the server refuses some of it, which stays here.
+            UnreachableError: the server does not answer; the recordings stay here, and are sent later.
+            SignInError: the user is no longer signed in; likewise.
+            StorageError: the server refuses a recording, which stays here.
         """
         with self._turn:
             refused = dict(self._refused)
@@ -205,7 +204,7 @@ class Outbox:
                 self._behind.pop(path, None)
 
     def _send_now(self, path: Path, tell: Tell = lambda _: None) -> None:
-        """Sends what there is of a recording, or waits while another thread or process does."""
+        """Sends a recording as it is now, or waits while another thread or process sends it."""
         if self._session.identity != self._identity:
             raise SignInError(f"{path} is of {self._identity[1] or 'nobody'}, who is not signed in any more")
         with self._alone[path]:
@@ -245,7 +244,7 @@ class Outbox:
             warnings.warn(f"{path} was sent, and cannot be deleted here: {err}", RuntimeWarning, stacklevel=2)
 
     def _send_ended(self, path: Path) -> None:
-        """Sends the episodes that have ended, up to the first that goes on, and were not sent yet."""
+        """Sends the ended episodes that were not sent yet, up to the first running one."""
         with Recording(path) as recording:
             ended = {row.episode for row in rows_of(recording, Sidecar(), live=True)}
             new = []
@@ -264,7 +263,7 @@ class Outbox:
         files.write_bytes(note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
 
     def _send_at_exit(self, process: int) -> None:
-        """What a program has recorded is there when it has ended; what cannot be sent now is left for the next."""
+        """At exit, sends what the program has recorded; the next program sends the rest."""
         if os.getpid() != process:
             return
         try:

@@ -60,7 +60,7 @@ class Recordings:
 
         Raises:
             NotFoundError: there is no such recording, or another file has replaced it meanwhile.
-            FormatError: its bytes do not have the SHA-256 that the server has named.
+            FormatError: its bytes do not have the SHA-256 that the server named.
         """
         ticket = self._ticket(recording)
         if not ticket.whole or ticket.episodes != episodes:

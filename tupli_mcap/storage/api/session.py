@@ -1,5 +1,5 @@
-"""Requests to a server, signed in: tokens are renewed when they have expired, and what fails on the way is tried again
-where asking twice is as asking once."""
+"""Signed-in requests to a server. Renews expired tokens, and repeats requests that failed on the way, if repeating them
+is harmless."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["DEFAULT_URL", "TIMEOUT", "Session", "pages"]
 DEFAULT_URL: Final = "http://127.0.0.1:8080"
 TIMEOUT: Final = 60.0  # seconds without a byte
 _CONNECT_TIMEOUT: Final = 10.0
-_ATTEMPTS: Final = 4  # of a request that changes nothing when it is sent twice
+_ATTEMPTS: Final = 4  # of a request that may be repeated
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
 _MOST_REDIRECTIONS: Final = 3
 _NOTHING_LEFT: Final = 416  # there is nothing from that offset on
@@ -39,10 +39,10 @@ _users: dict[tuple[str, str], str] = {}  # by server and token of the environmen
 class Session:
     """Requests to one server, from any thread and any fork of the process.
 
-    A token in the environment (TUPLI_MCAP_TOKEN) comes before those that are kept.
+    A token in the environment (TUPLI_MCAP_TOKEN) takes precedence over stored ones.
 
     Raises:
-        StorageError: the address is none of a web server.
+        StorageError: the address is not that of a web server.
         MissingExtraError: httpx is not installed.
     """
 
@@ -71,23 +71,23 @@ class Session:
         """The connections of this process."""
         if self._closed:
             raise StorageError("the client is closed; open another one")
-        if self._process != os.getpid():  # a fork, in which those of its parent are not to be used
+        if self._process != os.getpid():  # a forked child must not use its parent's connections
             self._client, self._process = self._connected(), os.getpid()
         return self._client
 
     def another(self) -> Session:
-        """One of the same server and user, with connections of its own."""
+        """A session with the same server and user, and its own connections."""
         return Session(self.url, self.tokens)
 
     @property
     def known_user(self) -> str | None:
-        """Who is signed in, empty if nobody is; None while nobody knows whose the token in the environment is."""
+        """The signed-in user, empty if nobody is; None while the user of the token in the environment is unknown."""
         token = os.environ.get(_TOKEN_VARIABLE)
         return _users.get((self.url, token)) if token else self.tokens.username(self.url)
 
     @property
     def username(self) -> str:
-        """Who is signed in; empty if nobody is. Asks the server whose the token in the environment is."""
+        """The signed-in user; empty if nobody is. Asks the server for the user of a token in the environment."""
         if self.known_user is None:
             me = as_told(dict[str, Any], self.ask("GET", "/v1/me"))
             _users[self.url, os.environ[_TOKEN_VARIABLE]] = str(me.get("username", ""))
@@ -95,18 +95,18 @@ class Session:
 
     @property
     def identity(self) -> tuple[str, str, str]:
-        """Equal for sessions of one server and user, whose tokens lie at one place."""
+        """Equal for sessions with the same server, user and token store."""
         return self.url, self.username, str(self.tokens.path)
 
     def close(self) -> None:
-        """Close the connections; asking anything afterwards is a StorageError."""
+        """Close the connections; later requests raise StorageError."""
         self._closed = True
         self._client.close()
 
     # --- signing in ---
 
     def sign_in(self, username: str, password: str) -> None:
-        """Gets tokens for a user, and keeps them."""
+        """Gets tokens for a user, and stores them."""
         pair = self.ask("POST", "/v1/tokens", {"username": username, "password": password}, anonymous=True)
         self.tokens.put(self.url, username, as_told(TokenPair, pair).model_dump())
 
@@ -118,7 +118,7 @@ class Session:
             self.ask("POST", "/v1/tokens/end", {"refresh_token": refresh}, anonymous=True)
 
     def _renew(self, used: str) -> bool:
-        """Exchanges the refresh token, unless another process has just done so; False if there is nothing to use."""
+        """Exchanges the refresh token, unless another process has just done so; False if there is none."""
         with self.tokens.alone():
             known = self.tokens.tokens(self.url)
             if known.get("access_token") not in (None, used):
@@ -150,9 +150,9 @@ class Session:
         repeat: bool | None = None,
         **query: Any,
     ) -> Any:
-        """What the server answers to a JSON body, or to `content`, as a value; its refusals are raised as errors.
+        """Sends a JSON body, or `content`; returns the answer as a value. Raises the server's refusals as errors.
 
-        repeat: whether to ask again where the connection fails; by default, where the method says so.
+        repeat: repeat the request if the connection fails; by default, if its method is idempotent.
         """
         if content is None and told is not None:
             content = jsonvalue.dumps(told).encode()
@@ -178,9 +178,9 @@ class Session:
         headers: dict[str, str] | None = None,
         **options: Any,
     ) -> httpx.Response:
-        """A request, again if it fails on the way and may be repeated; refusals are raised as errors.
+        """Sends a request, and repeats it if the connection fails and it may be repeated. Raises refusals as errors.
 
-        stream: the body is read, and the answer closed, by the caller; redirections are followed.
+        stream: the caller reads the body and closes the answer; redirections are followed.
         """
         token = "" if anonymous else self._token()
         options |= {"headers": headers or {}, "stream": stream}
@@ -195,7 +195,7 @@ class Session:
         return response
 
     def _sign_in(self) -> str:
-        """What to do if the server wants to know who asks."""
+        """Tells the user how to sign in."""
         if os.environ.get(_TOKEN_VARIABLE):
             return f"put another token into {_TOKEN_VARIABLE}, or take it out of the environment and sign in"
         return f"sign in: tupli-mcap login USER --url {shown(self.url)}"
@@ -231,7 +231,7 @@ class Session:
         raise UnreachableError(f"{shown(self.url)} does not answer")
 
     def _answered(self, method: str, path: str, stream: bool, **options: Any) -> httpx.Response:
-        """The answer to a request; to a GET that of the bucket to which it is sent on, which is told no token."""
+        """The answer to a request. Follows the redirection of a GET to a bucket, without sending the token there."""
         client = self.client
         response = client.send(client.build_request(method, path, **options), stream=stream)
         for _ in range(_MOST_REDIRECTIONS):
@@ -249,7 +249,7 @@ class Session:
         )
 
     def stream(self, path: str, start: int = 0, **options: Any) -> Iterator[bytes]:
-        """The bytes of an answer from an offset on. Where the connection breaks off, it goes on with what is left."""
+        """The bytes of an answer from an offset on. If the connection breaks off, asks for the rest."""
         import httpx
 
         fruitless = 0
@@ -276,7 +276,7 @@ class Session:
                 skipped = max(0, skipped - len(piece))
 
     def fetch(self, path: str, told: Any, file: BinaryIO) -> None:
-        """Writes what the server answers to a JSON body into a file, anew where the connection breaks off."""
+        """Writes the answer to a JSON body into a file; begins again if the connection breaks off."""
         import httpx
 
         content, headers = jsonvalue.dumps(told).encode(), {"Content-Type": "application/json"}
@@ -298,7 +298,7 @@ class Session:
 
 
 class _NoTickets(logging.Filter):
-    """httpx logs addresses; that of a recording opens it for whoever reads the log."""
+    """Removes secret addresses of recordings from httpx's log: whoever has one can read the recording."""
 
     def filter(self, record: logging.LogRecord) -> bool:
         if isinstance(record.args, tuple):
@@ -326,7 +326,7 @@ def _checked(url: str) -> str:
 
 
 def pages(session: Session, path: str, asked: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """All that is listed, a page at a time; `limit` and `offset` in `asked` are of the whole."""
+    """All items of a list, fetched page by page; `limit` and `offset` in `asked` are of the whole list."""
     left = asked.get("limit")
     while True:
         page = as_told(Page, session.ask("POST", path, {**asked, "limit": left}, repeat=True))

@@ -1,9 +1,9 @@
 """Keeps a user's tokens, by server: in the system's keyring if there is one, else in a file that only this user can
 read.
 
-`servers.json` in the directory of this user's configuration names the servers and who is signed in there, the one that
-was used last at the end. It is written anew whenever tokens change, in the keyring too: what was read holds for as long
-as it is the same file.
+`servers.json` in the user's configuration directory lists the servers and the signed-in users, the server used last at
+the end. It is written again whenever tokens change, in the keyring too, so what was read is valid as long as the file
+is the same.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class TokenStore:
             files.write_bytes(self.path, json.dumps(servers, indent=2).encode(), permissions=0o600)
 
     def _servers(self) -> _Servers:
-        """What the file says, and what the keyring has said since it was written."""
+        """The entries of the file, with tokens read from the keyring since it was written."""
         try:
             status = self.path.stat()
         except OSError:

@@ -84,12 +84,12 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
 
 
 def _recording(headers: Mapping[str, str]) -> str:
-    """What the server calls a recording that has come."""
+    """The server's name of an uploaded recording."""
     return unquote(as_told(str, headers.get("Recording")))
 
 
 def _path(location: str) -> str:
-    """The path of an upload on the same server, whatever that calls itself."""
+    """The path of an upload on the same server, without the host name, which a proxy may change."""
     try:
         return urlsplit(location).path or "/"
     except ValueError as err:

@@ -1,5 +1,5 @@
-"""Recordings that wait for a server, as files: what state they are in, what killed processes have left of them, and the
-note of what was sent of one that goes on."""
+"""The files of recordings that wait for a server: their state, how to finish those of killed processes, and the note of
+how many episodes of a growing one were sent."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def numbers_of(recording: Recording, first: int) -> list[int]:
 
 
 def finished(path: Path) -> Path:
-    """Finishes what a killed process has left; returns the path of what can be sent of it.
+    """Finishes the recording of a killed process; returns the path of the file to send.
 
     Raises:
         RecordingError, FormatError: nothing of it can be saved.
@@ -61,12 +61,12 @@ def finished(path: Path) -> Path:
 
 
 def note(path: Path) -> Path:
-    """Where it is noted how many episodes of a recording were sent."""
+    """The path of the note of how many episodes of a recording were sent."""
     return path.with_name(f"{path.name}.sent")
 
 
 def sent_before(path: Path) -> int:
-    """Episodes of a recording with lower numbers were sent."""
+    """The first episode of a recording that was not sent yet."""
     try:
         return int(json.loads(note(path).read_bytes())["sent_before"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -74,7 +74,7 @@ def _run(view: LiveView, files: _Files) -> None:
     file = files.next(_PATIENCE)
     while file is not None:
         _show(view, files, *file)
-        file = files.next(0)  # a recorder that goes on names it before it closes the last one
+        file = files.next(0)  # a recorder names the next file before it closes this one
         if file is not None:
             view.go_on(Path(file[0]))
 
@@ -85,7 +85,7 @@ def _show(view: LiveView, files: _Files, path: str, uuid: str, begin: int) -> No
     while not is_over:
         files.wait(rest)
         began = time.process_time()
-        is_over = not is_locked(Path(path))  # asked before the look, so that the last look sees everything
+        is_over = not is_locked(Path(path))  # read before the look, so that the last look sees everything
         if follower is None:
             follower = follow(Path(path), uuid, begin)
         seen = False

@@ -71,7 +71,7 @@ class EpisodeNews:
         self._last: dict[int, StepRun] = {}  # by sub-environment
         self._waiting: dict[int, StepRun] = {}  # by number, ended episodes that wait for the second look
         self.count = 0  # ended episodes
-        self.successes: list[bool] = []  # of the ends written since the last look, where they say it
+        self.successes: list[bool] = []  # of the ends written since the last look, if they have `success`
 
     def look(
         self,
@@ -111,7 +111,7 @@ class EpisodeNews:
         return np.concatenate([fresh, np.array([end for end in made if end is not None], _ENDS)])
 
     def _told(self) -> Iterator[bool]:
-        """Whether the newest episodes whose ends are written succeeded, as far as their metadata say it."""
+        """Whether the newest episodes with a written end succeeded, by their metadata."""
         for _, message in messages_of(self._store, self._end, self._rows[self._end][-_LOOKED_AT:]):
             with contextlib.suppress(FormatError):  # a damaged one is not shown
                 metadata = EpisodeEnd.decode(memoryview(message)[_NUMBER:]).metadata

@@ -130,7 +130,7 @@ class Follower:
     """Reads what a recorder has committed since the last look. Rows before offset `begin` of the file are left out.
 
     Attributes:
-        is_over: nobody records any more, so the next look finds the rest.
+        is_over: the recorder has finished, so the next look finds the rest.
         steps: the step channels of the sub-environments whose steps are read.
     """
 
@@ -179,7 +179,7 @@ class Follower:
 
     @property
     def successes(self) -> Sequence[bool]:
-        """Whether the episodes succeeded whose ends were new at the last look, of those that say it."""
+        """Whether episodes succeeded: those with `success` whose ends were new at the last look."""
         return self._news.successes
 
     def look(self) -> tuple[list[NewSteps], Array]:

@@ -1,4 +1,4 @@
-"""A Foxglove WebSocket server on this machine: the topics, schemas and bytes of the file, as they come."""
+"""A Foxglove WebSocket server on this machine, which sends the messages of the file as they are recorded."""
 
 from __future__ import annotations
 

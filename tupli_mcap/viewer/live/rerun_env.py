@@ -1,4 +1,4 @@
-"""Sends one sub-environment of a rollout that goes on to the panels of a replay."""
+"""Sends one sub-environment of a running rollout to the panels of a replay."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class LiveEnv:
         self._rows = 0  # known of
         self._shift = 0  # from the number of a row to its place on the timeline
         self._next = 0  # the number after the last one sent
-        self._missed = False  # whether steps were left out since the last infos
+        self._missed = False  # steps were left out since the last infos
         self._rewards = Rewards(layout.reward)  # one for each sub-environment: it keeps the running return
         shown = [*scene.states, *scene.actions, *scene.beside]
         # cameras, infos and heat maps are not sent with blocks of steps
@@ -91,7 +91,7 @@ class LiveEnv:
 
     @property
     def _alone(self) -> Place:
-        """The place of entities that only the first sub-environment has: below no root."""
+        """The place of entities that only the first sub-environment has: at the top, below no root."""
         return Place(self._place.stream)
 
     @property
@@ -222,7 +222,7 @@ def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSte
 
 
 def _block(steps: NewSteps, columns: Any, bounds: list[int], ends: Sequence[int | None]) -> Block:
-    """The steps, and between each two of the bounds an episode, or what there is of it."""
+    """The steps as a block; between two consecutive bounds lies an episode, or a part of one."""
     pieces = [
         Piece(begin, end, i, int(steps.facts.step[begin]), how_ended)
         for i, ((begin, end), how_ended) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
@@ -232,7 +232,7 @@ def _block(steps: NewSteps, columns: Any, bounds: list[int], ends: Sequence[int 
 
 
 def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
-    """How each stretch of an episode ends: None where it goes on after the last row."""
+    """How the episode of each piece ends; None if it goes on after the last row."""
     terminal, timeout = steps.facts.terminal, steps.facts.timeout
     found: list[int | None] = []
     for end in bounds[1:]:
@@ -244,6 +244,6 @@ def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
 
 
 def _is_apart(panel: Panel) -> bool:
-    """Whether what a panel shows is not in the rows of steps."""
+    """Whether a panel shows values that are not in the rows of steps."""
     leaf = getattr(panel, "leaf", None)
     return isinstance(leaf, Leaf) and leaf.apart

@@ -1,4 +1,4 @@
-"""A rollout that goes on, in the panels of a replay."""
+"""Shows a running rollout in the panels of a replay."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_KEYS = 6  # of infos
 class LivePanels:
     """The steps of the first sub-environments, and an overview of the episodes of all of them.
 
-    `application` and `blueprint` are there once `decide` has returned True.
+    `application` and `blueprint` exist once `decide` has returned True.
     """
 
     application: str
@@ -50,8 +50,7 @@ class LivePanels:
         self._envs: list[LiveEnv] = []
 
     def decide(self, follower: Follower) -> bool:
-        """Decides which panels there are, once the first steps tell how large values get. False while there are too
-        few."""
+        """Chooses the panels once there are enough steps to see how large values get; until then, returns False."""
         if self._envs:
             return True
         self._began = self._began or time.monotonic()
@@ -65,7 +64,7 @@ class LivePanels:
         return True
 
     def _look(self, follower: Follower) -> None:
-        """Takes what is new."""
+        """Reads new steps and infos."""
         steps, ended = follower.look()
         self._steps += steps
         self._infos += follower.infos(MOST_INFOS)
@@ -96,7 +95,7 @@ class LivePanels:
         self._next_overview = 0.0
 
     def send(self, stream: Any, follower: Follower) -> None:
-        """Sends what is new."""
+        """Sends new steps and infos."""
         self._look(follower)
         steps, self._steps, infos, self._infos = self._steps, [], self._infos, []
         self._align(steps)
@@ -110,7 +109,7 @@ class LivePanels:
             self._next_overview = time.monotonic() + _EVERY
 
     def _align(self, steps: Sequence[NewSteps]) -> None:
-        """Keeps what happens at one time at about one place of the timeline."""
+        """Shifts sub-environments so that rows of the same time are near each other on the timeline."""
         for new in steps:
             self._envs[new.env].expect(new)
         end = max(env.end for env in self._envs)

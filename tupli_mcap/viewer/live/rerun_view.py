@@ -25,8 +25,8 @@ class RerunView:
     """Connects to a Rerun viewer, or starts one and connects to it.
 
     Args:
-        title: what the rollout is called.
-        warn: called once, if there is no viewer or no longer one.
+        title: the name of the rollout.
+        warn: called once if no viewer answers, and once if one is gone.
 
     Raises:
         MissingExtraError: the rerun-sdk that is installed is too old.
@@ -106,7 +106,7 @@ class RerunView:
         self._is_behind = True
 
     def _caught_up(self, patience: float) -> bool:
-        """True if the viewer has taken everything. While it has not, it is sent nothing more."""
+        """True if the viewer has taken everything. Until then, nothing more is sent to it."""
         try:
             self._stream.flush(timeout_sec=patience)
         except RuntimeError as err:

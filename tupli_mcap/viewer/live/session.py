@@ -1,7 +1,7 @@
 """Starts the process that shows a rollout, and names the files to it.
 
-The process is started as a program: a fork would copy the locks of this process's threads, and `multiprocessing` would
-run the caller's script again. Whatever happens to it, the recording goes on.
+It is started as a program: a fork would copy the locks of this process's threads, and `multiprocessing` would run the
+caller's script again. If it fails, the recording goes on.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _FAREWELL = 10.0  # seconds that closing waits for the process, at most
 
 
 class LiveSession:
-    """The process that shows what is recorded, until `close`."""
+    """The process that shows the recording, until `close`."""
 
     def __init__(self, process: subprocess.Popen[bytes], writer: RecordingWriter) -> None:
         self.process = process
         self.go_on(writer)
 
     def go_on(self, writer: RecordingWriter) -> None:
-        """Shows what `writer` records, once the files before it are shown to their ends."""
+        """Shows the file of `writer` after the files before it."""
         file = os.path.realpath(writer.path), writer.place.uuid, writer.container.position
         with contextlib.suppress(OSError):  # the process has ended
             if self.process.stdin is not None:
@@ -37,7 +37,7 @@ class LiveSession:
                 self.process.stdin.flush()
 
     def close(self) -> None:
-        """Waits some seconds for the process to show the rest and end; a slower one is left to go on alone."""
+        """Waits some seconds for the process to show the rest and end; a slower one goes on alone."""
         with contextlib.suppress(OSError):
             if self.process.stdin is not None:
                 self.process.stdin.close()
@@ -48,11 +48,11 @@ class LiveSession:
 
 
 def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession | None:
-    """Begins to show what `writer` records. Warns and returns None if no process can be started.
+    """Starts to show the file of `writer`. Warns and returns None if no process can be started.
 
     Args:
         live: "rerun", "foxglove", or where a viewer listens.
-        title: what the rollout is called.
+        title: the name of the rollout.
 
     Raises:
         RecordingError: `live` names no viewer.

@@ -1,4 +1,4 @@
-"""Which viewer `live=` names, and where it listens."""
+"""Parses `live=`: which viewer, and where it listens."""
 
 from __future__ import annotations
 

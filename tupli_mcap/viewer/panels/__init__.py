@@ -1,6 +1,6 @@
-"""Panels: a leaf, or what follows from the steps, as entities of a Rerun recording and a view on them.
+"""Panels: a leaf, or values computed from the steps, as entities of a Rerun recording and a view of them.
 
-`panel` says what each of them can do; the kinds are in `numbers` (lines, reward and return), `images` (images, grids,
+`panel` has their interface; the kinds are in `numbers` (lines, reward and return), `images` (images, grids,
 heat maps, camera frames) and `texts` (texts, lanes of states, infos). `viewer.scene` chooses among them.
 """
 

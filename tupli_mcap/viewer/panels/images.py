@@ -21,11 +21,11 @@ _AXES = {2: ("row", "column"), 3: ("[0]", "height", "width")}
 _FRAMES_AT_ONCE = 64
 _FRAMES_A_LINE = 4  # of a stack, at most
 _CHANNELS = (1, 3, 4)
-_ATARI = (84, 84, 4)  # four frames, where nothing says what the channels are
+_ATARI = (84, 84, 4)  # four frames, if nothing declares what the channels are
 
 
 def is_image(shape: Sequence[int]) -> bool:
-    """Whether it is that of one image: height, width and channels."""
+    """Whether a shape is that of one image: height, width and channels."""
     return len(shape) == 3 and shape[2] in _CHANNELS
 
 
@@ -33,7 +33,7 @@ def is_image(shape: Sequence[int]) -> bool:
 class Picture(LeafPanel):
     """An image leaf: one picture a step. A stack shows all its frames side by side, the newest first.
 
-    `black` and `white` are the values of leaves that are not uint8 at both ends of what is shown.
+    `black` and `white` are the values shown as black and white, for leaves that are not uint8.
     """
 
     black: float = 0.0
@@ -164,10 +164,12 @@ class Camera:
     column: str = "states"
 
     def declare(self, place: Place) -> None:
-        """Nothing: all is sent with the frames."""
+        """Sends nothing: everything is sent with the frames."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        if self.name not in block.recording.cameras:  # another recording beside it may have one
+        if (
+            self.name not in block.recording.cameras
+        ):  # another recording in the same view may have such a camera
             return
         for piece in block.pieces:
             frames = block.recording.frames(piece.position, self.name)

@@ -72,14 +72,14 @@ class Rewards:
         returns = self._returns(rewards, block)
         send_lines(place, "/reward", times, rewards[:, None])
         send_lines(place, "/return", times, returns[:, None])
-        heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker has to be somewhere
+        heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker needs a finite position
         for code, name in enumerate(_ENDS):
             at = np.array([piece.end - 1 for piece in block.pieces if piece.how_ended == code], np.int64)
             if len(at):
                 send_scalars(place.stream, f"{place.root}/end/{name}", times.at(at), heights[at][:, None])
 
     def miss(self) -> None:
-        """Says that steps are left out before the next block: the return is unknown until the running episode ends."""
+        """Call this if steps are left out before the next block: the return is then unknown until the episode ends."""
         self._running = np.nan
 
     def _totals(self, block: Block) -> Array:

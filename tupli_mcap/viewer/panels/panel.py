@@ -1,4 +1,4 @@
-"""What every panel has, and where its entities go."""
+"""The interface of panels, and the places of their entities."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Place(NamedTuple):
     def declare_series(
         self, entity: str, names: Sequence[str], colors: Array, *, stepped: bool = False
     ) -> None:
-        """How the scalars of an entity are drawn: as lines, or a single row as points."""
+        """Says how to draw the scalars of an entity: as lines, or a single row as points."""
         import rerun as rr
         from rerun.components import AggregationPolicy, InterpolationMode, MarkerShape
 
@@ -94,7 +94,7 @@ class Panel(Protocol):
 
 @dataclass(frozen=True)
 class LeafPanel:
-    """What the panels of a leaf have in common. `column` is the field of the steps that the leaf is in."""
+    """The base of panels of a leaf. `column` is the field of the steps that the leaf is in."""
 
     leaf: Leaf
     column: str
@@ -102,7 +102,7 @@ class LeafPanel:
     title: str
 
     def declare(self, place: Place) -> None:
-        """Nothing: all is sent with the values."""
+        """Sends nothing: everything is sent with the values."""
 
 
 def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
@@ -124,7 +124,7 @@ def named(title: str, root: str) -> str:
 
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
-    """A view of series over time. No legend is needed where it would only repeat the title."""
+    """A view of series over time, without a legend if that would only repeat the title."""
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(

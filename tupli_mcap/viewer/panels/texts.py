@@ -16,7 +16,7 @@ from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, Place, named, plo
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
 _LONGEST = 2000  # characters of a text that is shown
-_NO_STATE = ""  # as the viewer reads it: a gap in the lane
+_NO_STATE = ""  # the viewer shows this as a gap in the lane
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Infos:
 
 
 class LiveInfos(Infos):
-    """Numbers among the infos of the first sub-environment of a rollout that goes on; below no root."""
+    """The numbers in infos of the first sub-environment of a running rollout; below no root."""
 
     def send_numbers(
         self, place: Place, infos: Sequence[Mapping[str, Any]], times: Times, *, missed: bool
