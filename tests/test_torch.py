@@ -460,7 +460,7 @@ def test_a_state_dict_of_another_dataset_is_refused(dataset: TupliDataset, worke
     other = loader(dataset.with_episode_filter(F("n_tuples") > 5).windows(2))
     other.load_state_dict(first.state_dict())
     with pytest.raises(
-        SamplingError, match="expected a state dict of the same items, found one of another dataset"
+        SamplingError, match="expected a state dict of the same items, found one of other episodes"
     ):
         next(iter(other))
 

@@ -115,7 +115,7 @@ def test_what_a_storage_refuses(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="doesn't allow writing"):
         replay_buffer(transitions, 4).extend(RecordedStorage(transitions)[:2])
     other = RecordedStorage(dataset.with_episode_filter(F("n_tuples") > 5).transitions())
-    with pytest.raises(SamplingError, match="found one of another dataset"):
+    with pytest.raises(SamplingError, match="found one of other episodes"):
         other.load_state_dict(RecordedStorage(transitions).state_dict())
 
 
