@@ -3,6 +3,7 @@ and no width of a terminal, also where pytest runs in one."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 from collections.abc import Iterator
@@ -28,14 +29,21 @@ def _cache_of_all_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
         yield
 
 
+@pytest.fixture(scope="session")
+def _private_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """One directory after another. `mktemp` would look through those of all earlier tests for the next number."""
+    parent = tmp_path_factory.mktemp("private")
+    return (parent / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def _private_config(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    directory = tmp_path_factory.mktemp("config")
-    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(directory))
-    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-    monkeypatch.setenv("TUPLI_MCAP_DATA_DIR", str(tmp_path_factory.mktemp("data")))
+def _private_config(_private_directories: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    private = next(_private_directories)
+    for name in ["config", "cache", "data"]:
+        (private / name).mkdir(parents=True)
+        monkeypatch.setenv(f"TUPLI_MCAP_{name.upper()}_DIR", str(private / name))
     monkeypatch.delenv("COLUMNS", raising=False)  # what is printed is as wide as no terminal
-    return directory
+    return private / "config"
 
 
 @pytest.fixture(scope="session")
