@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import random
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -99,10 +100,38 @@ def admin(proxy: Between) -> Iterator[TupliAPIClient]:
         yield client
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all-cases", action="store_true", help="run all cases of sampled tests, not a sample")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Of a test that is marked as sampled(n, keep=[…]), n of its cases run, and those whose ids are in `keep`.
+
+    Which ones depends on nothing but the test's own name and the ids of its cases."""
+    if config.getoption("all_cases"):
+        return
+    cases: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        if item.get_closest_marker("sampled"):
+            cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    left_out: set[pytest.Item] = set()
+    for name, all_of_it in cases.items():
+        mark = all_of_it[0].get_closest_marker("sampled")
+        assert mark is not None
+        kept = [item for item in all_of_it if item.name.partition("[")[2][:-1] in mark.kwargs.get("keep", ())]
+        assert len(kept) == len(mark.kwargs.get("keep", ())), f"{name} has not all the cases to keep"
+        others = sorted(set(all_of_it) - set(kept), key=lambda item: item.nodeid)
+        chosen = random.Random(name).sample(others, min(mark.args[0], len(others)))
+        left_out |= set(others) - set(chosen)
+    items[:] = [item for item in items if item not in left_out]
+    config.hook.pytest_deselected(items=list(left_out))
+
+
 def pytest_configure() -> None:
     """Ctrl-C interrupts what tests start, too where this runs in the background of a shell, which ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ["OMP_NUM_THREADS"] = "1"  # tests run beside each other; PyTorch's threads would wait for a core in a loop
     os.environ["PYTHON_KEYRING_BACKEND"] = "keyring.backends.fail.Keyring"  # not the user's
     settings.register_profile("untimed", deadline=None)  # speed is measured in python -m tools.bench
     settings.load_profile("untimed")
