@@ -3,7 +3,9 @@ and no width of a terminal, also where pytest runs in one."""
 
 from __future__ import annotations
 
+import gc
 import itertools
+import multiprocessing
 import os
 import random
 import signal
@@ -127,11 +129,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=list(left_out))
 
 
+def pytest_collection_finish() -> None:
+    """What all tests have imported lasts: the garbage collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_configure() -> None:
     """Ctrl-C interrupts what tests start, too where this runs in the background of a shell, which ignores it."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    os.environ["OMP_NUM_THREADS"] = "1"  # tests run beside each other; PyTorch's threads would wait for a core in a loop
+    multiprocessing.get_start_method()  # settles it: TorchRL, once imported, would have every process spawned
+    os.environ["OMP_NUM_THREADS"] = "1"  # tests run beside each other: PyTorch's threads would wait for cores
     os.environ["PYTHON_KEYRING_BACKEND"] = "keyring.backends.fail.Keyring"  # not the user's
     settings.register_profile("untimed", deadline=None)  # speed is measured in python -m tools.bench
     settings.load_profile("untimed")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -1141,14 +1142,18 @@ LISTED = ("users", "groups", "roles", "tokens", "benchmarks", "artifacts", "epis
 COMMANDS = [name for name, command in get_command(app).commands.items() if not command.hidden]  # type: ignore[attr-defined]
 
 
+@functools.cache
+def help_of(command: str) -> str:
+    return ok(command, "--help")
+
+
 class TestProgram:
     def test_help(self, here: Path) -> None:
         listed = ok("--help")
-        assert ok() == listed
+        assert ok() == ok("help") == listed
         for command in COMMANDS:
             assert re.search(rf"^  {command} +\S.*[^.]\.$", listed, re.MULTILINE)  # not cut to "..."
-            out = ok(command, "--help")
-            assert out == ok(command, "-h")
+            out = help_of(command)
             assert max(map(len, out.splitlines())) <= 80
             assert not re.search(r"\.\.\.[]}]|\.{4}", out.splitlines()[0])  # the dots of several are typer's
 
@@ -1157,12 +1162,14 @@ class TestProgram:
         for command in sorted(
             {*COMMANDS} - {"view", "replay", "browse", "serve", "help", "version"}
         ):  # which show something
-            assert "--json" in ok(command, "--help")
+            assert "--json" in help_of(command)
 
-    def test_help_on_a_command(self, here: Path) -> None:
-        assert ok("help") == ok("--help")
-        for command in COMMANDS:
-            assert ok("help", command) == ok(command, "--help")
+    @pytest.mark.sampled(4)
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_help_on_a_command(self, command: str, here: Path) -> None:
+        assert ok("help", command) == ok(command, "-h") == help_of(command)
+
+    def test_help_on_no_command(self, here: Path) -> None:
         assert "there is no command 'lss' (did you mean 'ls'?)" in fails("help", "lss", code=2)
 
     def test_the_commands_are_in_groups(self, here: Path) -> None:
@@ -1186,7 +1193,7 @@ class TestProgram:
     def test_examples_are_meant(self, command: str, here: Path) -> None:
         """They parse: what a file or an environment says is another matter."""
         root = get_command(app)
-        lines = ok(command, "--help").splitlines()
+        lines = help_of(command).splitlines()
         examples = [line for line in lines if line.startswith("  tupli-mcap ")]
         assert examples or command == "version"
         for line in examples:
@@ -1200,7 +1207,7 @@ class TestProgram:
         assert ok("version") == ok("--version") == f"tupli-mcap {tupli_mcap.__version__}\n"
 
     def test_replay_is_view(self, here: Path) -> None:
-        assert ok("replay", "--help").replace("replay", "view") == ok("view", "--help")
+        assert help_of("replay").replace("replay", "view") == help_of("view")
 
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")

@@ -12,7 +12,6 @@ import pickle
 import subprocess
 import sys
 import weakref
-from collections.abc import Iterator
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
@@ -50,15 +49,6 @@ def as_numpy(column: Any) -> Any:
     if isinstance(column, dict):
         return {key: as_numpy(part) for key, part in column.items()}
     return tuple(as_numpy(part) for part in column) if isinstance(column, tuple) else column
-
-
-@pytest.fixture(autouse=True)
-def forked() -> Iterator[None]:
-    """TorchRL, once it is imported, makes spawn the default: its workers may be starting still when a test is over."""
-    before = multiprocessing.get_start_method(allow_none=True)
-    multiprocessing.set_start_method("fork", force=True)
-    yield
-    multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture(scope="module", params=SPACES)
