@@ -64,10 +64,9 @@ class RandomAccess(SaysWhatIsMeant):
     ) -> Windows:
         """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
 
-        See `Windows`: an index gives one window, an array of numbers gives a batch. The fields "infos", for all keys,
-            and
-        "info.<key>" give a dict of columns by key, which are all read into memory. Numbers are arrays, with NaN for
-        steps without such an info. The field "frames" gives the recorded pictures of the states.
+        See `Windows`: an index gives one window, an array of numbers gives a batch. The field "infos" gives a dict of
+        columns for all keys of the infos, "info.<key>" for one key; they are all read into memory. Numbers are
+        arrays, with NaN for steps without such an info. The field "frames" gives the recorded pictures of the states.
 
         Raises:
             SamplingError: no episode is long enough, or an argument is invalid.

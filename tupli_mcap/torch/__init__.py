@@ -19,13 +19,12 @@ from tupli_mcap.torch.episodes import Episodes
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES
 from tupli_mcap.torch.mapped import MapDataset
 from tupli_mcap.torch.stream import StreamDataset
-from tupli_mcap.torch.tensors import Samples, collate, tensors
+from tupli_mcap.torch.tensors import collate, tensors
 
 __all__ = [
     "WORKER_CACHE_BYTES",
     "Episodes",
     "MapDataset",
-    "Samples",
     "StreamDataset",
     "collate",
     "tensors",

@@ -10,9 +10,9 @@ import numpy as np
 from torch import Generator
 from torch.utils.data import DataLoader, Dataset
 
-from tupli_mcap.dataset.items import Items
+from tupli_mcap.dataset.items import Items, Samples
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
-from tupli_mcap.torch.tensors import Samples, collate
+from tupli_mcap.torch.tensors import collate
 
 
 class MapDataset(Dataset[dict[str, Any]]):

@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 
 from tupli_mcap.dataset.items import Samples
 
-__all__ = ["Samples", "collate", "tensors"]
+__all__ = ["collate", "tensors"]
 
 
 def tensors(column: Any) -> Any:
