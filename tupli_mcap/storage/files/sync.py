@@ -282,7 +282,7 @@ class SyncedCatalog:
                 if header.recording != relative:
                     self._catalog.remove_recording(relative)
                     path, original = self._root / relative, f"holds episodes of {header.recording} again"
-                    advice = "that one is listed, whatever they hold; verify both, and delete one"
+                    advice = "only that recording is listed; move one of them to another directory, or delete it"
                     self._skip(relative, entry.stamp, f"{path} {original}; {advice}")
                     return True
         return False
