@@ -282,7 +282,7 @@ class SyncedCatalog:
                 if header.recording != relative:
                     self._catalog.remove_recording(relative)
                     path, original = self._root / relative, f"holds episodes of {header.recording} again"
-                    advice = "only that recording is listed; move one of them to another directory, or delete it"
+                    advice = "only that recording is listed; move or delete one of them"
                     self._skip(relative, entry.stamp, f"{path} {original}; {advice}")
                     return True
         return False
