@@ -110,6 +110,19 @@ def test_only_what_is_whole_is_taken(tmp_path: Path) -> None:
     assert record(Arm(), tmp_path / "r.mcap").labels == Labels({}, {"action": ("open", "close")}, None)
 
 
+class Dashes(Arm):
+    """## Action Space
+    | Num | Action | Min |
+    |-----|--------|-----|
+    | 0   | lift   | -1  |
+    | 1   | -      | -1  |
+    """
+
+
+def test_a_dash_is_no_name(tmp_path: Path) -> None:
+    assert record(Dashes(), tmp_path / "r.mcap").labels.values == {"action": ("lift", "1")}
+
+
 class Longer(Arm):
     """An arm that says no more than what it is."""
 

@@ -330,6 +330,32 @@ def test_unknown_spaces_are_refused_before_a_file_is_made(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+class Missions(spaces.Space[str]):
+    """Texts of another library, as MiniGrid's MissionSpace."""
+
+    def __init__(self) -> None:
+        super().__init__(dtype=str)
+
+    def sample(self, mask: Any = None, probability: Any = None) -> str:
+        return f"get the {self.np_random.choice(['red', 'blaß'])} ball"
+
+    def contains(self, x: Any) -> bool:
+        return isinstance(x, str)
+
+
+def test_a_space_of_texts_of_another_library_becomes_a_text(tmp_path: Path) -> None:
+    space = spaces.Dict({"mission": Missions(), "pair": spaces.Tuple((Missions(), BOX))})
+    env = Sampler(space, spaces.Discrete(2))
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        taken = roll(recorded, 5)
+    recording = Recording(tmp_path / "r.mcap")
+    states = [step[0] for step in taken]
+    assert recording.episodes[0].states["mission"] == [state["mission"] for state in states]
+    assert list(recording.episodes[0].states["pair"][0]) == [state["pair"][0] for state in states]
+    assert type(recording.observation_space["mission"]) is spaces.Text
+    assert env.observation_space is space and type(space["mission"]) is Missions
+
+
 def test_too_many_leaves_are_refused(tmp_path: Path) -> None:
     """Code is generated for each, also from the spaces of a stranger's file that is written anew."""
     space = spaces.Dict({f"key{i}": spaces.Discrete(2) for i in range(4095)})

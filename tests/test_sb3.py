@@ -21,6 +21,7 @@ from tupli_mcap import (
     Recording,
     RecordingError,
     StepError,
+    TupliEnvWrapper,
     open as open_dataset,
     verify_recording,
 )
@@ -332,11 +333,13 @@ def test_wrong_pairings_name_the_right_one(tmp_path: Path) -> None:
         (
             RecordEpisodes,
             Parallel(),
-            "the PettingZoo environment Parallel; EpisodeWriter records it by hand",
+            r"the PettingZoo environment Parallel; there is no recorder of several agents yet, .*EpisodeWriter\(.*stream",
         ),
         (RecordEpisodes, "CartPole-v1", r"found 'CartPole-v1'; make it: gymnasium.make\('CartPole-v1'\)"),
         (RecordVector, "CartPole-v1", r"make it: gymnasium.make_vec\('CartPole-v1'\)"),
         (RecordVector, None, "found NoneType, which is no gymnasium.Env"),
+        (RecordEpisodes, lambda: cartpole, "found function <lambda>; give the environment that it makes"),
+        (TupliEnvWrapper, Parallel(), "there is no recorder of several agents yet"),
     ):
         with pytest.raises(RecordingError, match=message):
             wrapper(env, path)

@@ -29,6 +29,7 @@ __all__ = [
     "memory_for",
     "missing_extra",
     "os_reason",
+    "plural",
 ]
 
 _SPACE = "free some space there, or choose another disk"
@@ -129,6 +130,11 @@ def brief(err: BaseException | None) -> str:
     """An exception in one line: `ValueError: what it says`."""
     text = " ".join(str(err).split())[:300]
     return f"{type(err).__name__}: {text}" if text else type(err).__name__
+
+
+def plural(count: int, noun: str) -> str:
+    """`1 episode`, `1,200 episodes`."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

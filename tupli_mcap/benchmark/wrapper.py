@@ -25,6 +25,7 @@ from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
+from tupli_mcap.wrappers.base import check_kind
 
 __all__ = ["DeletedBenchmark", "TupliEnvWrapper"]
 
@@ -101,6 +102,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         rl_tuple_cls: type[RLTuple] = RLTuple,
         **recording_options: Any,
     ) -> None:
+        check_kind(env, vector=False)
         super().__init__(env)
         unknown = recording_options.keys() - set(_RECORDING_OPTIONS)
         if unknown:

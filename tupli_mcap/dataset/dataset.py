@@ -31,6 +31,7 @@ from tupli_mcap.dataset.sources import (
     numbers_by_recording,
     place_of,
 )
+from tupli_mcap.errors import plural
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
@@ -494,7 +495,9 @@ class Dataset(RandomAccess):
     def __repr__(self) -> str:
         if self._listed is None:
             return f"<Dataset of {self._source!r}: not listed yet>"
-        return f"<Dataset of {self._source!r}: {len(self):,} episodes, {self.n_steps:,} steps>"
+        return (
+            f"<Dataset of {self._source!r}: {plural(len(self), 'episode')}, {plural(self.n_steps, 'step')}>"
+        )
 
     def __str__(self) -> str:
         """As `repr`, but lists the episodes first."""

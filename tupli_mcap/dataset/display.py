@@ -6,6 +6,7 @@ import html as _html
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from tupli_mcap.errors import plural
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 
 __all__ = ["Facts", "html", "text"]
@@ -45,12 +46,12 @@ def _counts(facts: Facts) -> str:
     if facts.headers is None:
         return "not listed yet"
     listed = sum(header.n_tuples for header in facts.headers)
-    episodes = _plural(len(facts.headers), "episode")
+    episodes = plural(len(facts.headers), "episode")
     if facts.filters.get("tuples") is None:
-        return f"{episodes}, {_plural(listed, 'step')}"
+        return f"{episodes}, {plural(listed, 'step')}"
     if facts.steps is None:
-        return f"{episodes}, {_plural(listed, 'step')} before the tuple filter"
-    return f"{episodes}, {facts.steps:,} of {_plural(listed, 'step')}"
+        return f"{episodes}, {plural(listed, 'step')} before the tuple filter"
+    return f"{episodes}, {facts.steps:,} of {plural(listed, 'step')}"
 
 
 def _filters(facts: Facts) -> list[str]:
@@ -73,7 +74,3 @@ def _row(place: int, header: EpisodeHeader) -> str:
 
 def _short(value: str) -> str:
     return value if len(value) <= _WIDTH else value[: _WIDTH - 1] + "…"
-
-
-def _plural(n: int, what: str) -> str:
-    return f"{n:,} {what}{'' if n == 1 else 's'}"

@@ -11,7 +11,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
-from tupli_mcap.doctor.message_text import plural, share
+from tupli_mcap.doctor.message_text import share
+from tupli_mcap.errors import plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.columns.statistics import element_bounds

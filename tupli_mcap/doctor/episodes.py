@@ -10,7 +10,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, value_bytes
-from tupli_mcap.doctor.message_text import plural, share
+from tupli_mcap.doctor.message_text import share
+from tupli_mcap.errors import plural
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block

@@ -23,11 +23,6 @@ def share(count: int, total: int) -> str:
     return f"{percent:.0f}%"
 
 
-def plural(count: int, noun: str) -> str:
-    """`1 episode`, `1,200 episodes`."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
 def duration(ns: float) -> str:
     """A duration (ns) in a fitting unit: `850 ns`, `1.5 ms`, `2.0 h`."""
     for unit, size in (("h", 3600e9), ("min", 60e9), ("s", 1e9), ("ms", 1e6), ("µs", 1e3)):

@@ -89,7 +89,7 @@ def _names(section: str, count: int) -> tuple[str, ...]:
     if not 0 < count <= _MOST:
         return ()
     for pattern in (_ROW, _ITEM):
-        found = [(int(number), _plain(name)) for number, name in pattern.findall(section)]
+        found = [(int(number), _plain(name, number)) for number, name in pattern.findall(section)]
         if [number for number, _ in found] == list(range(count)) and all(name for _, name in found):
             return tuple(name for _, name in found)
     return ()
@@ -98,15 +98,16 @@ def _names(section: str, count: int) -> tuple[str, ...]:
 def _meanings(env: Any, count: int) -> tuple[str, ...]:
     """The names that the Arcade Learning Environment gives its actions; empty for other environments."""
     with contextlib.suppress(Exception):  # the environment's own code may raise anything
-        names = tuple(_plain(str(name)) for name in env.get_action_meanings())
+        names = tuple(_plain(str(name), "") for name in env.get_action_meanings())
         return names if len(names) == count and all(names) else ()
     return ()
 
 
-def _plain(name: str) -> str:
-    """A name without markup, on one line, cut to the longest length."""
+def _plain(name: str, unnamed: str) -> str:
+    """A name without markup, on one line, cut to the longest length; `unnamed` for a dash."""
     plain = " ".join(_MARKUP.sub(r"\1", name).split())
     plain = "".join(c for c in plain if c.isprintable())
+    plain = unnamed if plain in ("-", "–", "—") else plain
     return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST - 1]}…"
 
 

@@ -20,7 +20,7 @@ from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.layout import ImageLayout, MessageLayout, field_line, image_layout, message_text
 from tupli_mcap.messages.variable.codec import VariableField
-from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, structure
+from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, own_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 STEP_SCHEMA = "tupli_mcap/msg/Step"
@@ -35,7 +35,7 @@ class StepLayout:
     """Leaves, stored dtypes and message layouts of `/step`, `/final_state` and the image channels.
 
     Args:
-        observation_space, action_space: of the environment.
+        observation_space, action_space: of the environment; spaces of texts of other libraries become Texts.
         reward_space: None for a float64.
         dtypes: ROS name of a constant leaf -> stored dtype; other leaves keep the declared one.
         inner_dtypes: ROS name of a variable leaf -> path in the leaf -> dtype name.
@@ -55,6 +55,7 @@ class StepLayout:
         inner_dtypes: Mapping[str, Mapping[str, str]] | None = None,
         stacks: Collection[Stack] = (),
     ) -> None:
+        observation_space, action_space = own_space(observation_space), own_space(action_space)
         self.inner_dtypes = {name: dict(found) for name, found in (inner_dtypes or {}).items() if found}
         self.observation_space = observation_space
         self.action_space = action_space

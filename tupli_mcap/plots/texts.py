@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import plural
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
 from tupli_mcap.plots.groups import Group
@@ -76,8 +77,8 @@ def facts_of(groups: Sequence[Group]) -> list[tuple[str, str]]:
 
 def _group_text(group: Group) -> str:
     spread, success = _spread_text(group.rows["return"]), _success_text(group)
-    parts = [_counted(len(group.runs), "run")] if len(group.runs) > 1 else []
-    parts += [_counted(len(group.rows), "episode"), _counted(int(group.rows["length"].sum()), "step")]
+    parts = [plural(len(group.runs), "run")] if len(group.runs) > 1 else []
+    parts += [plural(len(group.rows), "episode"), plural(int(group.rows["length"].sum()), "step")]
     parts += [f"return {spread}"] if spread else []
     return ", ".join([*parts, *([f"success {success}"] if success else [])])
 
@@ -102,10 +103,6 @@ def notes_of(measured: Sequence[Measured]) -> list[str]:
     prefixes = [f"{one.name}: " if len(measured) > 1 else "" for one in measured]
     pairs = zip(prefixes, measured, strict=True)
     return list(dict.fromkeys(prefix + note for prefix, one in pairs for note in one.notes()))
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _spread_text(values: Array) -> str:

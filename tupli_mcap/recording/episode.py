@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import RecordingError, SaysWhatIsMeant
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.schema import RLTuple
@@ -300,7 +300,7 @@ class Episode(GymnasiumNames):
             )
 
     def __repr__(self) -> str:
-        return f"<Episode {self.number}: {len(self)} steps, return {self.return_:g}, {self.end}>"
+        return f"<Episode {self.number}: {plural(len(self), 'step')}, return {self.return_:g}, {self.end}>"
 
     def _repr_html_(self) -> str:
         facts = {
@@ -365,4 +365,4 @@ class Episodes(Sequence[Episode]):
             raise IndexError(f"expected an episode from 0 to {len(self) - 1}, found {i}") from err
 
     def __repr__(self) -> str:
-        return f"<{len(self)} episodes of {self._recording.name}>"
+        return f"<{plural(len(self), 'episode')} of {self._recording.name}>"

@@ -9,7 +9,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, plural
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
@@ -174,7 +174,7 @@ class Frames(Sequence[Picture]):
         return self[int(found[0])]
 
     def __repr__(self) -> str:
-        return f"<{len(self)} frames of camera {self.camera!r}>"
+        return f"<{plural(len(self), 'frame')} of camera {self.camera!r}>"
 
 
 def gathered(parts: Iterable[tuple[Frames, Array, Array]], total: int) -> Array:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from tupli_mcap.errors import FormatError, RecordingError, memory_for
+from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import EPISODE_START, FINAL_STATE, INFO
@@ -405,7 +405,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
-        return f"<Recording {self.name}: {len(self.index)} episodes, {self.num_steps} steps{state}>"
+        return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.num_steps, 'step')}{state}>"
 
 
 def _opened_again(source: str, uuid: str, cache_bytes: int) -> Recording:

@@ -29,6 +29,7 @@ from tupli_mcap.replay.compare import Checker, Difference
 from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.recorded_values import RecordedValues, recorded_values
 from tupli_mcap.replay.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
+from tupli_mcap.spaces.leaves import own_space
 
 _MAX_DIVERGENCES = 100
 
@@ -337,7 +338,7 @@ def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[i
 
 def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:
     for name in ("observation_space", "action_space"):
-        recorded, found = getattr(recording, name), getattr(env, name)
+        recorded, found = getattr(recording, name), own_space(getattr(env, name))
         if recorded != found:
             raise RecordingError(
                 f"{recording.name}: expected an environment with the {name} {recorded}, found {found}"

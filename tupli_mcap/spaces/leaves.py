@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import string
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -164,7 +165,8 @@ def _walk(
     else:
         raise SpaceError(
             f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
-            "wrap the environment so that it returns a Box, Discrete, Dict, Tuple, Text, Sequence, Graph or OneOf"
+            "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction), with a function that "
+            "makes a value of Gymnasium's own of it, and the space of such values"
         )
 
 
@@ -181,6 +183,24 @@ def _constant_leaf(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name
     if images and dtype == np.uint8 and len(shape) == 3 and shape[2] in (1, 3, 4) and 0 not in shape:
         kind = "image"
     return Leaf(keys, path, name, space, kind, np.dtype(dtype.name), shape)
+
+
+def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
+    """`space`, with a Text for each space of another library whose values are strings (a MissionSpace of MiniGrid).
+
+    Such a space may allow anything: its Text has the printable ASCII characters, and up to 4,096 of them.
+    """
+    if type(space) is spaces.Dict:
+        named = {key: own_space(sub) for key, sub in space.spaces.items()}
+        changed = any(named[key] is not sub for key, sub in space.spaces.items())
+        return spaces.Dict(list(named.items())) if changed else space
+    if type(space) is spaces.Tuple:
+        listed = [own_space(sub) for sub in space.spaces]
+        changed = any(one is not sub for one, sub in zip(listed, space.spaces, strict=True))
+        return spaces.Tuple(listed) if changed else space
+    if type(space) in _VARIABLE or space.shape is not None or space.dtype is None or space.dtype.kind != "U":
+        return space
+    return spaces.Text(4096, min_length=0, charset=string.printable)
 
 
 def structure(space: gym.Space[Any]) -> Callable[[Sequence[Any]], Any]:

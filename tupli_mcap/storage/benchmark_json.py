@@ -15,6 +15,7 @@ from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain, loads
 from tupli_mcap.schema import BenchmarkHeader, BenchmarkMetadata
+from tupli_mcap.spaces.leaves import own_space
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 from tupli_mcap.storage.texts import is_hash
 
@@ -159,8 +160,8 @@ def facts_about(env: gym.Env[Any, Any]) -> dict[str, Any]:
     JSON."""
     try:
         return {
-            "observation_space": space_to_json(env.observation_space),
-            "action_space": space_to_json(env.action_space),
+            "observation_space": space_to_json(own_space(env.observation_space)),
+            "action_space": space_to_json(own_space(env.action_space)),
         }
     except SpaceError:
         return {}

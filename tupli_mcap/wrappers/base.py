@@ -244,10 +244,17 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
     elif "stable_baselines3" in libraries:
         found = f"the VecEnv {name} of Stable-Baselines3; use tupli_mcap.sb3.VecRecordEpisodes"
     elif "pettingzoo" in libraries:
-        found = f"the PettingZoo environment {name}; EpisodeWriter records it by hand, an agent a stream"
+        found = (
+            f"the PettingZoo environment {name}; there is no recorder of several agents yet, but "
+            "tupli_mcap.EpisodeWriter(..., num_envs=AGENTS) records the steps of each agent as a stream"
+        )
     elif isinstance(env, str):
         make = "make_vec" if "vector" in expected else "make"
         found = f"{env!r:.60}; make it: gymnasium.{make}({env!r:.60})"
+    elif "dm_env" in libraries:
+        found = f"the dm_env environment {name}; wrap it in shimmy.DmControlCompatibilityV0"
+    elif callable(env):
+        found = f"{name} {getattr(env, '__name__', '')}; give the environment that it makes"
     else:
         found = f"{name}, which is no gymnasium.Env"
     return RecordingError(f"expected {expected}, found {found}")

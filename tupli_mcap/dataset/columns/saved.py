@@ -23,7 +23,7 @@ from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.items import FIELDS, Steps
 from tupli_mcap.dataset.items.steps import checked_fields, following, pick, pick_runs, rows_of_runs
 from tupli_mcap.dataset.sources import DatasetError
-from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.errors import FormatError, StorageError, plural
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress
@@ -226,7 +226,7 @@ class SavedColumns(RandomAccess):
 
     def __repr__(self) -> str:
         episodes = len(self._manifest.episodes)
-        return f"<SavedColumns of {str(self._directory)!r}: {episodes:,} episodes, {len(self):,} steps>"
+        return f"<SavedColumns of {str(self._directory)!r}: {plural(episodes, 'episode')}, {plural(len(self), 'step')}>"
 
 
 class SavedSteps:
