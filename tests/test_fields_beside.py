@@ -12,7 +12,7 @@ import pytest
 from environments import Scripted
 
 import tupli_mcap
-from tupli_mcap import F, RecordEpisodes, Recording, RecordingError, SpaceError, TupliDataset
+from tupli_mcap import F, FilterError, RecordEpisodes, Recording, RecordingError, SpaceError, TupliDataset
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.items import SamplingError
 
@@ -85,6 +85,34 @@ def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None
         open_columns(tmp_path / "columns").windows(2, fields=["infos"])
     with pytest.raises(SamplingError, match="expected fields"):
         dataset.transitions(fields=["inform"])
+
+
+def test_of_columns(dataset: tupli_mcap.Dataset) -> None:
+    columns = dataset.read(["states", "info.step", "infos.force"])
+    assert set(columns.infos) == {"step", "force"}
+    np.testing.assert_array_equal(columns.infos["step"], columns.states[:, 0] + 1)
+    assert dataset.read(["infos"]).infos[0]["name"] == "at 1"
+    with pytest.raises(SamplingError, match="did you mean 'force'"):
+        dataset.read("info.forse")
+
+
+def test_times_are_a_field(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
+    times = dataset.read("times").times
+    np.testing.assert_array_equal(np.concatenate([episode.times for episode in dataset]), times)
+    np.testing.assert_array_equal(dataset.transitions(2, fields=["times"])[:].times, times)
+    both = TupliDataset(tmp_path)
+    assert len(both.with_tuple_filter(f"time >= {times[4]} and info.step > 4")) == 3
+    assert len(both.with_tuple_filter("time > '1h ago'")) == len(times)
+    assert len(both.with_tuple_filter("time <= 'yesterday'")) == 0
+    with pytest.raises(FilterError, match="'time' is a time: expected .* found 'yesterdy'"):
+        both.with_tuple_filter("time > 'yesterdy'")
+
+
+def test_an_item_has_its_columns_by_name(dataset: tupli_mcap.Dataset) -> None:
+    window = dataset.windows(2)[1]
+    assert window["states"] is window.states
+    with pytest.raises(KeyError, match=r"expected one of mask, .*found 'obs' \(did you mean 'states'"):
+        window["obs"]
 
 
 class Counting(gym.Env[Any, int]):

@@ -234,6 +234,8 @@ def test_what_has_no_value_comes_last(dataset: Dataset) -> None:
         numbers = [episode.number for episode in dataset[:12].sort(value, descending=descending)]
         assert numbers[-2:] == [0, 1]
         assert numbers[:-2] == sorted(range(2, 12), reverse=not descending)
+    with pytest.raises(TupliError, match=r"write sort\('return', descending=True\)"):
+        dataset.sort("-return")
     with pytest.raises(TupliError, match="cannot sort"):
         dataset.sort(lambda episode: episode.number if episode.env else "text" if episode.number else 1)
 
@@ -241,6 +243,7 @@ def test_what_has_no_value_comes_last(dataset: Dataset) -> None:
 def test_head_and_sample(dataset: Dataset) -> None:
     assert ids(dataset.head(3)) == ids(dataset)[:3]
     assert len(dataset.head(100)) == 36
+    assert ids(dataset.head()) == ids(dataset)[:5]
     one, same, other = dataset.sample(9, seed=1), dataset.sample(9, seed=1), dataset.sample(9, seed=2)
     assert ids(one) == ids(same) != ids(other)
     assert len(set(ids(one))) == 9

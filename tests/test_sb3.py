@@ -333,7 +333,7 @@ def test_wrong_pairings_name_the_right_one(tmp_path: Path) -> None:
         (
             RecordEpisodes,
             Parallel(),
-            r"the PettingZoo environment Parallel; there is no recorder of several agents yet, .*EpisodeWriter\(.*stream",
+            r"the PettingZoo environment Parallel; there is no recorder of several agents yet, .*EpisodeWriter",
         ),
         (RecordEpisodes, "CartPole-v1", r"found 'CartPole-v1'; make it: gymnasium.make\('CartPole-v1'\)"),
         (RecordVector, "CartPole-v1", r"make it: gymnasium.make_vec\('CartPole-v1'\)"),

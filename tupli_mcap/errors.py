@@ -56,6 +56,7 @@ _ADVICE: Final = {
 _STATE = ("states", "observations", "state")
 _NEXT_STATE = ("next_states", "next_observations", "next_state")
 _ACTION, _REWARD = ("actions", "action"), ("rewards", "reward")
+_LENGTH = ("n_steps", "steps")
 _TERMINAL, _TIMEOUT = ("terminals", "terminal"), ("timeouts", "timeout")
 _OTHERWISE: Final = {
     **dict.fromkeys(("obs", "observation", "observations", "states", "state"), _STATE),
@@ -63,9 +64,10 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("act", "acts", "action", "actions"), _ACTION),
     **dict.fromkeys(("rew", "rews", "reward", "rewards"), _REWARD),
     **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
+    **dict.fromkeys(("length", "num_steps", "n_tuples", "n_steps"), _LENGTH),
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
 }
-"""Other libraries' names of the columns of steps, and ours: the error names the first of ours that the object has."""
+"""Other libraries' names of columns and of the number of steps, and ours: the error names the first that there is."""
 
 
 class TupliError(Exception):

@@ -24,6 +24,7 @@ from tupli_mcap.dataset.items import (
     Windows,
     checked_fields,
     info_columns,
+    info_keys,
 )
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.dataset.items.windows import FIVE
@@ -81,7 +82,7 @@ class RandomAccess(SaysWhatIsMeant):
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
         See `Transitions` for several steps, and `Transition` for targets of values. Fields are those of
-        `Transition`; "infos", "info.<key>" and "frames" are as for `windows`.
+        `Transition`; "infos", "info.<key>", "times" and "frames" are as for `windows`.
 
         Raises:
             SamplingError: the dataset is empty, or an argument is invalid.
@@ -92,15 +93,13 @@ class RandomAccess(SaysWhatIsMeant):
     def _with_more(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
         """The steps, with infos and frames if fields name them, and the names of the fields to read."""
         steps = self.steps
-        given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
-        keys = [name for name in given if isinstance(name, str) and name.partition(".")[0] in (INFOS, "info")]
-        rest = checked_fields([name for name in given if name not in keys], (*steps.fields, *BESIDE))
+        keys, given = info_keys(fields)
+        rest = checked_fields(given, (*steps.fields, *BESIDE))
         if FRAMES in rest:
             steps = StepsWith(steps, FRAMES, FrameValues(steps.episode_lengths, self._frames_of))
         if not keys:
             return steps, rest
-        wanted = [name.partition(".")[2] for name in keys]
-        columns = info_columns(self._infos(), wanted if all(wanted) else None)
+        columns = info_columns(self._infos(), keys if all(keys) else None)
         return StepsWith(steps, INFOS, InfoValues(columns, len(steps))), [*rest, INFOS]
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:

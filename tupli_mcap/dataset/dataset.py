@@ -19,7 +19,7 @@ from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
 from tupli_mcap.dataset.columns.load import read_columns
 from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
-from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
+from tupli_mcap.dataset.items import INFOS, ListedEpisodes, RecordedSteps, Steps, info_columns, info_keys
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
 from tupli_mcap.dataset.sources import (
@@ -234,10 +234,14 @@ class Dataset(RandomAccess):
 
         Raises:
             FilterError: the key is unknown, also among metadata.
-            DatasetError: two of the values cannot be ordered.
+            DatasetError: two of the values cannot be ordered, or the key begins with "-".
         """
         if callable(key):
             values = [key(self._episode(header)) for header in self.headers]
+        elif isinstance(key, str) and key.startswith("-"):
+            raise DatasetError(
+                f"expected a key, found {key!r:.80}; write sort({key[1:]!r:.80}, descending=True)"
+            )
         elif isinstance(key, str):
             values = values_at(key, self.headers)
         else:
@@ -252,7 +256,7 @@ class Dataset(RandomAccess):
         rest = sorted(set(range(len(values))) - set(places))
         return self._of([self.headers[i] for i in [*ordered, *rest]])
 
-    def head(self, n: int) -> Dataset:
+    def head(self, n: int = 5) -> Dataset:
         """The first `n` episodes, or as many as there are."""
         return self._of(self.headers[: _count(n)])
 
@@ -298,12 +302,18 @@ class Dataset(RandomAccess):
 
         Args:
             fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames; Gymnasium's
-                names (observations, terminations, truncations) mean the same.
+                names (observations, terminations, truncations) mean the same. "infos" is a dict for each step;
+                "info.<key>" makes `infos` a dict of columns, as in `windows`.
 
         Raises:
             DatasetError: a field is unknown.
             SpaceError: one array cannot hold the steps of two recordings; the message names them.
         """
+        keys, others = info_keys(fields)
+        if any(keys):
+            found = self.read([*others, INFOS])
+            found.infos = info_columns(found.infos, keys if all(keys) else None)
+            return found
         wanted = field_names(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
             return example.read([], wanted)

@@ -20,7 +20,7 @@ from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.items.windows import FIVE
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew
 
@@ -89,7 +89,7 @@ class TupliDataset(RandomAccess):
 
     # --- filters ---
 
-    def with_benchmark_filter(self, filter: BaseFilter | None) -> Self:
+    def with_benchmark_filter(self, filter: BaseFilter | str | None) -> Self:
         """The dataset with a new benchmark filter, over the fields of `BenchmarkHeader`; None removes it.
 
         Raises:
@@ -97,7 +97,7 @@ class TupliDataset(RandomAccess):
         """
         return self._with(benchmark_filter=filter)
 
-    def with_episode_filter(self, filter: BaseFilter | None) -> Self:
+    def with_episode_filter(self, filter: BaseFilter | str | None) -> Self:
         """The dataset with a new episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
         `n_tuples`, `end`, …); None removes it.
 
@@ -106,13 +106,14 @@ class TupliDataset(RandomAccess):
         """
         return self._with(episode_filter=filter)
 
-    def with_tuple_filter(self, filter_fcn: TupleFilter | None) -> Self:
+    def with_tuple_filter(self, filter_fcn: TupleFilter | str | None) -> Self:
         """The dataset with a new tuple filter, which chooses steps; None removes it.
 
         Args:
-            filter_fcn: an expression over state, action, reward, terminal, timeout, info, next_state and step
-                (counted from 0 in each episode), such as `F("state.0") > 1`, which is evaluated on whole
-                columns; or a function of one `RLTuple` that returns True or False, called for every step.
+            filter_fcn: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time
+                (ns) and step (counted from 0 in each episode), such as `F("state.0") > 1` or "info.force > 2", which
+                is evaluated on whole columns; or a function of one `RLTuple` that returns True or False, called for
+                every step.
 
         Raises:
             FilterError: it is neither, or names an unknown field.
@@ -122,7 +123,10 @@ class TupliDataset(RandomAccess):
     def _with(self, **filters: Any) -> Self:
         made = type(self).__new__(type(self))
         made.__dict__.update(self.__dict__)
-        made._query = self._query.with_filters(**filters)
+        parsed = {
+            name: parse_filter(given) if isinstance(given, str) else given for name, given in filters.items()
+        }
+        made._query = self._query.with_filters(**parsed)
         made.set_seed(self._seed)
         return made
 

@@ -122,6 +122,11 @@ class Episode(GymnasiumNames):
         return int(self._row["env"])
 
     @property
+    def n_steps(self) -> int:
+        """The number of its steps: `len(episode)`."""
+        return len(self)
+
+    @property
     def return_(self) -> float:
         """Sum of the rewards."""
         return float(self._row["return"])
@@ -220,6 +225,11 @@ class Episode(GymnasiumNames):
     @property
     def timeouts(self) -> Any:
         return self._columns.timeouts
+
+    @cached_property
+    def times(self) -> Any:
+        """Wall clock when each step returned: int64 (steps,), ns."""
+        return self._recording.read([self._position], fields=["times"]).times
 
     @cached_property
     def next_states(self) -> Any:

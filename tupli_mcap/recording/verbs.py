@@ -61,7 +61,7 @@ class DatasetVerbs(SaysWhatIsMeant):
         """The episodes in the order of a key ("return", "metadata.score") or a function."""
         return self.dataset.sort(key, descending=descending)
 
-    def head(self, n: int) -> Dataset:
+    def head(self, n: int = 5) -> Dataset:
         """The first `n` episodes."""
         return self.dataset.head(n)
 

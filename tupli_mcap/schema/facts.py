@@ -28,7 +28,7 @@ from tupli_mcap.schema.models import EpisodeHeader
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
-__all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "path_in"]
+__all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "path_in", "with_times"]
 
 TIME_KEY: Final = "created_at"
 TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
@@ -113,6 +113,13 @@ def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
         yield filter
     for item in filter.filters:
         yield from comparisons(item)
+
+
+def with_times(filter: BaseFilter, key: str) -> BaseFilter:
+    """The filter with times at `key` ("yesterday", a date) as nanoseconds; raises FilterError if a value is no time."""
+    if filter.type in COMBINING:
+        return filter.model_copy(update={"filters": tuple(with_times(part, key) for part in filter.filters)})
+    return filter if filter.key != key else _in_time(filter, key, datetime.datetime.now(datetime.UTC))
 
 
 def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -> BaseFilter:

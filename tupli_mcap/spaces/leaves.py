@@ -165,7 +165,7 @@ def _walk(
     else:
         raise SpaceError(
             f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
-            "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction), with a function that "
+            "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction) with a function that "
             "makes a value of Gymnasium's own of it, and the space of such values"
         )
 

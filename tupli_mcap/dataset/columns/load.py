@@ -23,6 +23,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 from tupli_mcap.recording.columns.fields import FIELDS
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
+from tupli_mcap.schema.facts import with_times
 
 __all__ = [
     "Selected",
@@ -286,6 +287,7 @@ STEP_KEYS: Mapping[str, str] = {
     "next_state": "next_states",
     "info": "infos",
     "step": "steps",
+    "time": "times",
 }
 """Name in an expression -> column; `step` counts from 0 within its episode."""
 
@@ -322,7 +324,7 @@ def selector_of(filter: TupleFilter) -> TupleSelector:
     if isinstance(filter, BaseFilter):
         check_keys(filter, STEP_KEYS)
         needed = {field for key, field in STEP_KEYS.items() if _names(filter, key)}
-        return TupleSelector(("terminals", *sorted(needed - {"terminals"})), filter)
+        return TupleSelector(("terminals", *sorted(needed - {"terminals"})), with_times(filter, "time"))
     if not callable(filter):
         raise FilterError(
             f"expected a function of one tuple or an expression like F('reward') > 0, found {filter!r:.80}"

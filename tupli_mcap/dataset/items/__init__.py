@@ -18,6 +18,7 @@ from tupli_mcap.dataset.items.beside import (
     InfoValues,
     StepsWith,
     info_columns,
+    info_keys,
 )
 from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
@@ -58,5 +59,6 @@ __all__ = [
     "Windows",
     "checked_fields",
     "info_columns",
+    "info_keys",
     "steps_of",
 ]

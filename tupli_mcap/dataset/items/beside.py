@@ -12,7 +12,7 @@ from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields,
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.recording.frames import Frames, gathered
 
-__all__ = ["BESIDE", "FRAMES", "INFOS", "FrameValues", "InfoValues", "StepsWith", "info_columns"]
+__all__ = ["BESIDE", "FRAMES", "INFOS", "FrameValues", "InfoValues", "StepsWith", "info_columns", "info_keys"]
 
 INFOS, FRAMES = BESIDE = ("infos", "frames")
 
@@ -80,6 +80,14 @@ class FrameValues:
         steps = rows - self._starts[episodes]
         each = ((episode, np.flatnonzero(episodes == episode)) for episode in np.unique(episodes).tolist())
         return gathered(((self._frames_of(episode), steps[at], at) for episode, at in each), len(rows))
+
+
+def info_keys(fields: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The keys of infos that fields name ("info.x": "x"; "infos": ""), and the other fields."""
+    given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
+    named = [isinstance(name, str) and name.partition(".")[0] in (INFOS, "info") for name in given]
+    keys = [name.partition(".")[2] for name, is_info in zip(given, named, strict=True) if is_info]
+    return keys, [name for name, is_info in zip(given, named, strict=True) if not is_info]
 
 
 def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None = None) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_numbers
-from tupli_mcap.errors import SaysWhatIsMeant
+from tupli_mcap.errors import SaysWhatIsMeant, did_you_mean
 from tupli_mcap.schema import BaseFilter, F
 
 __all__ = [
@@ -31,7 +31,16 @@ _MANY = 1 << 20  # items that are processed together
 
 @dataclass(frozen=True)
 class Parts(SaysWhatIsMeant):
-    """Columns of one item or of a batch, and facts about them, by name; None if not requested."""
+    """Columns of one item or of a batch, and facts about them, by name; None if not requested. `item["states"]` is
+    `item.states`, as in the dicts of a `DataLoader`."""
+
+    def __getitem__(self, name: str) -> Any:
+        found = self.asdict()
+        if name not in found:
+            raise KeyError(
+                f"expected one of {', '.join(found)}, found {name!r:.80}{did_you_mean(name, found)}"
+            )
+        return found[name]
 
     def asdict(self) -> dict[str, Any]:
         """The requested columns and facts, by name."""

@@ -33,6 +33,7 @@ class Transition(Parts):
             recorded state, and the transition is better left out.
         steps: number of its first step (int64).
         episodes: place of its episode in the query (int64).
+        times: wall clock of its first step (int64, ns).
         infos: of its first step, a dict of columns by key.
         frames: picture of its first step: uint8 (height, width, 3).
     """
@@ -47,6 +48,7 @@ class Transition(Parts):
     next_states: Any = None
     terminals: Any = None
     timeouts: Any = None
+    times: Any = None
     infos: Any = None
     frames: Any = None
 
@@ -75,7 +77,7 @@ class Transitions(StepItems[Transition]):
         if not isinstance(discount, int | float | np.number) or not 0 <= discount <= 1:
             raise SamplingError(f"expected a discount from 0 to 1, found {discount!r:.80}")
         self.discount = float(discount)
-        known = [field for field in steps.fields if field in (*TRANSITION_FIELDS, *BESIDE)]
+        known = [field for field in steps.fields if field in (*TRANSITION_FIELDS, "times", *BESIDE)]
         self.fields = tuple(checked_fields(fields, known))
         varying = steps.layout is not None and any(leaf.kind == "variable" for leaf in steps.layout.reward)
         if self.n_step > 1 and varying and "rewards" in self.fields:
