@@ -115,8 +115,8 @@ class RandomAccess(SaysWhatIsMeant):
         )
 
     def episode_values(self, expression: F | BaseFilter) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """The number of each episode at a key, such as `F("metadata.score")`; for a filter, 1 if it is true, else 0.
-        Samplers take these as weights.
+        """The number of each episode at a key, such as `F("metadata.score")`; for a filter, 1 if it is true, else 0:
+        float64 (episodes,). Samplers take these as weights.
 
         Raises:
             SamplingError: an episode has no number there.

@@ -63,6 +63,7 @@ class Measured:
 
     @property
     def rows(self) -> Array:
+        """The index rows of the chosen episodes."""
         return self.index[self.positions]
 
     @property

@@ -50,9 +50,17 @@ class Described(Protocol):
 
 
 class Episode(GymnasiumNames):
-    """One episode of a recording. Columns are arrays (lists for leaves of variable size), nested as the space is.
+    """One episode of a recording.
 
-    Arrays are decoded on access, from the chunks that hold the episode, and kept. They are the caller's to change.
+        episode = dataset[0]
+        print(episode.states.shape, episode.rewards.sum(), episode.end, episode[-1].action)
+
+    A column is an array of shape (steps, *leaf shape), or a list for a leaf of variable size, nested as the space is.
+    The first access decodes the chunks that hold the episode, and keeps the columns; the caller may change them. Not
+    thread-safe.
+
+    Raises:
+        FormatError: on access, if a chunk of the episode is damaged.
     """
 
     def __init__(self, recording: Recording, position: int) -> None:
@@ -194,11 +202,12 @@ class Episode(GymnasiumNames):
 
     @property
     def states(self) -> Any:
+        """The observation that each action was chosen on: (steps, *leaf shape), in the recorded dtypes."""
         return self._columns.states
 
     @property
     def all_states(self) -> Any:
-        """The states, followed by the final state if it is known: then one more than there are steps."""
+        """The states, followed by the final state if it is known: then (steps + 1, *leaf shape)."""
         if self._row["final_row"] < 0:
             return self.states
         layout, finals = self._recording.layout, self._recording.final_states([self._position])
@@ -212,18 +221,22 @@ class Episode(GymnasiumNames):
 
     @property
     def actions(self) -> Any:
+        """The action of each step: (steps, *leaf shape), in the recorded dtypes."""
         return self._columns.actions
 
     @property
     def rewards(self) -> Any:
+        """The reward of each step: float64 (steps,), or in shape and dtype as the reward space says."""
         return self._columns.rewards
 
     @property
     def terminals(self) -> Any:
+        """Whether the environment ended with the step: bool (steps,)."""
         return self._columns.terminals
 
     @property
     def timeouts(self) -> Any:
+        """Whether the episode was truncated with the step: bool (steps,)."""
         return self._columns.timeouts
 
     @cached_property
@@ -233,7 +246,7 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def next_states(self) -> Any:
-        """The state after each step; that of the last step is the final state."""
+        """The state after each step, as `states`; after the last step, the final state, or its own state if unknown."""
         return self._recording.read([self._position], fields=["next_states"]).next_states
 
     @cached_property

@@ -235,6 +235,10 @@ class Recording(DescribedRecording, DatasetVerbs):
             images: False leaves the columns of image leaves empty and reads no image; not possible for `next_states`.
 
         If an episode's final state is not known, `next_states` repeats its last state.
+
+        Raises:
+            RecordingError: an episode or a field does not exist.
+            FormatError: a chunk is damaged.
         """
         fields = FIVE if fields is None else field_names(fields)
         if not images and "next_states" in fields:

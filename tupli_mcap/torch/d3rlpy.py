@@ -196,7 +196,7 @@ class RecordedBuffer:
         return RecordedEpisode(self, int(number[0])), int(place[0])
 
     def places(self, indices: Array) -> tuple[Array, Array]:
-        """The episode of each transition, and its place in it."""
+        """The episode of each transition, and its place in it: int64, as `indices`."""
         numbers = self.transition_ends.searchsorted(indices, side="right")
         before = self.transition_ends[numbers] - (self.sizes - ~self.terminated)[numbers]
         return numbers, indices - before

@@ -100,6 +100,10 @@ class Sampler:
     def update(self, places: Array | Sequence[int], weights: Array | Sequence[float] | float) -> None:
         """Sets the weights of some items (of some episodes with `by="episodes"`), from the next batch on.
 
+        Args:
+            places: the numbers of these items or episodes, integers (n,).
+            weights: one for each, numbers (n,), or one number for all.
+
         Raises:
             SamplingError: the sampler has no weights, a place does not exist, or a weight is invalid.
         """
@@ -133,7 +137,7 @@ class Sampler:
         return None if self._tree is None else self._tree.weights.copy()
 
     def draw(self, number: int) -> Array:
-        """Batch `number` of this seed, drawn with the current weights."""
+        """Batch `number` of this seed, drawn with the current weights: int64 (batch_size,)."""
         random = seeded(self.seed, _DRAWS, checked_count(number, 0, "the number of a batch"))
         if self._tree is not None:
             if not self._tree.total > 0:

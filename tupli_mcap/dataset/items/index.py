@@ -30,7 +30,7 @@ __all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
 
 
 class ListedEpisodes(NamedTuple):
-    """Episodes of one recording: the name that opens it, their numbers, and how many steps of each are listed."""
+    """Episodes of one recording: the name that opens it, their numbers and listed lengths (int64, both)."""
 
     recording: str
     numbers: Array

@@ -30,8 +30,10 @@ class Columns(GymnasiumNames):
     the space is.
 
     Attributes:
-        episode_lengths: steps of each episode, int64.
-        times: wall clock when each step returned, int64, ns.
+        episode_lengths: steps of each episode, int64 (episodes,).
+        rewards: float64 (steps,), or as the reward space says.
+        terminals, timeouts: bool (steps,).
+        times: wall clock when each step returned, int64 (steps,), ns.
         infos: a dict for each step, empty if none was recorded.
         frames: the pictures of the states, uint8 (steps, height, width, 3).
     """
