@@ -1,14 +1,13 @@
-"""Recording to a server: what 1,000 short episodes cost, beside PyTupli's way, one JSON document an episode.
+"""Measures recording 1,000 short episodes to a server, beside PyTupli, which sends a JSON document per episode.
 
     python tools/bench_client.py [--episodes 1000] [--rounds 3]
 
-Both sides are a client and a server process on this machine, and record the same rollout, CartPole-v1 with episodes of
-22 steps, through their own `TupliEnvWrapper`: time until the last episode is stored, and found by a question.
+Both sides are a client and a server process on this machine. They record the same rollout, CartPole-v1 with episodes of
+22 steps, through their own `TupliEnvWrapper`. The time ends when a query finds the last episode.
 
-PyTupli's side is PyTupli 1.2.9 itself, client and server as they are on PyPI, with two changes in the server's process:
-in the place of MongoDB there is mongomock-motor, a MongoDB in the memory of that process (no network, no disk: faster
-than a real one), and passwords are hashed by argon2, as passlib's bcrypt does not work with today's bcrypt. Neither is
-part of what is measured per episode but for the insertion of a document. It needs the extra `bench`, and
+PyTupli's side is PyTupli 1.2.9, client and server as they are on PyPI, with two changes in the server's process.
+mongomock-motor replaces MongoDB: it keeps documents in the memory of that process, so it is faster than a real one.
+argon2 hashes passwords, because passlib's bcrypt does not work with today's bcrypt. It needs the extra `bench`, and
 `pip install --no-deps pytupli==1.2.9`.
 
 Our side is `tupli-mcap serve` with SQLite and a directory.
@@ -38,7 +37,7 @@ PASSWORD = "correct horse battery staple"
 
 
 def roll(env: Any, episodes: int) -> None:
-    """Keeps the pole up for 22 steps, as often as asked."""
+    """Keeps the pole up for 22 steps, in each of some episodes."""
     for seed in range(episodes):
         state, _ = env.reset(seed=seed)
         done = False
@@ -84,7 +83,7 @@ def pytupli_signed_in(url: str) -> Any:
 
 
 def rollout(url: str, episodes: int) -> float:
-    """Recorded by our wrapper while they are rolled out."""
+    """Our wrapper records a rollout."""
     from tupli_mcap import TupliEnvWrapper
     from tupli_mcap.schema import FilterEQ
 
@@ -99,7 +98,7 @@ def rollout(url: str, episodes: int) -> float:
 
 
 def pytupli_rollout(url: str, episodes: int) -> float:
-    """By PyTupli's wrapper."""
+    """PyTupli's wrapper records a rollout."""
     from pytupli.benchmark import TupliEnvWrapper
     from pytupli.schema import FilterEQ
 
@@ -113,7 +112,7 @@ def pytupli_rollout(url: str, episodes: int) -> float:
 
 
 def at_once(url: str, episodes: int) -> float:
-    """Built by hand, and stored by one call of ours."""
+    """Episodes built by hand, stored by one call of our client."""
     from tupli_mcap import schema
 
     client = signed_in(url)
@@ -125,7 +124,7 @@ def at_once(url: str, episodes: int) -> float:
 
 
 def one_by_one(url: str, episodes: int) -> float:
-    """Built by hand, and stored by a call of ours for each."""
+    """Episodes built by hand, each stored by a call of our client."""
     from tupli_mcap import schema
 
     client = signed_in(url)
@@ -138,7 +137,7 @@ def one_by_one(url: str, episodes: int) -> float:
 
 
 def pytupli_by_hand(url: str, episodes: int) -> float:
-    """Built by hand, and stored by a call of PyTupli's for each."""
+    """Episodes built by hand, each stored by a call of PyTupli's client."""
     from pytupli import schema
 
     client = pytupli_signed_in(url)
@@ -214,7 +213,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def running(command: list[str], port: int, **variables: str) -> Iterator[str]:
-    """A server in a process of its own; gives its address once it answers."""
+    """Starts a server process; yields its address once it answers."""
     url = f"http://127.0.0.1:{port}"
     process = subprocess.Popen(command, env={**os.environ, **variables}, stdout=subprocess.DEVNULL)
     try:
@@ -232,7 +231,7 @@ def running(command: list[str], port: int, **variables: str) -> Iterator[str]:
 
 
 def measured(kind: Callable[[str, int], float], url: str, episodes: int) -> float:
-    """What a kind takes in a process of its own."""
+    """Measures one kind in a process of its own."""
     command = [sys.executable, __file__, "--run", kind.__name__, "--url", url, "--episodes", str(episodes)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return float(done.stdout)
@@ -277,7 +276,7 @@ def main() -> None:
 
 
 def report(times: dict[str, list[float]], episodes: int) -> bool:
-    """Prints what was measured; whether it is as quick as it must be."""
+    """Prints the figures; returns whether they are within the limits."""
     median = {name: statistics.median(each) for name, each in times.items()}
     print(f"{episodes} episodes of {STEPS} steps, stored and found: seconds, median and all")
     for kind in KINDS:

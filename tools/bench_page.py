@@ -1,9 +1,9 @@
-"""What the pages of `tupli-mcap browse` cost on a directory of a million episodes.
+"""Measures the pages of `tupli-mcap browse` on a directory of a million episodes.
 
     python tools/bench_page.py [--episodes 1000000] [--directory DIR] [--repeats 5]
 
-Makes recordings of 10,000 short episodes each (DIR keeps them for another time), catalogues them, asks for each page in
-turn over HTTP, and prints the median and the slowest. Exits with 1 if the first page takes more than 300 ms.
+Makes recordings of 10,000 short episodes each (DIR keeps them), catalogues them, gets each page in turn over HTTP, and
+prints the median and the slowest time. Exits with 1 if the first page takes more than 300 ms.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EACH, STEPS, MOST_MS = 10_000, 2, 300.0
 
 
 def make(root: Path, episodes: int) -> None:
-    """Recordings of random episodes, with returns and metadata; those that are there stay."""
+    """Makes recordings of random episodes, with returns and metadata, unless they exist."""
     box = spaces.Box(-1, 1, (3,), np.float32)
     rng = np.random.default_rng(0)
     for number in range(-(-episodes // EACH)):

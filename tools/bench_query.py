@@ -1,7 +1,8 @@
-"""What a server sends where 1% of 9,000 short episodes are wanted: bytes, seconds to the first one, and its memory.
+"""Measures queries for 1% of 9,000 short episodes on a server: bytes, seconds to the first byte, and the server's
+memory.
 
-`python tools/bench_query.py` records CartPole on a server of its own, and asks as `POST /v1/query`, as datasets and
-as `pull` do. Bytes are those of all connections in both directions, counted by a proxy in between.
+`python tools/bench_query.py` records CartPole on a server of its own. It queries as `POST /v1/query`, as datasets and
+as `pull` do. A proxy counts the bytes of all connections in both directions.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ CHOSEN = F("metadata.chosen") == True  # noqa: E712 - an expression
 
 
 class Hundredth(EpisodeMetadataCallback):
-    """Chooses each hundredth episode."""
+    """Chooses every hundredth episode."""
 
     count = 0
 
@@ -58,7 +59,7 @@ class Hundredth(EpisodeMetadataCallback):
 
 
 class Counter:
-    """Hands bytes on to a server, and counts them."""
+    """A proxy that counts bytes."""
 
     def __init__(self, port: int) -> None:
         self.sent = 0
@@ -120,7 +121,7 @@ def record(client: TupliAPIClient, episodes: int) -> tuple[str, int]:
 
 
 def print_memory(server: psutil.Process, client: TupliAPIClient, place: Path, transfers: int) -> None:
-    """How much more memory a server has while it cuts a recording for many clients at once, who take their time."""
+    """Prints how much more memory a server takes while it cuts a recording for many slow clients at once."""
     random, steps = np.random.default_rng(0), 2000
     episodes = [
         EpisodeData(

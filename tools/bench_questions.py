@@ -1,12 +1,12 @@
-"""What questions about a million episodes on a server cost: pages of lists, filtered and in order, of readers who each
-see a part of them. Everything is on this machine's loopback, and shares its cores.
+"""Measures queries over a million episodes on a server: pages of filtered and sorted lists, by users who each may read
+a part of the episodes. Server and clients share this machine.
 
     python tools/bench_questions.py [--directory DIR] [--episodes 1000000] [--database ENGINE] [--only KIND]
                                     [--clients 32] [--workers 2] [--seconds 20]
 
-Makes the database of a server of each ENGINE, sqlite and postgresql (DIR keeps them for another time), asks each kind
-of question in turn, and then lets many clients ask at random, each once a second, for pages of 20 episodes. Exits with
-1 if the 95th percentile of what they wait is above what the server must reach.
+Makes the database of a server for each ENGINE, sqlite and postgresql (DIR keeps them). Sends each kind of query in
+turn. Then many clients send random queries for pages of 20 episodes, each once a second. Exits with 1 if the 95th
+percentile of their waiting times is above the limit.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ KEYS = ("metadata.score", "metadata.task", "metadata.success")
 
 
 def fill(url: str, directory: Path, episodes: int) -> None:
-    """Makes the database of a server with so many episodes, of which no file is there."""
+    """Makes the database of a server with so many episodes, without their files."""
     library = Library(Settings(directory, database=url))
     library.first_password()
     with library.database.writing() as connection:
@@ -84,7 +84,8 @@ def nobody() -> Caller:
 
 
 def put(connection: Connection, number: int, rng: random.Random) -> None:
-    """A recording: of ten, one is dan's or the admin's, and of the others half is the lab's; one is everybody's."""
+    """Adds a recording. Of ten, one is private to dan or the admin, one is public, and half of the others are in
+    `lab`."""
     owner = ("dan" if number % 100 == 50 else "admin") if number % 10 == 0 else ("ann", "bob")[number % 2]
     groups = [owner, *(["global"] if number % 10 == 9 else ["lab"] if rng.random() < 0.5 else [])]
     seen = audience(connection, groups)
@@ -110,7 +111,7 @@ def put(connection: Connection, number: int, rng: random.Random) -> None:
 
 @contextlib.contextmanager
 def database(engine: str, directory: Path, episodes: int) -> Iterator[str]:
-    """The URL of a filled database; one that is in the directory is taken as it is."""
+    """The URL of a filled database, made unless the directory has it."""
     with contextlib.ExitStack() as stack:
         filled = directory / engine
         new = not filled.exists()
@@ -129,7 +130,7 @@ def database(engine: str, directory: Path, episodes: int) -> Iterator[str]:
             begun = time.perf_counter()
             fill(url, filled, episodes)
             print(f"{engine}: {episodes:,} episodes, listed in {time.perf_counter() - begun:.0f} s")
-        if engine == "postgresql":  # as it does by itself, some minutes later
+        if engine == "postgresql":  # autovacuum would do this some minutes later
             engine_of = create_engine(url, isolation_level="AUTOCOMMIT")
             with engine_of.connect() as connection:
                 connection.exec_driver_sql("VACUUM ANALYZE")
@@ -141,7 +142,7 @@ def database(engine: str, directory: Path, episodes: int) -> Iterator[str]:
 
 
 class Question(NamedTuple):
-    """A kind of question, and the filter that it asks with; `deep` with a cursor; `sort` on the page of episodes."""
+    """A kind of query and its filter; `deep`: with a cursor; `sort`: on the page of episodes."""
 
     kind: str
     make: Callable[[random.Random], str]
@@ -192,7 +193,7 @@ QUESTIONS = (
 
 
 class Reader(NamedTuple):
-    """Who asks: the lines of a head that say so, for the interface and for the page; and cursors of pages."""
+    """A user: the headers that sign in, for the API and for the page; and cursors of pages."""
 
     token: str
     cookie: str
@@ -231,7 +232,7 @@ class Reader(NamedTuple):
 
 
 async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: bytes, what: str) -> float:
-    """What an answer takes, in ms; says if it is a refusal."""
+    """Times one answer (ms); prints refusals."""
     begun = time.perf_counter()
     writer.write(request)
     told = (await reader.readuntil(b"\r\n\r\n")).lower()
@@ -245,7 +246,7 @@ async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, reques
 async def in_turn(
     server: Process, readers: Mapping[str, Reader], asked: Sequence[Question], repeats: int
 ) -> None:
-    """Prints what each kind takes each reader, with nobody else there."""
+    """Prints the time of each kind for each user, without other load."""
     print(
         f"  one client, ms, median of {repeats} (at most){'':6}" + "".join(f"{name:>18}" for name in readers)
     )
@@ -264,7 +265,7 @@ async def in_turn(
 async def at_once(
     server: Process, readers: Mapping[str, Reader], asked: Sequence[Question], options: argparse.Namespace
 ) -> dict[str, list[float]]:
-    """Lets clients ask at random, each once a second; returns what the kinds took."""
+    """Runs clients that send random queries, each once a second; returns the times by kind."""
     taken: dict[str, list[float]] = {}
     end = time.perf_counter() + options.seconds
 
@@ -285,7 +286,7 @@ async def at_once(
 
 
 def measure(server: Process, options: argparse.Namespace) -> float:
-    """Prints what questions take; returns the 95th percentile of all of them while many clients ask."""
+    """Prints the times of queries; returns the 95th percentile of all of them under load."""
     readers = {name: Reader.signed_in(server.url, name) for name in ("admin", *READERS)}
     asked = [question for question in QUESTIONS if options.only in question.kind]
     asyncio.run(in_turn(server, readers, asked, options.repeats))
@@ -303,7 +304,7 @@ def measure(server: Process, options: argparse.Namespace) -> float:
 
 
 def worked(server: Process) -> float:
-    """Seconds of a core that the processes of a server have taken."""
+    """The CPU time (s) of the processes of a server."""
     process = psutil.Process(server.pid)
     times = [each.cpu_times() for each in (process, *process.children(recursive=True))]
     return float(sum(each.user + each.system for each in times))

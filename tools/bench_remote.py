@@ -1,7 +1,7 @@
-"""What reading a file on a server costs: requests, bytes, and seconds over a link of 20 ms and 200 Mbit/s.
+"""Measures reading a file on a server: requests, bytes, and seconds over a link of 20 ms and 200 Mbit/s.
 
-`python tools/bench_remote.py [FILE]`; without a file, one of 380 episodes of 1,000 steps (46 MB) is made. The link is a
-server of its own process that waits 20 ms before each connection and each answer, and sends no faster than the link.
+`python tools/bench_remote.py [FILE]`; without a file, it makes one of 380 episodes of 1,000 steps (46 MB). The link is
+a server process that waits 20 ms before each connection and each answer, and limits its rate.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""What a server costs: transfers beside nginx, and memory while it streams. Everything is on this machine's loopback,
-and shares its cores. What questions cost is in `bench_questions.py`.
+"""Measures a server: transfers beside nginx, and memory while it streams. Server and clients share this machine.
+`bench_questions.py` measures queries.
 
     python tools/bench_server.py transfers [--mib 1024] [--rounds 3]
     python tools/bench_server.py memory [--mib 256] [--clients 32]
 
-transfers   A recording goes up and comes down through curl: to `tupli-mcap serve`, to the same behind nginx with the
-            configuration that is shipped (but without TLS), and to nginx alone (a static file; PUT by its dav module).
-            Ours ends when the recording is checked by its SHA-256, durable and listed; nginx's when it is written.
-memory      What the processes of a server hold in the end beyond what they held before, while clients fetch whole
-            recordings slowly.
+transfers   curl uploads and downloads a recording: with `tupli-mcap serve`, with the same behind nginx in the shipped
+            configuration (but without TLS), and with nginx alone (a static file; PUT by its dav module). An upload to
+            our server ends when the SHA-256 is checked and the recording is durable and listed; one to nginx when the
+            file is written.
+memory      How much the memory of a server's processes grows while clients slowly fetch whole recordings.
 
-Exits with 1 where a figure is missed that the server must reach.
+Exits with 1 if a figure misses its limit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _DAV = """
 
 
 def record(path: Path, mib: int, seed: int = 0) -> None:
-    """A recording of so many MiB: numbers that do not compress."""
+    """Makes a recording of so many MiB of numbers that do not compress."""
     from gymnasium import spaces
 
     import tupli_mcap
@@ -203,7 +203,7 @@ def held(process: psutil.Process) -> float:
 
 
 def most_held(process: psutil.Process, clients: int, port: int, request: bytes) -> float:
-    """The most that a server holds while clients take what they have asked for, 8 MiB at a time in turn."""
+    """The most memory of a server while clients read their answers, 8 MiB at a time in turn."""
     most, open_, waiting = 0.0, [], 0.0
     for _ in range(clients):
         connection = socket.create_connection(("127.0.0.1", port), timeout=120)

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""What recording costs, against an earlier commit: `python tools/bench_since.py COMMIT [--rounds 300]`.
+"""Compares the cost of recording with an earlier commit: `python tools/bench_since.py COMMIT [--rounds 300]`.
 
-Two processes, one on each version, record the same environment, which does nothing, in turns of some milliseconds:
-whatever else the machine does is the same for both. The time of the environment alone is taken off.
+Two processes, one per version, record the same environment, which does nothing, in turns of some milliseconds, so that
+other load on the machine affects both alike. The time of the environment alone is subtracted.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Nothing(gym.Env[Any, Any]):
 
 
 class Nothings(gym.vector.VectorEnv[Any, Any, Any]):
-    """`n` of them; all end at once, and reset in the same step."""
+    """`n` sub-environments of that kind, which all end and reset in the same step."""
 
     def __init__(self, length: int, n: int) -> None:
         self.length, self.num_envs = length, n
@@ -108,7 +108,7 @@ def turn_of(length: int, n: int, path: Path | None) -> Callable[[], None]:
 
 
 def work(kind: str, path: str) -> None:
-    """One side: a turn for every line that comes in; its seconds go out."""
+    """One side: for every line on stdin, makes a turn and prints its seconds."""
     warnings.simplefilter("ignore")
     turn = turn_of(*KINDS[kind], Path(path) if path else None)
     for _ in sys.stdin:

@@ -2,14 +2,14 @@
 
     python tools/client_faults.py --rounds 100 --seed 1
 
-In each round one or two processes record to a server, or one pushes a directory there or pulls one from there, through
-a proxy that refuses, resets, stalls, answers 503, turns bits over, or is away for a while. At some moment they are
-killed, or they end by themselves. Then another process does what users do next: it uses the server again, or pushes or
-pulls once more, over a connection that is good. After that
+In each round, one or two processes record to a server, or one pushes or pulls a directory, through a proxy that
+refuses, resets, stalls, answers 503, flips bits, or is down for a while. The processes are killed at a random moment,
+or end by themselves. Then another process uses the server again, or repeats the push or pull, over a good connection.
+After that:
 
 - each step whose `step()` returned is on the server, exact, and no episode is there twice;
-- nothing waits, and no recording has failed or waited for the server;
-- what was pushed or pulled is there once, equal to what it was, and every file is whole.
+- nothing waits to be sent, and no recording has failed or waited for the server;
+- what was pushed or pulled is there once and unchanged, and every file is whole.
 
 Exit code 1 at a finding.
 """
@@ -53,7 +53,7 @@ _FAULTS = ("pass", "pass", "refuse", "reset", "reset", "5xx", "flip", "flip up",
 
 
 class Told(gym.Env[Any, Any]):
-    """Says in each state whose it is: (token, episode, step)."""
+    """An environment whose states identify themselves: (token, episode, step)."""
 
     observation_space = gym.spaces.Box(0, 1 << 40, (3,), np.int64)
     action_space = gym.spaces.Discrete(1 << 30)
@@ -74,7 +74,7 @@ class Told(gym.Env[Any, Any]):
 
 
 def length(episode: int) -> int:
-    """How many steps an episode has."""
+    """The number of steps of an episode."""
     return 5 + episode * 37 % 60
 
 
@@ -82,7 +82,7 @@ def length(episode: int) -> int:
 
 
 def record(url: str, token: int, ledger: str, seed: int) -> None:
-    """Records until it is told to stop; notes each step that has returned."""
+    """Records until it is told to stop; writes down each step that has returned."""
     rng = random.Random(seed)
     client = TupliAPIClient(url)
     env = TupliEnvWrapper(Told(token), client, chunk_size=rng.choice([4096, 1 << 18]))
@@ -128,7 +128,7 @@ def noted(ledger: Path) -> dict[int, tuple[int, bool]]:
 
 
 def recorded_wrong(client: TupliStorage, token: int, ledger: Path) -> Iterator[str]:
-    """What is not on the server as it was recorded."""
+    """Sentences on recorded steps that the server lacks, or has wrongly."""
     ids = [h.id for h in client.list_benchmarks() if h.metadata.name == f"token {token}"]
     found: dict[int, list[Any]] = {}
     for item in client.list_episodes(F("benchmark_id").isin(ids), include_tuples=True) if ids else []:
@@ -146,7 +146,7 @@ def recorded_wrong(client: TupliStorage, token: int, ledger: Path) -> Iterator[s
 
 
 def copied_wrong(one: TupliStorage, other: TupliStorage, uri: str) -> Iterator[str]:
-    """What differs between two storages of a benchmark."""
+    """Sentences on differences between two storages of a benchmark."""
     of_it = FilterEQ(key="benchmark_id", value=uri)
     first, second = (
         sorted(storage.list_episodes(of_it, include_tuples=True), key=lambda item: item.id)
@@ -182,7 +182,7 @@ class Rounds:
             os.environ[f"TUPLI_MCAP_{each}_DIR"] = str(place / each)
 
     def run(self, number: int, rng: random.Random) -> list[str]:
-        """What went wrong in a round."""
+        """Runs a round; returns what went wrong."""
         place = self.folder / str(number)
         self._set(place)
         kind = rng.choice(_KINDS)
@@ -241,7 +241,7 @@ class Rounds:
         return uri
 
     def _broken(self, commands: list[list[str]], rng: random.Random, *, ready: bool = False) -> Iterator[str]:
-        """Runs processes over a bad connection, and kills them at some moment; yields what they complain of."""
+        """Runs processes over a bad connection, and kills them at a random moment; yields their errors."""
         processes = [
             subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             for command in commands
@@ -278,7 +278,7 @@ class Rounds:
 
 
 def campaign(rounds: int, seed: int, folder: Path) -> Iterator[tuple[int, list[str]]]:
-    """Runs rounds; what went wrong in each."""
+    """Runs rounds; yields what went wrong in each."""
     warnings.simplefilter("ignore")
     with serving(Settings(folder / "served")) as url, between(url) as proxy:
         all_rounds = Rounds(url, proxy, folder)

@@ -2,16 +2,16 @@
 
     python tools/concurrency.py --seconds 120 --writers 8 --seed 1
 
-Every row says which process, episode and step it is of, so that any row read can be checked by itself. What was
-acknowledged (a step that returned, an episode that ended, a deletion) goes to ledgers outside the storage with one
-write(2) each, which outlives a kill. During the run and after it, the storage is held against them:
+Every row contains its process, episode and step, so that each row can be checked by itself. Processes write everything
+acknowledged (a step that returned, an episode that ended, a deletion) to ledgers outside the storage, with one write(2)
+each, which survives a kill. During the run and after it, the storage is compared with the ledgers:
 
-- no step that was acknowledged is lost, nor does an ended episode lack in a list, unless somebody meant to delete it;
+- no acknowledged step is lost, and lists have every ended episode, unless a process meant to delete it;
 - nothing whose deletion was acknowledged comes back;
 - every episode that is read is exact, from its first step to its last;
-- no call fails but for what it names being deleted meanwhile, and none warns;
-- nobody waits for anybody for more than --patience seconds;
-- the catalog equals one that is made anew, and nothing is locked when all have gone.
+- a call fails only if its item was deleted meanwhile, and none warns;
+- no process waits for another one for more than --patience seconds;
+- the catalog equals a rebuilt one, and nothing is locked when all have ended.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ Key = tuple[int, int]  # token, episode
 
 
 class Told(gym.Env[Any, Any]):
-    """Says in each state whose it is: (token, episode, step). An episode has as many steps as its options say."""
+    """An environment whose states identify themselves: (token, episode, step). Options give the length of an
+    episode."""
 
     observation_space = gym.spaces.Box(0, 1 << 40, (3,), np.int64)
     action_space = gym.spaces.Discrete(1 << 30)
@@ -94,11 +95,11 @@ class Named(EpisodeMetadataCallback):
 
 
 class WrongError(Exception):
-    """Something the storage must never do."""
+    """The storage has broken a promise."""
 
 
 def check_rows(states: Any, actions: Any, rewards: Any, flags: Any, final: Any) -> Key:
-    """Whose episode these rows are; WrongError unless they are exactly the first steps of it."""
+    """The token and number of the episode of some rows; WrongError unless they are exactly its first steps."""
     n = len(states)
     token, number = (int(x) for x in states[0][:2])
     wanted = np.empty((n + 1, 3), np.int64)
@@ -124,7 +125,7 @@ def check_recording(recording: Recording) -> Iterator[tuple[int, Key, int, str]]
 
 
 class Ledger:
-    """What was acknowledged, in files of one line or record each; any process may read it at any time."""
+    """Everything acknowledged, in files that any process may read at any time."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -177,7 +178,7 @@ class Place(NamedTuple):
 
 
 class Worker:
-    """One process: does one thing after another until it is told to stop, or killed."""
+    """One process: works until it is told to stop, or killed."""
 
     def __init__(self, place: Place, slot: int, token: int, seed: int, until: float, beats: Any) -> None:
         self.place, self.slot, self.token, self.until = place, slot, token, until
@@ -243,7 +244,7 @@ class Writer(Worker):
 
 
 class Other(Worker):
-    """Does to the storage what others do while somebody records."""
+    """A process that reads, deletes, compacts and shares while others record."""
 
     def work(self) -> None:
         names = ("look", "load", "open", "items", "delete", "delete_many", "publish", "compact", "rebuild", "vanish",
@@ -259,7 +260,7 @@ class Other(Worker):
         time.sleep(self.random.random() * 0.05)
 
     def look(self) -> None:
-        """Every episode that had ended is listed, none that was deleted."""
+        """Checks that lists have every ended episode, and no deleted one."""
         gone = self.ledger.keys("deleted")
         ended = {key for key, (_, over) in self.ledger.episodes().items() if over}
         chosen = self.random.choice([None, "id", "token"])
@@ -279,7 +280,7 @@ class Other(Worker):
             raise WrongError(f"listed twice: {twice}, not listed: {lost}, listed though deleted: {back}")
 
     def load(self) -> None:
-        """A whole benchmark at once."""
+        """Loads a whole benchmark."""
         benchmark = self.random.choice(self.place.benchmarks)
         ds = TupliDataset(self.storage).with_episode_filter(FilterEQ(key="benchmark_id", value=benchmark))
         ds.load()
@@ -291,7 +292,7 @@ class Other(Worker):
             at += header.n_tuples
 
     def open(self) -> None:
-        """One recording, be it live, killed or finished."""
+        """Opens one recording: live, killed or finished."""
         header = self._any()
         with self.storage.open_recording(header.recording) as recording:
             list(check_recording(recording))
@@ -342,7 +343,7 @@ class Other(Worker):
         self.storage.reindex()
 
     def vanish(self) -> None:
-        """Somebody deletes the catalog's file."""
+        """Deletes the catalog's file."""
         catalog = catalog_path(self.place.storage)
         assert catalog is not None
         for suffix in ("", "-wal", "-shm"):
@@ -361,7 +362,7 @@ class Other(Worker):
         self.ledger.note("taken", bundle.name)
 
     def benchmark(self) -> None:
-        """A benchmark of one's own, from store to delete."""
+        """Stores a benchmark, records to it, and deletes it."""
         env = TupliEnvWrapper(Told(2 * FOREIGN + self.token, self.counts["benchmark"]), self.storage)
         uri = env.store(name=f"own {self.token} {self.counts['benchmark']}")
         state, _ = env.reset()
@@ -375,7 +376,7 @@ class Other(Worker):
             raise WrongError(f"benchmark {uri} was deleted and still has episodes")
 
     def refuse(self) -> None:
-        """A benchmark that is being recorded is not deleted with its episodes."""
+        """Checks that nobody can delete a benchmark with its episodes while it is being recorded."""
         uri = self.random.choice(self.place.benchmarks)
         env = TupliEnvWrapper(Told(3 * FOREIGN + self.token, self.counts["refuse"]), self.storage, uri)
         state, _ = env.reset()
@@ -474,7 +475,7 @@ def _check_alive(processes: list[Any], beats: Any, patience: float, place: Place
 
 
 def verify(place: Place) -> Counter[str]:
-    """Holds what is there against the ledgers."""
+    """Compares the storage with the ledgers."""
     figures: Counter[str] = Counter()
     storage, ledger = FileStorage(place.storage), place.ledger
     locked = [path for path in place.storage.rglob("*.mcap") if is_locked(path)]

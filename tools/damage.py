@@ -1,10 +1,10 @@
 #!/usr/bin/env python
-"""Damages golden recordings in every way that is quick to try, and recovers and verifies each: nothing wrong may pass.
+"""Damages golden recordings in many simple ways, then verifies and recovers each.
 
-`python tools/damage.py [--every N] [--name NAME ...] [--kind flip|cut|zero|swap]`: every N-th byte of each recording
-is flipped (or the file is cut there, 64 bytes from there on are zeroed, or bytes from elsewhere are put there). Then
-`verify` has to find it, `recover` may only give steps that were recorded, has to name those that are missing, and
-`verify` has to like what it wrote. Prints a line a recording; exit code 1 if something is wrong.
+`python tools/damage.py [--every N] [--name NAME ...] [--kind flip|cut|zero|swap]`: at every N-th byte of each
+recording, flips a bit, cuts the file, zeroes 64 bytes, or copies bytes from elsewhere in the file. Then `verify` must
+find the damage; `recover` must return only recorded steps, and name the missing ones; and `verify` must find nothing in
+the recovered file. Prints a line per recording; exits with 1 if something is wrong.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ Steps = dict[tuple[int, int], str]
 
 
 def flip(data: bytes, at: int, rng: random.Random) -> bytes:
-    """One bit."""
+    """Flips one bit."""
     bad = bytearray(data)
     bad[at] ^= 1 << rng.randrange(8)
     return bytes(bad)
 
 
 def cut(data: bytes, at: int, rng: random.Random) -> bytes:
-    """The end is gone."""
+    """Cuts the file."""
     return data[:at]
 
 
 def zero(data: bytes, at: int, rng: random.Random) -> bytes:
-    """A stretch of zeros, as a lost page leaves it."""
+    """Writes zeros, as a lost page leaves them."""
     return data[:at] + bytes(len(data[at : at + 64])) + data[at + 64 :]
 
 
 def swap(data: bytes, at: int, rng: random.Random) -> bytes:
-    """Bytes from elsewhere in the file."""
+    """Copies bytes from elsewhere in the file."""
     other, size = rng.randrange(len(data)), rng.randrange(1, 200)
     part = data[other : other + size]
     return data[:at] + part + data[at + len(part) :]
@@ -87,7 +87,7 @@ def steps_of(path: Path) -> Steps:
 
 
 def wrong(path: Path, wanted: Steps, *, changed: bool) -> str | None:
-    """What is wrong with what becomes of a damaged file; None if nothing is."""
+    """What is wrong after verifying and recovering a damaged file; None if nothing is."""
     if verify_recording(path).problems == [] and changed:
         return "damage not found"
     try:
@@ -136,7 +136,7 @@ def main() -> int:
 
 
 def sweep(name: str, kind: str, every: int, directory: Path) -> tuple[Counter[str], int]:
-    """What went wrong, by sentence (with the first place of each), and how many files were tried."""
+    """Everything that went wrong, by sentence (with the first place of each), and the number of files tried."""
     path = place(name, directory)
     wanted, data = steps_of(path), path.read_bytes()
     library = range(35, 47)  # in the header: bytes that no rule is about

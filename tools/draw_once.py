@@ -1,6 +1,6 @@
-"""Lets this environment's own viewer draw a replay, without a screen, and looks whether there is anything on it.
+"""Lets this environment's viewer draw a replay without a screen, and checks that it shows curves.
 
-Needs little of rerun-sdk, so that it runs under old versions too.
+Uses little of rerun-sdk, so that it runs with old versions too.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def drawn(port: int, picture: Path) -> float:
-    """How much of the window is in colour, as soon as it is enough."""
+    """The coloured part of the window; waits until it is large enough."""
     found, end = 0.0, time.monotonic() + _SECONDS
     while found < _ENOUGH and time.monotonic() < end:
         time.sleep(1.0)

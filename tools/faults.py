@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Every fault of the operating system, one after another: the full sweep of tests/test_faults.py.
+"""The full sweep of tests/test_faults.py: makes the calls of the operating system fail, one after another.
 
-Each call that recording or a storage makes on its files fails in its turn, with each error it may give, once
-or for good, before anything or after half of the bytes was written. Prints what failed; exit code 1 then.
+Each call of recording or of a storage on its files fails once or from then on, with each of its possible errors, before
+anything or half of the bytes was written. Prints what went wrong; exits with 1 then.
 
     tools/faults.py                      everything (an hour or so)
     tools/faults.py --sample 50          50 cases of each workload
@@ -32,7 +32,7 @@ Run = Callable[[Path, Case], Outcome]
 
 
 def sweep(name: str, run: Run, directory: Path, sample: int | None, seed: int) -> tuple[int, int]:
-    """Runs the faults of one workload; how many, and how many of them went wrong."""
+    """Runs the faults of one workload; returns their number, and how many went wrong."""
     began = time.perf_counter()
     chosen = list(cases(run(directory / "whole", Case(-1, errno.EIO, False)).calls))
     if sample is not None:

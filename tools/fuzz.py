@@ -4,8 +4,8 @@
     python tools/fuzz.py --count 100000 --seed 1 --jobs 2        # a run
     python tools/fuzz.py --seed 1 --case 4711 --keep /tmp/found   # one input again, kept
 
-Inputs are golden recordings, changed by a mutator. Workers die of too much memory and are killed when they hang; both
-are findings. The exit code is 1 if there are any.
+Inputs are golden recordings, changed by a mutator. A worker that takes too much memory dies, and one that hangs is
+killed; both are findings. Exits with 1 if there are any.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ADDRESS_SPACE = 2 << 30  # more than a worker has once everything is imported
 
 
 def work(inbox: Any, outbox: Any, now: Any, options: argparse.Namespace) -> None:
-    """Judges batches of inputs; `now` is the number in work, for the parent to see."""
+    """Reads and judges batches of inputs; `now` tells the parent the number of the current one."""
     faulthandler.enable()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent's business
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
@@ -57,7 +57,7 @@ def work(inbox: Any, outbox: Any, now: Any, options: argparse.Namespace) -> None
 
 
 class Worker:
-    """A process and what it is at."""
+    """A process and its current input."""
 
     def __init__(self, inbox: Any, outbox: Any, options: argparse.Namespace) -> None:
         self.now = mp.Value("q", -1)
@@ -142,7 +142,7 @@ def table(outcomes: dict[str, Counter[str]]) -> None:
 
 
 def one(options: argparse.Namespace) -> int:
-    """One input again, kept where asked."""
+    """Repeats one input, and keeps it if asked."""
     seeds = load_seeds()
     case = case_of(options.seed, options.case, seeds, options.only)
     with tempfile.TemporaryDirectory() as directory:

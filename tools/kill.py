@@ -1,8 +1,8 @@
 """Kill recording processes and look for lost steps: `python tools/kill.py [--kills N] [--seed N] [--jobs N]`.
 
-Each recording is begun, killed, checked, gone on with and killed again, up to five times, and finished at the end. The
-killed processes have told of every step over a pipe. Exit code 1 if a step is missing or differs in a bit, or anything
-else is wrong. `tests/test_kill.py` does a little of this.
+Starts each recording, kills its process, checks the file, appends to it and kills again, up to five times, and finishes
+it. The processes report every step over a pipe. Exits with 1 if a step is missing or differs in a bit, or anything else
+is wrong. `tests/test_kill.py` runs a sample.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Chain(NamedTuple):
 
 
 class Pair:
-    """What came of one kind at one moment, in new or appended recordings."""
+    """The results of one kind at one moment, in new or appended recordings."""
 
     def __init__(self) -> None:
         self.kills = self.steps = self.losses = 0
@@ -55,7 +55,7 @@ class Pair:
 
 
 def plan(kinds: list[str], moments: list[str], seed: int) -> Iterator[Chain]:
-    """Recordings without end: kind after kind, each through all of its moments."""
+    """Endless recordings: kind after kind, each through all of its moments."""
     rng = random.Random(seed)
     left: dict[tuple[str, bool], list[str]] = collections.defaultdict(list)
     while True:
@@ -73,7 +73,7 @@ def plan(kinds: list[str], moments: list[str], seed: int) -> Iterator[Chain]:
 
 
 def live(chain: Chain, breakage: str, keep: str | None) -> list[Death]:
-    """Runs in a worker process; what went wrong is kept, if asked for."""
+    """Runs in a worker process; keeps the files that went wrong, if asked."""
     directory = Path(tempfile.mkdtemp(prefix="tupli-mcap-kill-"))
     try:
         os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(directory / "config")
@@ -89,7 +89,7 @@ def live(chain: Chain, breakage: str, keep: str | None) -> list[Death]:
 
 
 def kill(options: argparse.Namespace, console: Console) -> Iterator[tuple[Chain, list[Death]]]:
-    """Recordings and what came of them, until there were enough kills."""
+    """Yields recordings and their results until there were enough kills."""
     chains, killed = plan(options.kind or list(KINDS), options.moment or list(MOMENTS), options.seed), 0
     context = multiprocessing.get_context("spawn")  # each worker forks on its own, and must be small
     with (

@@ -1,8 +1,8 @@
 #!/usr/bin/env python
-"""Writes the golden recordings of `tests/golden`: one a feature, what its environment returned beside it.
+"""Writes the golden recordings of `tests/golden`: one per feature, with what its environment returned beside it.
 
 Run it when the format changes, in the commit that changes it: `python tools/make_golden.py [DIRECTORY]`.
-Clock and UUID are made up, so that two runs write the same bytes where nothing is compressed.
+Clock and UUID are fixed, so that two runs write the same bytes where nothing is compressed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ POLE = spaces.Box(
 
 @contextlib.contextmanager
 def made_up_world(number: int) -> Iterator[None]:
-    """A clock that ticks once a look, and known UUIDs and versions."""
+    """Fixed UUIDs and versions, and a clock that advances at each call."""
     clock = itertools.count(START_NS, STEP_NS)
     known = uuid.UUID(int=number)
     with (
@@ -69,7 +69,7 @@ def made_up_world(number: int) -> Iterator[None]:
 
 
 class Played(gym.Env[Any, Any]):
-    """Episodes from a formula, and a log of them; `ends` says how long each is and how it ends."""
+    """Episodes from a formula, and a log of them; `ends` has the length and the end of each."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ def stored_png(picture: Any, form: str = "png") -> bytes:
 
 
 class Score(EpisodeMetadataCallback):
-    """Return of the episode, and things JSON has no form for."""
+    """The return of the episode, and values that JSON cannot hold."""
 
     def __init__(self) -> None:
         self.reset()
@@ -523,7 +523,7 @@ def unfinished_frames(path: Path) -> list[Log]:
 
 
 def unfinished(path: Path, env: Played, **more: Any) -> list[Log]:
-    """What a power loss leaves at the best: a file without a summary, and its journal."""
+    """An unfinished recording: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
         live = Path(directory, path.name)
         options: dict[str, Any] = {
@@ -556,7 +556,7 @@ class Silent(Played):
 
 
 def unfinished_holes(path: Path) -> list[Log]:
-    """What a killed process leaves, with final states in holes, and the chunks of the first steps in the file."""
+    """The files of a killed process, with final states in holes, and the chunks of the first steps in the file."""
     env = Silent(POLE, pole, ENDS)
     with tempfile.TemporaryDirectory() as directory, mock.patch(BOOT_ID, return_value=""):
         live = Path(directory, path.name)
@@ -574,7 +574,7 @@ def unfinished_holes(path: Path) -> list[Log]:
 
 
 def unfinished_streams(path: Path, space: gym.Space[Any], observe: Observe) -> list[Log]:
-    """What a killed writer of two streams leaves: nobody knows the state after the last step."""
+    """The files of a killed writer of two streams: the state after the last step is unknown."""
     env = Played(space, observe, ENDS)
     roll(env, env, [3, 4, 2], action)
     episodes = expected(env)

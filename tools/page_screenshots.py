@@ -2,8 +2,7 @@
 
     python tools/page_screenshots.py [--all DIR] [--recordings DIR]
 
-Writes docs/page-*.png. With --all, every page is taken wide, narrow and dark as well, into DIR, to be looked at. With
---recordings, these are kept for another time.
+Writes docs/page-*.png. --all also takes every page wide, narrow and dark, into DIR. --recordings keeps the recordings.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ def main() -> None:
 
 
 def record(root: Path) -> None:
-    """Runs as people have them."""
+    """Records runs like those of users."""
     root.mkdir(parents=True)
     carts(root, seeds=4, episodes=60)
     viewed.courier(root / "courier.mcap")

@@ -1,9 +1,11 @@
 #!/usr/bin/env python
-"""Takes the power away from recordings, on paper: possible disks are put together, read, and compared with the truth.
+"""Simulates power losses: makes the files that a disk may hold after one, reads them, and compares the steps.
 
-For every kind of environment and each durability: at random moments, every sector of file and journal is as it was at
-the last sync or at any moment since; then file and journal are cut at every byte. What was synced must be there, and
-nothing else than what the environment returned. Exits with 1 if not: `tools/power_loss.py [--crashes N] [--seed S]`.
+For every kind of environment and each durability, at random moments: each sector of file and journal is as it was at
+the last sync, or at any moment since; then file and journal are cut at every byte. Every synced step must be there, and
+every step must be one that the environment returned. Exits with 1 if not.
+
+    tools/power_loss.py [--crashes N] [--seed S]
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from tupli_mcap.recording import journal_path
 
 
 def crashes(story: Story, place: Path, count: int, rng: random.Random) -> tuple[int, list[str]]:
-    """Steps checked, and what went wrong."""
+    """Simulates crashes; returns the number of checked steps, and what went wrong."""
     steps, wrong = 0, []
     for n in range(count):
         at = rng.randrange(len(story.moments))
@@ -35,7 +37,7 @@ def crashes(story: Story, place: Path, count: int, rng: random.Random) -> tuple[
 
 
 def cuts(story: Story, place: Path, stride: int) -> tuple[int, list[str]]:
-    """Files and journals cut, and what went wrong."""
+    """Cuts file and journal; returns the number of cuts, and what went wrong."""
     last, count, wrong = story.moments[-1], 0, []
     journal = last.journal or b""
     used = len(journal.rstrip(b"\0")) + 1

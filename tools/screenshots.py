@@ -1,7 +1,7 @@
 """Takes the pictures of README and site: real recordings, replayed in the real viewer, without a screen.
 
-Run it with `.venv/bin/python tools/screenshots.py` after `tools/setup-viewer`; it writes docs/replay-*.png and
-docs/replay.webp, which moves.
+Run it with `.venv/bin/python tools/screenshots.py` after `tools/setup-viewer`; it writes docs/replay-*.png and the
+animation docs/replay.webp.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _land(path: Path) -> Path:
 
 
 def _film(window: HeadlessViewer, replay: Path, goal: Path, steps: int) -> None:
-    """Moves the time through the steps, and makes a film of what the viewer shows."""
+    """Moves the time cursor through the steps, and films the viewer."""
     window.portrait(replay, goal.with_suffix(".png"), 0)  # waits until its notes are gone
     goal.with_suffix(".png").unlink()
     pictures = []

@@ -1,17 +1,17 @@
-"""Kills a server, its database and its object store in the middle of what users do, and breaks their connections.
+"""Kills a server, its database and its object store while users work, and breaks their connections.
 
     python tools/server_faults.py --kills 300 --seed 1 --engine postgresql
 
 Three users store, fetch, publish and delete recordings and artifacts at the same time, through a proxy that refuses,
-resets, stalls, answers 503 and turns bits over. At some moment the server is killed, its PostgreSQL stopped as by a
-crash, or its bucket cut off; a while later it is back. Every tenth kill hits a server that brings the tables of the
-first version up to date. After each
+resets, stalls, answers 503 and flips bits. At a random moment, the server is killed, its PostgreSQL crashes, or its
+bucket is cut off; a while later it is back. Every tenth kill hits a server that upgrades the tables of the first
+version. After each:
 
-- what was acknowledged is there, whole and exact, and what was deleted is not;
-- what was not acknowledged is there as a whole, or not at all, and once; published as a whole, or not at all;
-- tried again, it is as if it had been tried once;
-- each file that is kept is named by the database, or waits to be deleted, and none that is named is missing; after the
-  next start, nothing waits.
+- everything acknowledged is there, whole and exact, and nothing that was deleted;
+- a request without an answer has happened completely, or not at all, and not twice;
+- repeating it has the same effect as one request;
+- each stored file is named by the database or waits to be deleted, and no named file is missing; after the next start,
+  nothing waits.
 
 Exit code 1 at a finding.
 """
@@ -63,7 +63,7 @@ _USERS = ("ann", "bob", "eve")
 
 
 class Server:
-    """A server in a process of its own, which is there again on the same port after it was killed."""
+    """A server process that can be restarted on the same port after a kill."""
 
     def __init__(self, settings: Settings, environment: dict[str, str]) -> None:
         self._context = multiprocessing.get_context("forkserver")
@@ -112,7 +112,7 @@ def _serve(settings: Settings, port: int, environment: dict[str, str], tells: An
 
 
 class Campaign:
-    """Kills, and what is found after each."""
+    """Kills the server, and checks it after each kill."""
 
     def __init__(self, engine: str, folder: Path, seed: int, stack: contextlib.ExitStack) -> None:
         self._folder, self._stack, self._seed = folder, stack, seed
@@ -147,7 +147,7 @@ class Campaign:
         return self._stack.enter_context(self.cluster.database())
 
     def run(self, kills: int) -> Iterator[tuple[int, str, list[str]]]:
-        """The number of each kill, what was killed, and what was wrong after it."""
+        """Yields the number of each kill, what was killed, and what was wrong after it."""
         some = ("server", "server", "database", "bucket") if self.cluster else ("server",)
         number = 0
         while number < kills:
@@ -208,7 +208,7 @@ class Campaign:
     # --- what must hold ---
 
     def _rest(self) -> None:
-        """Waits until the server has nothing to do but to answer this."""
+        """Waits until the server has no other request."""
         while "tupli_mcap_requests_running 1.0" not in self._admin.call("GET", "/metrics").text:
             time.sleep(0.02)
 
@@ -224,7 +224,7 @@ class Campaign:
         yield from self._files(waiting=True)
 
     def _last(self) -> Iterator[str]:
-        """What is wrong after a start with nobody at work."""
+        """What is wrong after a start without users."""
         yield from self._compare(again=True)
         self._server.kill()
         self._server.start()
@@ -234,7 +234,7 @@ class Campaign:
         self.counts["not answered"] = sum(user.failed for user in self._users)
 
     def _files(self, waiting: bool) -> Iterator[str]:
-        """Files that nothing names, or that are named and not there; `waiting`: some may wait to be deleted."""
+        """Files that nothing names, and named files that are missing; `waiting`: some may wait to be deleted."""
         with contextlib.closing(Database(self._url)) as database, database.reading() as connection:
             named = {unescape_text(place) for place in connection.execute(select(FILE.c.place)).scalars()}
             of_artifacts = select(ITEM.c.id).where(ITEM.c.kind == "artifact")
@@ -271,7 +271,7 @@ class Campaign:
     # --- migrations ---
 
     def _migrate(self, number: int, rng: random.Random) -> Iterator[str]:
-        """Kills a server, or its database, while it brings the first version's tables up to date."""
+        """Kills a server, or its database, while it upgrades the first version's tables."""
         settings = replace(self._settings, directory=self._folder / f"first{number}", blobs="", database="")
         settings.own.mkdir(parents=True)
         with contextlib.ExitStack() as stack:
@@ -296,7 +296,7 @@ class Campaign:
 
 
 def campaign(engine: str, kills: int, seed: int, folder: Path) -> Iterator[tuple[int, str, list[str]]]:
-    """Kills; the number of each, what was killed, and what was wrong then."""
+    """Runs kills; yields the number of each, what was killed, and what was wrong then."""
     logging.getLogger("werkzeug").setLevel(logging.ERROR)  # the bucket's log
     with contextlib.ExitStack() as stack:
         made = Campaign(engine, folder, seed, stack)

@@ -1,14 +1,14 @@
-"""Asks a server everything that its OpenAPI document allows, and much that it does not, as somebody in each role.
+"""Sends a server requests that its OpenAPI document allows, and others, as users of each role.
 
     python tools/server_fuzz.py --examples 200 --seed 1 --engine postgresql
 
-Schemathesis makes the requests from the document; those to pages, and their forms, tests/page_fuzz.py draws. In half of
-them, names and ids of what is there take the place of what is made up, so that they get further than "there is no such
-thing". Who asks is drawn for each. Findings are
+Schemathesis makes the requests from the document; tests/page_fuzz.py draws requests to pages and their forms. Half of
+them use names and ids of existing items instead of made-up ones, so that they get further than "there is no such
+thing". A random user sends each. Findings are:
 
-- a failure of the server: a status of 500 or more, but "you keep as much as you may" (507);
-- an answer that the document does not tell of: its status, its media type, its JSON;
-- a page with a text that is not escaped.
+- a failure of the server: a status of 500 or more, except a full quota (507);
+- an answer that the document does not describe: its status, its media type or its JSON;
+- a page with unescaped text.
 
 Exit code 1 at a finding.
 """
@@ -71,9 +71,9 @@ _TEXTS = ["steps >= 0", "metadata.score == 1", 'created_by in ["admin"]']
 
 
 class Stock:
-    """What there is to ask for, kept by a user and published in `global`, and somebody in each role.
+    """Items of a user, published in `global`, and a user of each role.
 
-    Who asks may delete all of it: `renew` brings it back, and gives what may stand for each name in a request.
+    Requests may delete all of it: `renew` brings it back, and returns the values for each name in a request.
     """
 
     def __init__(self, url: str, folder: Path) -> None:
@@ -88,7 +88,7 @@ class Stock:
         self._owner = self._person()
 
     def _person(self, role: str = "") -> Person:
-        """A new user, whom the admin gives a role in `global`."""
+        """Creates a user; the admin gives them a role in `global`."""
         self._users += 1
         name = f"user{self._users}"
         self._admin.ask("POST", "/v1/users", {"username": name, "password": f"{name}'s password"})
@@ -112,7 +112,7 @@ class Stock:
         return person
 
     def renew(self) -> dict[str, list[Any]]:
-        """Brings back what was deleted, and who; gives what may stand for each name in a request."""
+        """Brings back deleted items and users; returns the values for each name in a request."""
         for role, person in self.askers.items():
             if role and person.call("GET", "/v1/me").status_code == 401:
                 self.askers[role] = self._asker(role)
@@ -166,7 +166,7 @@ class Stock:
         return path.partition("ticket=")[2]
 
     def _uploads(self) -> list[str]:
-        """Uploads that each has begun."""
+        """An unfinished upload of each user."""
         begun = [
             person.call("POST", "/v1/uploads", headers=announced(b"x" * 9)) for person in self.askers.values()
         ]
@@ -174,7 +174,7 @@ class Stock:
 
 
 class Known:
-    """Puts what is there into requests."""
+    """Puts existing names and ids into requests."""
 
     def __init__(self, names: dict[str, list[Any]], rng: random.Random) -> None:
         self._names, self._rng = names, rng
@@ -206,7 +206,7 @@ class Known:
 
 
 class Fuzzer:
-    """Asks, and keeps what went wrong: by what it is, how often, and the first request that shows it."""
+    """Sends requests, and counts findings by kind, with the first request that shows each."""
 
     def __init__(self, url: str, folder: Path, seed: int) -> None:
         self.schema = from_url(f"{url}/openapi.json")
@@ -216,7 +216,7 @@ class Fuzzer:
         self.findings: dict[str, str] = {}
 
     def run(self, examples: int, only: str = "") -> None:
-        """Makes requests to each route, or only to one, such as `GET /v1/me`."""
+        """Sends requests to each route, or only to one, such as `GET /v1/me`."""
         names: dict[str, list[Any]] = {}
         for number, found in enumerate(self.schema.get_all_operations()):
             if number % _RENEWED_EVERY == 0:
@@ -225,7 +225,7 @@ class Fuzzer:
                 self._ask(found.ok(), names, examples)
 
     def run_pages(self, examples: int, only: str = "") -> None:
-        """Asks for each page, and sends each form, or only that of one path."""
+        """Gets each page and sends each form, or only those of one path."""
         for number, route in enumerate(page_routes()):
             if number % _RENEWED_EVERY == 0:
                 names = self._stock.renew()

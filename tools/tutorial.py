@@ -1,7 +1,7 @@
-"""The tutorial: from a custom environment to a policy trained offline on what was recorded of it.
+"""The tutorial: from a custom environment to a policy trained offline on its recordings.
 
-It stores a benchmark, records random steps of it, trains a policy on them with discrete CQL, tests that and
-cleans up. Run it with `tools/tutorial`, which installs what it needs first (d3rlpy and PyTorch).
+It stores a benchmark, records random steps, trains a policy on them with discrete CQL, tests the policy, and
+cleans up. Run it with `tools/tutorial`, which first installs d3rlpy and PyTorch.
 """
 
 from __future__ import annotations
