@@ -33,15 +33,22 @@ def _cache_of_all_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
 
 
 @pytest.fixture(scope="session")
-def _private_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def _directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """One directory after another. `mktemp` would look through those of all earlier tests for the next number."""
-    parent = tmp_path_factory.mktemp("private")
+    parent = tmp_path_factory.mktemp("tests")
     return (parent / str(number) for number in itertools.count())
 
 
+@pytest.fixture
+def tmp_path(_directories: Iterator[Path]) -> Path:
+    directory = next(_directories)
+    directory.mkdir()
+    return directory
+
+
 @pytest.fixture(autouse=True)
-def _private_config(_private_directories: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    private = next(_private_directories)
+def _private_config(_directories: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> Path:
+    private = next(_directories)
     for name in ["config", "cache", "data"]:
         (private / name).mkdir(parents=True)
         monkeypatch.setenv(f"TUPLI_MCAP_{name.upper()}_DIR", str(private / name))
