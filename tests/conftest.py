@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _cache_of_all_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """For what is made once for several tests."""
+def _shared_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache for what is made once for several tests; no authorities to load whenever a client of a server is made."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("SSL_CERT_DIR", str(tmp_path_factory.mktemp("certificates")))
         yield
 
 

@@ -109,6 +109,7 @@ def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         yield Lab(url, root)
 
 
+@pytest.mark.sampled(0, keep=["sqlite and a directory-published", "postgresql and s3-private"])
 @pytest.mark.parametrize("published", [False, True], ids=["private", "published"])
 def test_every_route_for_each_role(lab: Lab, published: bool) -> None:
     wrong = []

@@ -204,6 +204,7 @@ class TestRights:
 
 
 class TestInjection:
+    @pytest.mark.sampled(12)
     @pytest.mark.parametrize("text", TEXTS, ids=repr)
     def test_of_ids_names_keys_and_orders(self, lab: Lab, text: str) -> None:
         """Nothing but a refusal, and nothing of ann's."""
@@ -233,6 +234,7 @@ class TestInjection:
         assert [a for a in answers if a.status_code >= 500 or a.status_code < 300] == []
         assert not [a for a in answers if "x-evil" in a.headers or lab.recording in a.text]
 
+    @pytest.mark.sampled(12)
     @pytest.mark.parametrize("text", TEXTS, ids=repr)
     def test_of_filters(self, lab: Lab, text: str) -> None:
         key = f"metadata.{text}"

@@ -1139,7 +1139,8 @@ class TestSharing:
 
 
 LISTED = ("users", "groups", "roles", "tokens", "benchmarks", "artifacts", "episodes")
-COMMANDS = [name for name, command in get_command(app).commands.items() if not command.hidden]  # type: ignore[attr-defined]
+PROGRAM: Any = get_command(app)
+COMMANDS = [name for name, command in PROGRAM.commands.items() if not command.hidden]
 
 
 @functools.cache
@@ -1192,15 +1193,14 @@ class TestProgram:
     @pytest.mark.parametrize("command", COMMANDS)
     def test_examples_are_meant(self, command: str, here: Path) -> None:
         """They parse: what a file or an environment says is another matter."""
-        root = get_command(app)
         lines = help_of(command).splitlines()
         examples = [line for line in lines if line.startswith("  tupli-mcap ")]
         assert examples or command == "version"
         for line in examples:
             _, name, *words = shlex.split(line)
             assert name == command
-            context = root.make_context("tupli-mcap", [name])
-            found = root.get_command(context, name)  # type: ignore[attr-defined]
+            context = PROGRAM.make_context("tupli-mcap", [name])
+            found = PROGRAM.get_command(context, name)
             assert found.make_context(name, words, parent=context).params
 
     def test_version(self, here: Path) -> None:

@@ -123,22 +123,24 @@ def _names(directory: Path) -> dict[str, Any]:
     return names
 
 
+COMMANDS: Any = typer.main.get_command(app)
+
+
 @pytest.mark.parametrize("example", [one for examples in _EXAMPLES.values() for one in examples])
 def test_examples_of_commands_are_understood(example: str) -> None:
     name, *words = shlex.split(example)
-    command = typer.main.get_command(app).get_command(None, name)  # type: ignore[attr-defined, arg-type]
+    command = COMMANDS.get_command(None, name)
     options = {option for param in command.params for option in param.opts + param.secondary_opts}
     assert {word for word in words if re.match(r"--?[a-z]", word) and word != "-return"} <= options
 
 
 def test_the_reference_of_commands_holds_all() -> None:
     page = generated.replaced((ROOT / "docs/reference/commands.md").read_text(encoding="utf-8"))
-    group: Any = typer.main.get_command(app)
     for names in _COMMANDS.values():
         for name in names:
             section = page.partition(f"\n### {name}\n")[2].partition("\n### ")[0]
             options = [
-                o for p in group.commands[name].params if not p.hidden for o in p.opts if o.startswith("--")
+                o for p in COMMANDS.commands[name].params if not p.hidden for o in p.opts if o.startswith("--")
             ]
             assert [option for option in options if option not in section] == [], name
 

@@ -19,7 +19,7 @@ import server_faults
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
-@pytest.mark.parametrize(("engine", "kills"), [("sqlite", 2), ("postgresql", 4)])
+@pytest.mark.parametrize(("engine", "kills"), [("sqlite", 1), ("postgresql", 3)])
 def test_nothing_acknowledged_is_lost_and_nothing_half_there(
     engine: str, kills: int, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
