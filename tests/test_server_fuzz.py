@@ -33,6 +33,7 @@ def tool() -> ModuleType:
     return module
 
 
+@pytest.mark.sampled(0, keep=["postgresql"])
 @pytest.mark.parametrize("engine", ["sqlite", "postgresql"])
 def test_every_route_answers_as_the_document_says(
     engine: str, tmp_path: Path, request: pytest.FixtureRequest
