@@ -140,7 +140,11 @@ def test_the_reference_of_commands_holds_all() -> None:
         for name in names:
             section = page.partition(f"\n### {name}\n")[2].partition("\n### ")[0]
             options = [
-                o for p in COMMANDS.commands[name].params if not p.hidden for o in p.opts if o.startswith("--")
+                o
+                for p in COMMANDS.commands[name].params
+                if not p.hidden
+                for o in p.opts
+                if o.startswith("--")
             ]
             assert [option for option in options if option not in section] == [], name
 
