@@ -1,8 +1,8 @@
-"""Users of a server that fails, who write down what was acknowledged, and compare it with what is there afterwards.
+"""Users of a failing server: they note what was acknowledged, and compare it with the server afterwards.
 
-A request that was answered with success has happened. One that was not may have: what it changes is then one of two
-things, until it is tried again. Nothing else may be there, and nothing in between. Such a request may still be at work
-when the next one is sent: its opposite is not asked for before the server has nothing more to do (`rested`).
+A request that succeeded has happened. A failed one may have happened: until it is repeated, its item has one of two
+states, and no third one. It may still be running when the next request is sent, so a user sends the opposite request
+only when the server is idle (`rested`).
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ _WAIT = 10.0  # seconds until a request counts as failed
 
 
 class UnexpectedError(Exception):
-    """A request was refused that should not be."""
+    """The server refused a request that it should accept."""
 
 
 class _NotNowError(Exception):
-    """A request was not answered, or not now."""
+    """A request got no answer, or "try again later"."""
 
 
 class Thing:
-    """What a user has stored, or tried to: a recording with `count` episodes, or an artifact.
+    """An item that a user stored, or tried to: a recording with `count` episodes, or an artifact.
 
-    here, shown: what may be the case: whether it is there, and published. name: what the server calls it.
+    here, shown: the possible values of whether it is stored, and published. name: the server's name of it.
     """
 
     def __init__(self, data: bytes, count: int = 0) -> None:
@@ -65,18 +65,18 @@ class User:
         self._benchmark: str = self.person.ask("POST", "/v1/benchmarks", cart_benchmark())["id"]
 
     def work(self, stop: threading.Event) -> None:
-        """Does one thing after the other until it is told to stop."""
+        """Sends random requests until it is told to stop."""
         while not stop.is_set():
             with self._noted():
                 self._step()
 
     def rested(self) -> None:
-        """Notes that none of the requests so far is still at work."""
+        """Notes that no request so far is still running."""
         for thing in self.things:
             thing.open = ""
 
     def settle(self) -> None:
-        """Tries again what is not known."""
+        """Repeats requests whose effect is unknown."""
         for thing in self.things:
             with self._noted():
                 if len(thing.here) > 1:
@@ -176,7 +176,7 @@ class User:
         thing.here = {True}
 
     def _send(self, data: bytes) -> str:
-        """Stores a recording, in some requests."""
+        """Stores a recording, in several requests."""
         answer = self._call("POST", "/v1/uploads", headers=announced(data))
         place, size = answer.headers.get("Location"), self._rng.choice((len(data), len(data) // 3 + 1))
         while "Recording" not in answer.headers:
@@ -233,7 +233,7 @@ class User:
     # --- afterwards ---
 
     def compare(self, url: str, other: str) -> Iterator[str]:
-        """What is not as was acknowledged, seen over a good connection by this user, and by another one."""
+        """Differences from what was acknowledged, as this user and another one see it over a good connection."""
         me, them = Person(url, self.person.name), Person(url, other)
         artifacts, recordings = _artifacts(me, self.person.name), _recordings(me, self.person.name)
         shown = _artifacts(them, self.person.name) | _recordings(them, self.person.name)
@@ -264,7 +264,7 @@ class User:
 
 @contextlib.contextmanager
 def _asking(thing: Thing, what: str) -> Iterator[None]:
-    """Requests that may still be at work when they are not answered."""
+    """Wraps requests that may still be running if they get no answer."""
     before, thing.open = thing.open, what
     yield
     thing.open = before

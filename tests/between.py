@@ -1,4 +1,4 @@
-"""A proxy between a client and a server on this machine, which counts bytes and breaks connections as it is told to."""
+"""A proxy between a client and a server on this machine, which counts bytes and breaks connections on request."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["Between", "Fault", "between"]
 class Fault(NamedTuple):
     """What happens to a connection.
 
-    kind: "pass"; "refuse": it is closed at once; "reset": after so many bytes, in both directions counted together;
-        "stall": nothing is passed on after them; "5xx": the first request is answered 503; "flip": a bit of a file is
-        turned over on its way to the client, after so many bytes of files, "flip up": to the server. (Who sends JSON
-        over a connection that turns bits over needs TLS.)
+    kind: "pass"; "refuse": closes it at once; "reset": closes it after so many bytes of both directions;
+    "stall": passes nothing on after them; "5xx": answers 503 to the first request; "flip": flips a bit of a file on
+    its way to the client, after so many bytes of files, "flip up": to the server. (JSON over such a connection
+    needs TLS.)
     """
 
     kind: str = "pass"
@@ -28,7 +28,7 @@ class Fault(NamedTuple):
 
 
 class _Passed:
-    """What has passed of a connection: how many bytes, how many of files, and whether a file is on its way."""
+    """The traffic of a connection so far: bytes, bytes of files, and whether a file is on its way."""
 
     total = of_files = 0
     is_file = False
@@ -41,8 +41,8 @@ _REQUESTS = (b"GET ", b"POST ", b"PUT ", b"PATCH ", b"DELETE ", b"HEAD ")
 
 
 class Between:
-    """Accepts connections on `url`. `faults` are those of the next connections; `up`, `down`: bytes from and to clients
-    that have come through; `away`: nobody listens."""
+    """Accepts connections on `url`. `faults`: of the next connections; `up`, `down`: bytes passed on from and to
+    clients; `away`: it does not listen."""
 
     def __init__(self, target: str) -> None:
         parts = urlsplit(target)
@@ -57,7 +57,7 @@ class Between:
         threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
 
     def go_away(self) -> None:
-        """Refuses connections, and ends those that there are."""
+        """Refuses new connections, and ends the open ones."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -163,7 +163,7 @@ class Between:
 
     @staticmethod
     def _flipped(data: bytes, body: int, after: int) -> tuple[bytes, bool]:
-        """The bytes with one bit of the body turned over, if it is among them; and whether it is still to come."""
+        """The bytes with one bit of the body flipped, if it is among them; and whether it is still to come."""
         at = body + after
         if not body <= at < len(data):
             return data, True
@@ -179,7 +179,7 @@ def _reset(connection: socket.socket) -> None:
 
 @contextlib.contextmanager
 def between(target: str) -> Iterator[Between]:
-    """A proxy for as long as the block is entered."""
+    """A proxy within the block."""
     proxy = Between(target)
     try:
         yield proxy

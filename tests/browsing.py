@@ -1,4 +1,4 @@
-"""A page in a real Chromium that draws by software: photographed as soon as it shows something in colour."""
+"""A page in a real Chromium with software rendering: takes a picture as soon as the page shows something in colour."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ _TOP = 40  # rows of pixels of the viewer's own bar, whose signs are coloured
 
 
 class Seen(NamedTuple):
-    """What a page showed: height x width x 3 bytes, and what its scripts complained of."""
+    """A picture of a page: height x width x 3 bytes, and the errors of its scripts."""
 
     picture: np.ndarray
     complaints: list[str]
 
     @property
     def ink(self) -> float:
-        """The part of the pixels below the viewer's bar that are coloured."""
+        """The share of coloured pixels below the viewer's bar."""
         return _ink(self.picture)
 
 
 @contextlib.contextmanager
 def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
-    """`tupli-mcap replay --web` while it runs: the URL it tells, and the addresses on which anybody can reach it."""
+    """Runs `tupli-mcap view --web`; yields the URL that it prints, and the addresses that it listens on."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell
         signal.signal(signal.SIGINT, signal.default_int_handler)
     command = [
@@ -76,9 +76,9 @@ def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
 
 
 def browse(url: str, seconds: float = 150.0, size: tuple[int, int] = (1000, 700)) -> Seen:
-    """Open a page and wait until two pictures in a row are the same and coloured, or the time is over.
+    """Opens a page and waits until two pictures in a row are equal and coloured, or the time is over.
 
-    It reaches this machine only: what the page asks of others is refused.
+    The page can reach this machine only.
     """
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *FLAGS])

@@ -1,4 +1,4 @@
-"""An S3 server's stand-in, moto's, and a bucket of it. Its credentials are in the environment meanwhile."""
+"""A bucket of moto's S3 server, with its credentials in the environment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NUMBERS = itertools.count()
 
 
 class Bucket:
-    """A bucket of a server of its own; what it holds lasts while the server is away."""
+    """A bucket on a server of its own; its objects survive a restart of the server."""
 
     def __init__(self, name: str) -> None:
         self.url = f"s3://{name}"
@@ -40,7 +40,7 @@ class Bucket:
 
 @contextlib.contextmanager
 def bucket() -> Iterator[Bucket]:
-    """An empty bucket for the length of a block."""
+    """An empty bucket within the block."""
     made = Bucket(f"lab-{next(_NUMBERS)}")
     with pytest.MonkeyPatch.context() as patch:
         for key, value in {

@@ -1,5 +1,5 @@
-"""What every test gets: directories of its own for configuration, cache and data, so that no test touches the user's;
-and no width of a terminal, also where pytest runs in one."""
+"""Fixtures. Every test has its own directories for configuration, cache and data, so that none touches the user's, and
+no width of a terminal, even if pytest runs in one."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _private_config(_directories: Iterator[Path], monkeypatch: pytest.MonkeyPatc
 
 @pytest.fixture(scope="session")
 def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeadlessViewer]:
-    """One Rerun viewer for all tests; `show` closes what was open. Skips where this machine cannot draw."""
+    """One Rerun viewer for all tests; `show` closes open files. Skips if this machine cannot draw."""
     from viewing import HeadlessViewer, NoViewerError
 
     try:
@@ -74,7 +74,7 @@ def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[HeadlessViewer]
 
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Cluster]:
-    """One PostgreSQL for all tests, which make databases of their own in it. Skips where it is not installed."""
+    """One PostgreSQL for all tests, which make their own databases in it. Skips if it is not installed."""
     from postgres import NoPostgresError, cluster
 
     try:
@@ -88,7 +88,7 @@ def postgres() -> Iterator[Cluster]:
 
 @pytest.fixture
 def proxy(tmp_path: Path) -> Iterator[Between]:
-    """A server, with what counts bytes and breaks connections before it."""
+    """A server behind a proxy that counts bytes and breaks connections."""
     from between import between
     from serving import serving
 

@@ -1,4 +1,4 @@
-"""Counts what a piece of work does: on a file four times as large it may do four times as much, on any machine."""
+"""Counts operations instead of seconds: on a file four times as large, there may be four times as many."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["calls", "grows", "tallied"]
 
 
 def calls(work: Callable[[], Any]) -> int:
-    """How many functions `work` calls, of Python and of C."""
+    """The number of calls that `work` makes of functions in Python and C."""
     count = 0
 
     def note(_: Any, event: str, __: Any) -> None:
@@ -31,7 +31,7 @@ def calls(work: Callable[[], Any]) -> int:
 
 @contextmanager
 def tallied(place: Any, name: str, size: Callable[..., int]) -> Iterator[list[int]]:
-    """Collects what `size` says of the arguments of each call of a function that `place` holds as `name`."""
+    """Collects `size` of the arguments of each call of the function `name` of `place`."""
     sizes: list[int] = []
     real = getattr(place, name)
 
@@ -45,5 +45,6 @@ def tallied(place: Any, name: str, size: Callable[..., int]) -> Iterator[list[in
 
 
 def grows(work: Callable[[int], int], start: int) -> float:
-    """How much more `work` counts for four times `start`, over four: about 1 if it is linear, 4 if it is quadratic."""
+    """The count for four times `start`, divided by four times the count for `start`: about 1 if linear, 4 if
+    quadratic."""
     return work(4 * start) / work(start) / 4

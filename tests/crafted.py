@@ -1,4 +1,4 @@
-"""Recordings with a step changed, and every checksum right: what no writer makes, and readers may meet."""
+"""Recordings with a changed step and correct checksums, which no writer makes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _EPISODE = 35  # the offset of the episode and the step in the record of a messa
 
 
 def find_step(model: Model, episode: int, step: int) -> tuple[Part, int]:
-    """The chunk that holds a step, and the step's place in it."""
+    """The chunk of a step, and the step's place in it."""
     assert model.index is not None
     topics = {int.from_bytes(body[:2], "little"): body for opcode, body in model.summary if opcode == 4}
     for part in model.chunks():

@@ -1,4 +1,4 @@
-"""Environments that draw themselves, small and fast: each state has a picture of its own."""
+"""Small, fast environments that render: each state has a picture of its own."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Drawing(gym.Env[Any, Any]):
 
 
 class Drifting(Drawing):
-    """A walk that goes another way from step `DRIFT` (of the process's environment) on."""
+    """A walk that changes from step `DRIFT` (an environment variable) on."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         state, reward, terminal, timeout, info = super().step(action)

@@ -1,4 +1,4 @@
-"""Environments for tests: any spaces, and the ways in which real ones stray from them."""
+"""Environments for tests: of any spaces, and with the deviations from their spaces that real ones have."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Sampler(gym.Env[Any, Any]):
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Returns what `observe(step)` and `reward(step)` give, whatever the spaces say."""
+    """Returns `observe(step)` and `reward(step)`, even if they are not in its spaces."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class Scripted(gym.Env[Any, Any]):
 
 
 def same(a: Any, b: Any) -> bool:
-    """Equal in type, dtype, shape and bits, through any nesting."""
+    """Whether two values are equal in type, dtype, shape and bits, at any nesting."""
     if type(a) is not type(b):
         return False
     if isinstance(a, np.ndarray | np.generic):

@@ -1,4 +1,4 @@
-"""Faults of the operating system at will: calls on files below a directory fail, one after another.
+"""Injects faults of the operating system: chosen calls on files below a directory fail.
 
 The calls are those that Python's own modules make (`os`, `io`, `mmap`, `fcntl`); the files are real.
 """
@@ -46,9 +46,9 @@ FITS: dict[str, set[int]] = {
 class Faults:
     """Counts the calls on files below `root`, and fails call number `at` (from 0) with `code`.
 
-    lasting: every later call that `code` fits fails too (a disk that stays full).
-    short: a write that fails has stored half of its bytes before.
-    kinds: only such calls count.
+    lasting: later calls that can raise `code` fail too (a disk that stays full).
+    short: a failing write first stores half of its bytes.
+    kinds: count only calls of these kinds.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Faults:
     # ---- what is asked of a call
 
     def check(self, kind: str, path: str) -> None:
-        """Counts a call; raises if it is to fail."""
+        """Counts a call; raises if it should fail."""
         with self._lock:
             number = len(self.calls)
             if kind not in self._kinds:
@@ -83,7 +83,7 @@ class Faults:
         raise OSError(self._code, os.strerror(self._code), path)
 
     def written(self, path: str, data: Any, write: Callable[[Any], int]) -> int:
-        """A write, whole or half or not at all."""
+        """Makes a write: whole, half or not at all."""
         try:
             self.check("write", path)
         except OSError:
@@ -94,7 +94,7 @@ class Faults:
         return write(data)
 
     def below(self, path: Any) -> str | None:
-        """The path if it is below the root."""
+        """The path, if it is below the root."""
         path = path.fileno() if hasattr(path, "fileno") else path
         if isinstance(path, int):
             try:
@@ -108,7 +108,7 @@ class Faults:
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[Faults]:
-        """Within it the calls may fail."""
+        """Makes calls fail within the block."""
         replaced: list[tuple[Any, str, Any]] = []
 
         def replace(module: Any, name: str, make: Callable[[Any], Any]) -> None:

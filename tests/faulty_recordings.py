@@ -1,4 +1,4 @@
-"""Small rollouts under faults: what must hold after the k-th call failed, whatever it was."""
+"""Small rollouts with faults, and the checks after the k-th call has failed."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Whether a fault was hit and said, and how many calls there were."""
+    """Whether the fault occurred, whether the recorder reported it, and the number of calls."""
 
     hit: bool
     said: bool
@@ -85,7 +85,7 @@ class Outcome(NamedTuple):
 
 
 def cases(calls: list[tuple[str, str]]) -> Iterator[Case]:
-    """Every fault of a workload that makes these calls."""
+    """All faults of a workload that makes these calls."""
     for at, (kind, _) in enumerate(calls):
         for code in CODES:
             if code in FITS[kind]:
@@ -96,7 +96,7 @@ def cases(calls: list[tuple[str, str]]) -> Iterator[Case]:
 
 
 class Rollout:
-    """Steps of an environment, and what the caller has of them: (state, action, reward, ends, next state)."""
+    """A rollout, and the steps as its caller saw them: (state, action, reward, ends, next state)."""
 
     def __init__(self, env: Any, envs: int) -> None:
         self.env, self.envs = env, max(envs, 1)
@@ -166,7 +166,7 @@ def wrap(env: Any, path: Path, workload: Workload, **options: Any) -> Any:
 
 
 def recorded(path: Path) -> list[list[tuple[Any, ...]]]:
-    """What a file holds, by sub-environment, as `Rollout.seen`."""
+    """The steps in a file, by sub-environment, in the form of `Rollout.seen`."""
     with Recording(path) as recording:
         found: list[list[tuple[Any, ...]]] = [[] for _ in range(max(recording.num_envs, 1))]
         for i, episode in enumerate(recording.episodes):
@@ -180,7 +180,7 @@ def recorded(path: Path) -> list[list[tuple[Any, ...]]]:
 
 
 def check_recorded(path: Path, expected: list[list[tuple[Any, ...]]], *, more: int) -> None:
-    """Everything expected is in the file, bit for bit, in order, and at most `more` steps beyond."""
+    """Checks that the file has all expected steps, bit for bit and in order, and at most `more` others after them."""
     found = recorded(path)
     for ours, theirs in zip(expected, found if any(found) else [[] for _ in expected], strict=True):
         assert len(ours) <= len(theirs) <= len(ours) + more, (
@@ -192,7 +192,7 @@ def check_recorded(path: Path, expected: list[list[tuple[Any, ...]]], *, more: i
 
 
 class Leaks:
-    """No descriptor below a directory and no thread more than at first."""
+    """Checks that there are no more descriptors below a directory, and no more threads, than before."""
 
     def __init__(self, directory: Path) -> None:
         gc.collect()
@@ -216,7 +216,8 @@ class Leaks:
 
 
 def is_clear(err: BaseException, path: Path, case: Case) -> str:
-    """An error of ours, in one sentence, that names the file or its journals' directory, the reason and what to do."""
+    """Whether an error is ours, in one sentence that names the file or its journals' directory, the reason, and what to
+    do."""
     text = str(err)
     assert isinstance(err, TupliError), f"a raw error: {err!r}"
     assert "\n" not in text
@@ -227,7 +228,7 @@ def is_clear(err: BaseException, path: Path, case: Case) -> str:
 
 
 def run_case(name: str, directory: Path, case: Case) -> Outcome:
-    """One rollout with one fault, and everything that must hold then."""
+    """Makes one rollout with one fault, and checks everything that must hold then."""
     workload = WORKLOADS[name]
     root = directory / "disk"
     root.mkdir(parents=True)
@@ -267,12 +268,12 @@ def run_case(name: str, directory: Path, case: Case) -> Outcome:
 
 
 def case_matters(faults: Faults) -> bool:
-    """Whether what failed has to be said: not where only a look, or tidying up, was refused."""
+    """Whether a fault must be reported: not if only a look, or tidying up, failed."""
     return any(kind in ("write", "allocate", "create", "replace", "map") for kind, _ in faults.failed)
 
 
 def _prepared(env: Any, path: Path, workload: Workload) -> list[list[tuple[Any, ...]]]:
-    """What is in the file before; negative `start`: its writer was killed."""
+    """Makes the file to append to; with a negative `start`, its writer was killed."""
     seen: list[list[tuple[Any, ...]]] = [[] for _ in range(max(workload.envs, 1))]
     if not workload.start:
         return seen
@@ -376,7 +377,7 @@ def _go_on(env: Any, path: Path, workload: Workload, before: list[list[tuple[Any
 
 
 def calls_of(name: str, directory: Path) -> list[tuple[str, str]]:
-    """The calls of a workload without a fault."""
+    """The calls that a workload makes without a fault."""
     return run_case(name, directory, Case(-1, errno.EIO, False)).calls
 
 

@@ -1,4 +1,5 @@
-"""What is done to a storage, under faults: the old state or the new one afterwards, and one clear error."""
+"""Operations on a storage with faults: afterwards, it has the old state or the new one, and there was one clear
+error."""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ def by_hand(benchmark: str, score: float) -> Episode:
 
 
 class Lab(NamedTuple):
-    """A storage, and the ids of what is in it."""
+    """A storage, and the ids of its items."""
 
     root: Path
     benchmark: str
@@ -127,7 +128,7 @@ _DONE: dict[str, dict[str, str]] = {}
 
 
 def state_of(lab: Lab) -> dict[str, str]:
-    """Everything a storage holds, and the files written beside it."""
+    """Everything in a storage, and the files written beside it."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with FileStorage(lab.root) as storage:
@@ -167,7 +168,7 @@ def clone(lab: Lab, directory: Path) -> Lab:
 
 
 def run_storage_case(name: str, made: Lab, directory: Path, case: Case) -> Outcome:
-    """One operation with one fault, and everything that must hold then."""
+    """Runs one operation with one fault, and checks everything that must hold then."""
     lab = clone(made, directory)
     operation = OPERATIONS[name]
     before = state_of(lab)
@@ -205,7 +206,7 @@ def run_storage_case(name: str, made: Lab, directory: Path, case: Case) -> Outco
 
 
 def _repeat(name: str, lab: Lab) -> None:
-    """The operation again, without a fault; what has been done already may be refused."""
+    """Repeats the operation without a fault; it may be refused if it was done already."""
     with FileStorage(lab.root) as storage:
         try:
             OPERATIONS[name](storage, lab)
@@ -252,7 +253,7 @@ def _clear(err: BaseException, directory: Path, case: Case) -> str:
 
 
 def run_trust_case(directory: Path, case: Case) -> Outcome:
-    """Trusting and untrusting a digest with one fault: trusted, or not, and nothing else."""
+    """Trusts and untrusts a digest with one fault; afterwards, it is trusted or not, and nothing else changed."""
     digest = "ab" * 32
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(directory / "config")
     directory.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Interrupts a recorder at one event after another, and once more while it handles that, then looks at what is left."""
+"""Interrupts a recorder at one event, and once more while it handles that; then checks the files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEPS = 14
 
 
 class Counting(gym.Env[Any, Any]):
-    """Episodes of LENGTH steps. A state says which environment, episode and step it is of: no two are the same."""
+    """Episodes of LENGTH steps. A state encodes its environment, episode and step, so no two are equal."""
 
     action_space = spaces.Discrete(3)
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -159,7 +159,7 @@ class Interruption:
         self.left -= 1
         if self.left == 0:
             if self.again:
-                sys.setprofile(self._profile)  # who traces is switched off by an exception
+                sys.setprofile(self._profile)  # Python switches a trace function off when it raises
             raise KeyboardInterrupt
 
     def _profile(self, frame: Any, event: str, arg: Any) -> None:
@@ -171,7 +171,7 @@ class Interruption:
 
 @dataclass
 class Rollout:
-    """What a policy has seen of a recorder: `seen` are the transitions whose step has returned."""
+    """A policy at a recorder: `seen` are the transitions whose step has returned."""
 
     make: Callable[[Path], Any]
     path: Path
@@ -213,7 +213,7 @@ class Rollout:
         self.states = after
 
     def play(self) -> None:
-        """All that a recorder does."""
+        """Uses all methods of a recorder."""
         self.open()
         self.run(STEPS)
         self.env.close()
@@ -226,7 +226,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def transitions(files: list[Path]) -> Iterator[tuple[int, int]]:
-    """What is recorded."""
+    """The recorded transitions."""
     for file in files:
         with Recording(file) as recording:
             for episode in recording.episodes:
@@ -235,7 +235,7 @@ def transitions(files: list[Path]) -> Iterator[tuple[int, int]]:
 
 
 def interrupted(name: str, directory: Path, at: int, again: int = 0, *, go_on: bool = False) -> bool:
-    """Interrupts a scenario and checks what is left; False if it was over before."""
+    """Interrupts a scenario and checks the files; False if it ended before."""
     mode, make = SCENARIOS[name]
     path = directory / "r.mcap"
     before: list[tuple[int, int]] = []

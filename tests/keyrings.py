@@ -1,4 +1,4 @@
-"""A keyring in memory, in the place of the system's."""
+"""A keyring in memory, instead of the system's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Keyring", "keyring_in_memory"]
 
 
 class Keyring(keyring.backend.KeyringBackend):
-    """Keeps secrets in memory; `locked`: gives and takes none."""
+    """Keeps secrets in memory; while `locked`, returns and takes none."""
 
     priority = -1.0  # never the default one, for which each class that is defined comes into question
 
@@ -42,7 +42,7 @@ class Keyring(keyring.backend.KeyringBackend):
 
 @contextlib.contextmanager
 def keyring_in_memory() -> Iterator[Keyring]:
-    """The keyring of this process for as long as the block is entered."""
+    """Replaces the keyring of this process within the block."""
     before, mine = keyring.get_keyring(), Keyring()
     keyring.set_keyring(mine)
     try:

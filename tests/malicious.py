@@ -1,4 +1,4 @@
-"""Bundles that would run code if somebody let them. What they would do is write the marker file."""
+"""Bundles whose code would write the marker file if it ran."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MODULE = "evil_module"
 
 
 def module_source(marker: Path) -> str:
-    """A module that leaves its mark when it is imported, and has an environment, a wrapper and a function."""
+    """A module that writes the marker when it is imported, and has an environment, a wrapper and a function."""
     return f"""
 import pathlib, gymnasium
 pathlib.Path({str(marker)!r}).write_text("imported")
@@ -60,7 +60,7 @@ def pickles(marker: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def specs() -> Iterator[tuple[str, dict[str, Any]]]:
-    """EnvSpecs that name the module in each of the ways in which gymnasium would import it."""
+    """EnvSpecs that name the module in each way that makes gymnasium import it."""
     good = dict(capture(gym.make("CartPole-v1")).spec or {})
     evil = f"{MODULE}:Env"
     wrapper = {"name": "w", "entry_point": f"{MODULE}:Wrapper", "kwargs": {"max_episode_steps": 3}}
@@ -101,7 +101,7 @@ NAMES = [
 
 
 def _store(storage: FileStorage, record: EnvironmentRecord, metadata: BenchmarkMetadata, **more: Any) -> str:
-    """A benchmark with that environment, whatever it is, and two episodes of another one."""
+    """Stores a benchmark with that environment, and two episodes of another one."""
     artifact = storage.store_artifact(
         pickle.dumps(_Reduced(os.system, "true")), ArtifactMetadata(name="../../x.pkl")
     )
@@ -151,7 +151,7 @@ def _has(path: Path, attachment: str) -> bool:
 
 
 def _write_texts(directory: Path) -> None:
-    """Hostile JSON as metadata, options and reset info, written as it is: a writer of ours would quote it."""
+    """Writes hostile JSON as metadata, options and reset info, unquoted, which our writer would not do."""
     for i, value in enumerate(HOSTILE_TEXTS):
         text = json.dumps({"value": value, **value})
 
@@ -185,7 +185,7 @@ def _write_spaces(directory: Path) -> None:
 
 
 def _write_journal_elsewhere(directory: Path) -> None:
-    """An unfinished file that names somebody's file as its journal."""
+    """Writes an unfinished file that names another file of the user as its journal."""
     elsewhere = directory.parent / "elsewhere"
     elsewhere.mkdir()
     path = directory / "journal.mcap"

@@ -1,4 +1,4 @@
-"""A real nginx for tests, set up by the file that is shipped: `docs/howto/deploy/nginx.conf.template`."""
+"""A real nginx for tests, with the shipped configuration: `docs/howto/deploy/nginx.conf.template`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class NoNginxError(Exception):
 
 
 def program() -> str:
-    """Where nginx is. NoNginxError where it is not installed."""
+    """The path of nginx. NoNginxError if it is not installed."""
     found = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin:/sbin")
     if found is None:
         raise NoNginxError("nginx is missing: tools/setup-servers installs it")
@@ -49,7 +49,7 @@ def free_port() -> int:
 
 
 def shipped(server: str, exchanged: Mapping[str, str]) -> str:
-    """The file that is shipped, for a server; what it says of a machine (ports, paths) is exchanged for this one's."""
+    """The shipped configuration for a server, with the ports and paths of this machine."""
     text = Template(TEMPLATE.read_text()).safe_substitute(TUPLI_MCAP_SERVER=server)
     for old, new in exchanged.items():
         assert text.count(old) == 1, f"expected {old!r} once in {TEMPLATE.name}"
@@ -59,7 +59,7 @@ def shipped(server: str, exchanged: Mapping[str, str]) -> str:
 
 @contextlib.contextmanager
 def running(site: str, port: int) -> Iterator[Path]:
-    """nginx with a site for the length of a block; gives the directory of its logs and temporary files."""
+    """Runs nginx with a site within the block; yields the directory of its logs and temporary files."""
     with tempfile.TemporaryDirectory(prefix="nginx") as name:
         folder = Path(name)
         folder.chmod(0o755)

@@ -1,4 +1,4 @@
-"""Asks a server's pages, and sends their forms, with texts of all kinds: a browser in which somebody is signed in."""
+"""Gets a server's pages and sends their forms with texts of all kinds, as a browser of a signed-in user."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def page_routes() -> list[APIRoute]:
 
 
 class Browser:
-    """A browser; somebody is signed in, or nobody."""
+    """A browser, of a signed-in user or of a guest."""
 
     def __init__(self, url: str, name: str = "") -> None:
         self.client = httpx.Client(base_url=url, headers={"Accept": "text/html"}, timeout=120)
@@ -55,7 +55,7 @@ class Browser:
         self.client.close()
 
     def ask(self, route: APIRoute, names: Mapping[str, Sequence[Any]], rng: random.Random) -> httpx.Response:
-        """The answer of a route to what is drawn for its fields."""
+        """The answer of a route to random values of its fields."""
 
         def drawn(name: str) -> str:
             known = [

@@ -1,4 +1,4 @@
-"""Recordings to look at, and the page that shows them, served on a port of this machine."""
+"""Recordings, and the page that shows them, served on a port of this machine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def browsing(path: Path) -> Iterator[str]:
 
 @contextlib.contextmanager
 def serving_app(app: FastAPI) -> Iterator[str]:
-    """Serves an application in a thread; gives its address."""
+    """Serves an application in a thread; yields its address."""
     server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -1,4 +1,4 @@
-"""Somebody who uses a server by plain requests, with no client of ours between."""
+"""A user who sends plain requests to a server, without our client."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Person", "RefusedError", "announced", "cart_benchmark"]
 
 
 class RefusedError(Exception):
-    """A request was not answered with success."""
+    """A request did not succeed."""
 
 
 def announced(data: bytes, length: int | None = None) -> dict[str, str]:
@@ -32,7 +32,7 @@ def announced(data: bytes, length: int | None = None) -> dict[str, str]:
 
 
 def cart_benchmark() -> dict[str, Any]:
-    """CartPole as a benchmark, as a request has it."""
+    """CartPole as the JSON of a benchmark."""
     record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
     digest = benchmark_hash(BenchmarkContent(record, ()), metadata)
     return {"hash": digest, "serialized": pack(record, ()), "metadata": {"name": "cart"}}
@@ -55,7 +55,7 @@ class Person:
         self.headers = {"Authorization": f"Bearer {pair.json()['access_token']}"}
 
     def call(self, method: str, path: str, told: Any = None, **more: Any) -> httpx.Response:
-        """The answer to a request, with JSON that is told."""
+        """The answer to a request with a JSON body."""
         headers = {**self.headers, **more.pop("headers", {})}
         body = {} if told is None else {"json": told}
         # A client that does not look at certificates is made fast; none is kept, which nobody would close.
@@ -64,7 +64,7 @@ class Person:
         )
 
     def ask(self, method: str, path: str, told: Any = None, **more: Any) -> Any:
-        """What a request that succeeds is answered."""
+        """The JSON of the answer; RefusedError unless the request succeeds."""
         answer = self.call(method, path, told, **more)
         if answer.status_code >= 300:
             raise RefusedError(f"{method} {path}: {answer.status_code}: {answer.text}")

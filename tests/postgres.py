@@ -1,4 +1,4 @@
-"""A real PostgreSQL for tests: a cluster in a temporary directory, reached by a socket in it, and databases of it."""
+"""A real PostgreSQL for tests: a cluster in a temporary directory, with its socket there, and databases of it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Cluster:
             self._run("initdb", "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8")
 
     def start(self) -> None:
-        """Starts it, also after it was killed."""
+        """Starts it, also after a kill."""
         settings = " ".join(f"-c {key}='{value}'" for key, value in _SETTINGS.items())
         log = str(self._directory / "log")
         self._run("pg_ctl", "--wait", "-l", log, "-o", f"{settings} -k {self._directory}", "start")
@@ -83,7 +83,7 @@ class Cluster:
 
 @contextlib.contextmanager
 def cluster() -> Iterator[Cluster]:
-    """A cluster for the length of a block. NoPostgresError where it is not installed."""
+    """A cluster within the block. NoPostgresError if PostgreSQL is not installed."""
     with tempfile.TemporaryDirectory(prefix="pg") as folder:
         made = Cluster(Path(folder))
         made.start()

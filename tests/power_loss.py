@@ -1,7 +1,7 @@
-"""What a disk may hold after a power loss: every sector as it was at the last sync, or at any moment since.
+"""Simulates power losses: after one, each sector is as it was at the last sync, or at any moment since.
 
-`record` keeps what file and journal held after every step, and which of these moments were synced. `crash` puts a
-possible disk together, and `check` compares what is read from it with what the environment returned.
+`record` keeps the bytes of file and journal after every step, and which of these moments were synced. `crash` makes a
+possible disk, and `check` compares the steps on it with those that the environment returned.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _mixed(versions: list[bytes], rng: random.Random, synced: bool) -> bytes:
 
 
 def check(story: Story, place: Path, needed: list[int]) -> int:
-    """Steps found, all of them true and in order; AssertionError if one is wrong or of the needed ones is missing."""
+    """The number of steps found; AssertionError if one is wrong or out of order, or if a needed one is missing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:

@@ -1,4 +1,4 @@
-"""Whether recovery in memory, as reading does it, and `recover_recording` find the same in an unfinished recording."""
+"""Compares recovery in memory, as readers do it, with `recover_recording` on an unfinished recording."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _NEW = ("rewritten", "next_episode", "journal", "replaced", "crc")  # metadata o
 
 
 def differences(path: Path, directory: Path, *, killed: bool = False) -> list[str]:
-    """What recovery in memory and `recover_recording` find differently in a recording.
+    """The differences between recovery in memory and `recover_recording` on a recording.
 
-    Where something is good behind damage or behind missing rows, `recover_recording` finds more: then only the steps
-    are compared that both must have. After a kill there is nothing of the kind: both find the same. (Damage may still
-    be in several places: a chunk that was being written uncompressed holds records that can be told.)
+    `recover_recording` also finds good data after damage or missing rows: then only the steps that both must have are
+    compared. After a kill, there is no such data, and both find the same. (Damage may still be in several places: a
+    partly written uncompressed chunk has readable records.)
     """
     target = directory / "recovered once.mcap"
     with warnings.catch_warnings():
@@ -47,7 +47,7 @@ def differences(path: Path, directory: Path, *, killed: bool = False) -> list[st
 
 
 def compared(recording: Recording, recovered: Recording) -> list[str]:
-    """What an unfinished recording and a recovered file say differently."""
+    """The differences between an unfinished recording and a recovered file."""
     return [*_about(recording, recovered), *_of_episodes(recording, recovered)]
 
 
@@ -68,7 +68,7 @@ def _is_behind_a_gap(path: Path, recording: Recording) -> bool:
 
 
 def everything(episode: Episode, recording: Recording) -> dict[str, Any]:
-    """All that a file says of an episode, with the times of its rows."""
+    """Everything in a file about an episode, with the times of its rows."""
     row = recording.index[episode.position]
     first, length = int(row["first_row"]), int(row["length"])
     top = f"/env_{episode.env}" if recording.is_vector else ""
@@ -129,7 +129,7 @@ def _held(recording: Recording, episode: Episode, times: tuple[int, int]) -> tup
 
 
 def _about(recording: Recording, recovered: Recording) -> list[str]:
-    """Differences in what the files say of themselves."""
+    """Differences in the metadata of the files."""
     one, other = (
         {key: value for key, value in found.metadata.items() if key not in _NEW}
         for found in (recording, recovered)

@@ -1,4 +1,4 @@
-"""What is in a `.rrd` file, read back by the SDK."""
+"""Reads a `.rrd` file with the SDK."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def joined_rows(lengths: np.ndarray) -> tuple[list[int], list[int]]:
 
 
 def states_of(episode: Episode) -> np.ndarray:
-    """All that were seen: one for each step, and the final one."""
+    """All states: one for each step, and the final one."""
     return np.concatenate([episode.states, [episode.final_state]])
 
 
@@ -31,7 +31,7 @@ def _values(column: pa.Array) -> list[Any]:
 
 
 class Rrd:
-    """What is in a `.rrd` file: of each of its recordings, the rows of an entity's component."""
+    """The content of a `.rrd` file: for each of its recordings, the rows of an entity's component."""
 
     def __init__(self, path: Path) -> None:
         reader = RrdReader(str(path))

@@ -86,7 +86,7 @@ class Process:
 
 @contextlib.contextmanager
 def served(directory: Path, *options: str, port: int = 0) -> Iterator[Process]:
-    """A server for the length of a block."""
+    """A server within the block."""
     process = Process(directory, directory.with_name(f"{directory.name}.log"), *options, port=port)
     try:
         yield process
@@ -123,13 +123,13 @@ def certificate(folder: Path) -> tuple[Path, Path]:
 
 
 def sign_in(client: httpx.Client) -> dict[str, str]:
-    """The header that says that the admin asks."""
+    """The header with which the admin is signed in."""
     answer = client.post("/v1/tokens", json={"username": "admin", "password": PASSWORD})
     return {"Authorization": f"Bearer {answer.json()['access_token']}"}
 
 
 def begin(client: httpx.Client, token: dict[str, str], data: bytes) -> str:
-    """Begins an upload; gives its address."""
+    """Begins an upload; returns its address."""
     digest = base64.b64encode(hashlib.sha256(data).hexdigest().encode()).decode()
     headers = {"Upload-Length": str(len(data)), "Upload-Metadata": f"sha256 {digest}", **token}
     return client.post("/v1/uploads", headers=headers).headers["Location"]

@@ -1,4 +1,4 @@
-"""A real server on a port of this machine, for as long as a block runs."""
+"""A real server on a port of this machine, within a block."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PASSWORD = "correct horse battery staple"
 
 @contextlib.contextmanager
 def serving(settings: Settings, listening: Listening | None = None) -> Iterator[str]:
-    """Serves in a thread; gives the address. The admin's password is PASSWORD."""
+    """Serves in a thread; yields the address. The admin's password is PASSWORD."""
     with pytest_environment("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD):
         library = Library(settings)
         library.first_password()
@@ -48,7 +48,7 @@ ENGINES = ("sqlite and a directory", "postgresql and s3")
 
 @contextlib.contextmanager
 def settings_of(engine: str, request: pytest.FixtureRequest, directory: Path) -> Iterator[Settings]:
-    """What a server of an engine keeps, for as long as a block runs."""
+    """The settings of a server on an engine, whose data last as long as the block."""
     if engine != ENGINES[1]:
         yield Settings(directory)
         return

@@ -1,7 +1,7 @@
-"""Runs everything that reads a file, over malicious bundles, in a process where running code is trapped.
+"""Runs everything that reads a file on malicious bundles, in a process that traps the execution of code.
 
-`python trapped.py CORPUS TARGET` prints a JSON object: `trapped` (what would have run, imported, connected or
-written, with the operation that did it), `wrong` (errors that are none of ours), and how many operations there were.
+`python trapped.py CORPUS TARGET` prints a JSON object: `trapped` (everything that would have run, imported, connected
+or written, with the operation that did it), `wrong` (errors that are not ours), and the number of operations.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
 class Trap:
-    """Notes what must not happen while it is armed, and prevents it."""
+    """Notes and prevents forbidden events while it is armed."""
 
     def __init__(self, target: Path) -> None:
         self.target = os.path.realpath(target)
@@ -179,7 +179,7 @@ def _encoding() -> bool:
 
 
 def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Everything that is done to a file, by name. Those that write are given a copy in `work`."""
+    """All operations on a file, by name. Those that write get a copy in `work`."""
     name = path.name
 
     yield "open", lambda: Recording(path).close()
@@ -307,7 +307,7 @@ def _append(path: Path, work: Path) -> None:
 
 
 def storage_operations(root: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """What is done to a storage that somebody else filled (a copy: its catalog is made anew)."""
+    """All operations on a storage that somebody else filled (a copy, whose catalog is rebuilt)."""
 
     here = str(root)
     yield "reindex", _cli("reindex", "--storage", here)

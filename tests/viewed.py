@@ -1,4 +1,4 @@
-"""Recordings that look like what people record: what the tests of the viewer and the README's pictures show."""
+"""Recordings like those of users, for the tests of the viewer and the pictures of the README."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rollout(env: gym.Env[Any, Any], policy: Policy, episodes: int, seed: int = 1
 
 
 def cart_pole(path: Path, episodes: int = 6) -> Path:
-    """Poles that are balanced better and better, the last until time is up."""
+    """Poles that are balanced for longer and longer, the last ones until the time limit."""
     noise = np.random.default_rng(1)
     with RecordEpisodes(gym.make("CartPole-v1", max_episode_steps=300), path) as env:
         for episode in range(episodes):

@@ -1,4 +1,4 @@
-"""The real Rerun viewer without a screen: opened, asked what it shows, photographed, and ended for certain."""
+"""The real Rerun viewer without a screen: opens files, says which views show data, takes pictures, and always ends."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ENVIRONMENT = {"RUST_LOG": "info", "NO_COLOR": "1", "RERUN_APP_ONLY": "true", "
 
 
 class NoViewerError(RuntimeError):
-    """The viewer cannot run here; its own words say why."""
+    """The viewer cannot run here; the message is its own output."""
 
 
 class HeadlessViewer:
@@ -80,11 +80,11 @@ class HeadlessViewer:
         raise NoViewerError(f"the viewer did not start: {self._words()}")
 
     def _words(self) -> str:
-        """The end of what it wrote."""
+        """The end of its output."""
         return self._log.read_text(encoding="utf-8", errors="replace")[-2000:]
 
     def show(self, *paths: Path) -> ViewerState:
-        """Close what is open, open these files in order, wait until they are drawn; the last one is in front."""
+        """Closes all files, opens these in order, and waits until they are drawn; the last one is in front."""
         if self.client.get_state().recordings:
             self.client.close("all")
         self._seen = self._last_log()
@@ -129,7 +129,7 @@ class HeadlessViewer:
         return {name: ink > _SOME for name, ink in inks.items() if ink is not None}
 
     def problems(self) -> list[str]:
-        """What views and the viewer complained of since the last `show`."""
+        """The errors of views and the viewer since the last `show`."""
         state = self.client.get_state()
         views = [
             f"{view.name}: {report.severity}: {report.summary} {report.details or ''}"
@@ -148,12 +148,12 @@ class HeadlessViewer:
         return entries[-1].sequence if entries else None
 
     def screenshot(self, view: View | None = None) -> np.ndarray:
-        """What the window, or one of its views, shows: height x width x 3 bytes."""
+        """A picture of the window, or of one of its views: height x width x 3 bytes."""
         png = self.client.take_screenshot(None if view is None else view.view_id)
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def ink(self, view: View) -> int | None:
-        """How many of a view's pixels show data: bright ones of a text, coloured ones elsewhere.
+        """The number of a view's pixels that show data: bright ones of a text, coloured ones elsewhere.
 
         Grids are grey, and what stands in an empty text is dim.
 
@@ -181,7 +181,7 @@ class HeadlessViewer:
         )
 
     def close(self) -> None:
-        """End the viewer and everything it started."""
+        """Ends the viewer and all its processes."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGTERM)
         try:

@@ -1,4 +1,4 @@
-"""A web server of files in memory, which serves ranges as it is told to, and keeps a list of what it was asked."""
+"""A web server of files in memory, which serves ranges as configured, and keeps a list of the requests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Asked(NamedTuple):
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """Serves `files`, by path. Change its attributes to change what it does."""
+    """Serves `files`, by path. Its attributes configure the answers, and may change at any time."""
 
     daemon_threads = True
 
@@ -93,7 +93,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 @contextmanager
 def serving() -> Iterator[WebServer]:
-    """A server for as long as the block is entered."""
+    """A server within the block."""
     with WebServer() as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         thread.start()

@@ -1,4 +1,4 @@
-"""Defects for the recorder, each of which the check must find: a harness that cannot fail proves nothing."""
+"""Defects to put into the recorder; the check must find each, since a harness that cannot fail proves nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One recording, killed several times: checked after each death, gone on with, finished at the end."""
+"""One recording whose process is killed several times: checked after each kill, continued, finished at the end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _lengths: dict[tuple[str, str], int] = {}  # instructions of a moment, by kind
 
 
 class Death(NamedTuple):
-    """One kill: the finished steps that were checked, and what was wrong; not `killed` where the moment never came."""
+    """One kill: the number of checked steps, and what was wrong; not `killed` if the moment never came."""
 
     kind: str
     moment: str
@@ -39,7 +39,7 @@ class Death(NamedTuple):
 
 
 def moments_of(kind: str, *, appends: bool) -> list[str]:
-    """The moments that a kind can die at, in a new recording or in one that goes on."""
+    """The moments at which a kind can be killed, in a new recording or in a continued one."""
     about = KINDS[kind]
     names = []
     for moment in MOMENTS.values():

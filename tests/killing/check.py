@@ -1,4 +1,4 @@
-"""What a reopened recording must hold, from what the processes told: every finished step, to the bit."""
+"""Checks that a reopened recording has every finished step that its processes reported, bit for bit."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def found_in(recording: Recording) -> list[Found]:
 
 @dataclass(eq=False)
 class _Told:
-    """An episode as it was told: `certain` of its steps were finished."""
+    """An episode as it was reported: `certain` of its steps were finished."""
 
     reset: tuple[Any, ...]
     steps: list[tuple[Any, ...]] = field(default_factory=list)
@@ -52,12 +52,12 @@ class _Told:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What the callback has made of all steps."""
+        """The callback's metadata after all steps."""
         return {"steps": len(self.steps), "total": sum(step[2] for step in self.steps)}
 
 
 def _told_episodes(reports: Sequence[tuple[str, Any]]) -> dict[int, list[_Told]]:
-    """By sub-environment: the episodes told of."""
+    """The reported episodes, by sub-environment."""
     told: dict[int, list[_Told]] = {}
     finished = max((i for i, (name, _) in enumerate(reports) if name == "done"), default=-1)
     for i, (name, value) in enumerate(reports):
@@ -78,7 +78,7 @@ def check_recording(
     infos: Any,
     metadata: bool = False,
 ) -> tuple[int, list[str]]:
-    """(finished steps told of, what is wrong with the episodes that one process recorded)."""
+    """(finished steps that were reported, what is wrong with the episodes that one process recorded)."""
     told, problems, steps = _told_episodes(reports), [], 0
     numbers = [episode.number for episode in found]
     if numbers != sorted(set(numbers)):

@@ -1,4 +1,4 @@
-"""A process that records, tells of every step over a pipe, and dies."""
+"""A process that records, reports every step over a pipe, and dies."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Job(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What a process told before it died, in order. killed is False where it came to its end."""
+    """The reports of a process before it died, in order. killed is False if it ended by itself."""
 
     reports: list[tuple[str, Any]]
     killed: bool
@@ -51,7 +51,7 @@ class Told(NamedTuple):
 
 
 def record_and_die(job: Job) -> Told:
-    """Forks a process that does the job; returns what it told."""
+    """Forks a process that does the job; returns its reports."""
     read, write = os.pipe()
     gc.collect()
     pid = os.fork()
@@ -78,7 +78,7 @@ def record_and_die(job: Job) -> Told:
 
 
 def _listen(read: int, pid: int, job: Job) -> tuple[bytes, bool]:
-    """What comes out of the pipe until its other end is closed; kills at a time, if that is the moment."""
+    """Reads the pipe until its other end is closed; kills after a time, if that is the moment."""
     give_up = time.monotonic() + _PATIENCE
     at, rng = None, random.Random(job.seed)
     wanted = rng.choice([0, 400, 4000])  # bytes: from its birth, or from its first steps on

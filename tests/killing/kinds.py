@@ -1,4 +1,4 @@
-"""What is recorded while processes are killed: environments of every layout, single and vector."""
+"""The environments that killed processes record: of every layout, single and vector."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class Counter(EpisodeMetadataCallback):
 
 
 class Teller(gym.Env[Any, Any]):
-    """Tells what it gives before it returns it: ("reset", …) and ("step", …), with its number."""
+    """Reports each result before returning it: ("reset", …) and ("step", …), with its number."""
 
     def __init__(self, kind: Kind, number: int, seed: int, tell: Tell) -> None:
         self.observation_space = kind.space
@@ -215,7 +215,7 @@ class Teller(gym.Env[Any, Any]):
 
 
 class Stacked(FrameStackObservation):
-    """Says that the environment stacks frames, which it does itself."""
+    """Declares that the environment stacks frames, as it does itself."""
 
     def __init__(self, env: gym.Env[Any, Any], axis: int) -> None:
         gym.Wrapper.__init__(self, env)

@@ -1,7 +1,7 @@
 """The moments at which a recording process is killed, and the traps that kill it exactly there.
 
-A trap lies in the process itself: it counts the interpreter's instructions in our own code below a function, wraps a
-system call, or sets a timer of the kernel while a chunk is compressed. Linux only.
+A trap is in the process itself: it counts the interpreter's instructions in our own code below a function, wraps a
+system call, or sets a kernel timer while a chunk is compressed. Linux only.
 """
 
 from __future__ import annotations
@@ -130,8 +130,8 @@ def lay_trap(
 ) -> None:
     """Makes this process die at `moment`.
 
-    `length` is how many instructions the moment takes; None where that is not known: the process then dies at its end,
-    and tells ("length", instructions) before.
+    `length` is the number of instructions of the moment. If it is None, the process dies at the moment's end, and
+    first reports ("length", instructions).
     """
     occurrence = rng.randint(1, moment.times)
     if moment.name == "any line":
@@ -171,7 +171,7 @@ class _Instructions:
         self._codes: dict[CodeType, tuple[bool, bool]] = {}
 
     def set(self) -> None:
-        """Starts to watch, in threads made from now on, too."""
+        """Starts to count, also in threads made from now on."""
         threading.settrace(self._called)
         sys.settrace(self._called)
 
@@ -220,7 +220,7 @@ class _Instructions:
 
 
 def _trap_write(moment: Moment, occurrence: int, rng: random.Random) -> None:
-    """At a write of certain bytes: none, some or all of them get into the file."""
+    """Kills at a write of certain bytes: none, some or all of them get into the file."""
     left, pwrite = occurrence, os.pwrite
 
     def write(fd: int, data: Any, offset: int) -> int:
@@ -257,7 +257,7 @@ def _trap_call(name: str, occurrence: int, rng: random.Random) -> None:
 
 
 def _trap_compression(occurrence: int, rng: random.Random) -> None:
-    """Somewhere in the compressor: after a part of the time that the chunk took when it was compressed before."""
+    """Kills in the compressor, after a part of the time that compressing the same chunk took before."""
     left = occurrence
 
     def trapped(compress: Callable[[Container, Any], Any]) -> Callable[[Container, Any], Any]:
