@@ -129,7 +129,7 @@ class MissingExtraError(TupliError, ImportError):
 
 
 def brief(err: BaseException | None) -> str:
-    """An exception in one line: `ValueError: what it says`."""
+    """An exception in one line: `ValueError: its message`."""
     text = " ".join(str(err).split())[:300]
     return f"{type(err).__name__}: {text}" if text else type(err).__name__
 

@@ -109,7 +109,7 @@ def trusted_digests() -> list[str]:
 
 
 def trust_key(public_key: str, name: str) -> None:
-    """Trust whatever that Ed25519 key (64 hex digits) signs; a second name replaces the first.
+    """Trust everything that this Ed25519 key (64 hex digits) signs; a second name replaces the first.
 
     Raises:
         TupliError: It is no key, or cannot be noted.

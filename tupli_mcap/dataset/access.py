@@ -125,7 +125,8 @@ class RandomAccess(SaysWhatIsMeant):
         return episode_values(self._headers, expression)
 
     def _values_now(self) -> Callable[[F | BaseFilter], np.ndarray[Any, np.dtype[np.float64]]]:
-        """A function like `episode_values` for the episodes as they are listed now, even if they are listed anew."""
+        """A function like `episode_values` for the episodes as they are listed now, even if they are listed again
+        later."""
         return partial(episode_values, self._headers)
 
     def delta_windows(

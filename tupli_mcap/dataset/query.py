@@ -90,7 +90,7 @@ class Query:
         return self._selected
 
     def refresh(self, seen: dict[str, Recording] | None = None) -> list[EpisodeHeader]:
-        """Lists the episodes anew; columns are kept if the episodes are the same. `seen` as in `Source.episodes`."""
+        """Lists the episodes again; columns are kept if the episodes are the same. `seen` as in `Source.episodes`."""
         headers = self.source.episodes(self.benchmark_filter, self.episode_filter, seen)
         if self._headers is None or _identity(headers) != _identity(self._headers):
             self._selected, self.layout, self._columns, self._recorded = None, None, {}, None

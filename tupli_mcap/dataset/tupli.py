@@ -149,7 +149,7 @@ class TupliDataset(RandomAccess):
     # --- listing and loading ---
 
     def preview(self) -> list[EpisodeHeader]:
-        """The episodes, listed anew; no step is read."""
+        """Lists the episodes again; reads no step."""
         return list(self._query.refresh())
 
     def explain(self) -> str:
@@ -157,7 +157,7 @@ class TupliDataset(RandomAccess):
         return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
 
     def load(self) -> None:
-        """List the episodes anew and read their steps (states, actions, rewards, terminals, timeouts) into
+        """List the episodes again and read their steps (states, actions, rewards, terminals, timeouts) into
         memory.
 
         Raises:

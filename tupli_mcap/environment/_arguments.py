@@ -15,7 +15,7 @@ _LARGEST: Final = 1 << 20
 
 
 def more_than_data(value: object) -> str:
-    """Why a value from a file needs trust: its first part that may be more than data, and what it may be; else empty.
+    """Why a value from a file needs trust: its first part that may be code, and what it may be; empty for plain data.
 
     Some environments pass texts to `open` or `gymnasium.make`, and allocate as many things as a number says. Flags,
     plain words, fractions and whole numbers up to 2^20 are data; several such numbers may still cost much memory.

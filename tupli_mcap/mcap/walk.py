@@ -51,7 +51,7 @@ _CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
 
 
 class ChunkClaim(NamedTuple):
-    """What an index, or the chunk's header, claims: `length` bytes in the file hold `size` bytes of records."""
+    """The claim of an index, or of the chunk's header: `length` bytes in the file hold `size` bytes of records."""
 
     length: int
     size: int
@@ -298,7 +298,7 @@ class Walk:
         return fits and length == _SIZES.get(opcode, length)
 
     def _following(self, position: int) -> int:
-        """The offset where the walk goes on after a damaged record."""
+        """The offset where the walk continues after a damaged record."""
         if position + 9 <= self._end:
             claimed = position + 9 + int.from_bytes(self._source.read(position + 1, 8), "little")
             if position in self._known:

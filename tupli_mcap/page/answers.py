@@ -45,11 +45,11 @@ def _shelf(request: Request) -> Shelf:
 
 
 Shown = Annotated[Shelf, Depends(_shelf)]
-"""The shelf, limited to what the user who asks may see."""
+"""The shelf, limited to what the requesting user may see."""
 
 
 class SignInNeededError(TupliError):
-    """This page needs a user who is signed in, and nobody is."""
+    """The page needs a signed-in user, and nobody is signed in."""
 
 
 class PageRoute(APIRoute):
@@ -134,7 +134,7 @@ def _templates() -> Environment:
 
 
 def error_page(request: Request, err: Exception) -> Response:
-    """The page for an error. A reader who has to sign in is sent to the page for it."""
+    """The page for an error; for `SignInNeededError`, a redirection to the sign-in page."""
     as_json = request.query_params.get("format") == "json"
     if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
         here = request.url.path + (f"?{request.url.query}" if request.url.query else "")

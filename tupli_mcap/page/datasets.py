@@ -38,7 +38,7 @@ _UNNAMED: Final = "Recordings without an environment"
 
 @dataclass(frozen=True)
 class Dataset:
-    """What the catalog knows of a dataset without reading its episodes.
+    """The facts of a dataset that the catalog has without reading its episodes.
 
     key: its name in addresses. benchmark: None for recordings without one, or if the reader may not see it.
     recordings: empty only for a benchmark without recordings.
@@ -96,7 +96,7 @@ class Dataset:
 
     @property
     def success(self) -> tuple[int, int]:
-        """How many episodes succeeded, and how many say whether they did."""
+        """The number of successes, and the number of episodes that have `success`."""
         return sum(item.succeeded for item in self.recordings), sum(item.told for item in self.recordings)
 
     @property

@@ -45,7 +45,7 @@ class Shelf(Protocol):
         ...
 
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
-        """What the reader may see, as a condition on these two columns of the queried table."""
+        """The condition, on these two columns of the queried table, for rows that the reader may see."""
         ...
 
     def open(self, recording: str) -> Recording:

@@ -32,7 +32,7 @@ class Sparks(NamedTuple):
 
 
 def sparks_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Sparks:
-    """Draws the rewards of some episodes; if they are all the same, the first number of the states instead."""
+    """Draws the rewards of some episodes; if all rewards are equal, the first number of the states instead."""
     found: dict[str, Array] = {}
     name = "reward"
     for column in (_rewards, _first_state):

@@ -23,7 +23,7 @@ _TEXT_COLUMNS = 150
 _RC: dict[str, Any] = {
     "figure.dpi": 110, "font.size": 8.5, "lines.linewidth": 1.3, "patch.linewidth": 0,
     "axes.titlesize": 9, "axes.titlelocation": "left", "axes.titlepad": 4, "axes.labelsize": 8.5,
-    "axes.titley": 1.0,  # else it is looked for anew in every drawing
+    "axes.titley": 1.0,  # else matplotlib searches for it in every drawing
     "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": "#555555", "axes.linewidth": 0.7,
     "axes.grid": True, "axes.axisbelow": True, "grid.color": PALE, "grid.linewidth": 0.6,
     "axes.formatter.useoffset": False, "xtick.labelsize": 8, "ytick.labelsize": 8,
@@ -36,7 +36,7 @@ _RC: dict[str, Any] = {
 
 @contextlib.contextmanager
 def styled() -> Iterator[None]:
-    """Matplotlib's own defaults with `_RC` over them, whatever the user has set; theirs come back at the end.
+    """Uses matplotlib's defaults with `_RC` instead of the user's settings, which it restores at the end.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

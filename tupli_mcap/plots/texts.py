@@ -1,4 +1,4 @@
-"""What a report says: its title, facts and notes, as texts, as panels, and as HTML that stands alone."""
+"""The texts of a report: its title, facts and notes, as texts, as panels, and as self-contained HTML."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class EnvironmentFailedError(TupliError):
 
 
 class Moment(NamedTuple):
-    """What the environment returned; reward and flags are None for a reset.
+    """The values that the environment returned; reward and flags are None for a reset.
 
     The state is the environment's own object, which its next step may change.
     """

@@ -217,7 +217,7 @@ class _Renderer(Certifier):
     def report(
         self, path: Path | None, chosen: list[int], skipped: Sequence[Skipped], seconds: float
     ) -> RenderReport:
-        """What was rendered, into the file at `path`."""
+        """The result of rendering into the file at `path`."""
         index, counts, agreed = self._recording.index, self._frames.counts, self.agreed
         lengths = dict(zip(index["episode"].tolist(), index["length"].tolist(), strict=True))
         episodes = tuple(

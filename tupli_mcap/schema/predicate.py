@@ -87,7 +87,7 @@ def _value_test(filter: BaseFilter) -> Callable[[object], bool]:
 
 
 def scalar_test(filter: BaseFilter) -> Callable[[Scalar], bool]:
-    """What a comparison says of a scalar that is there."""
+    """The result of a comparison with an existing scalar."""
     if filter.type is FilterType.IN:
         # Equal scalars of one kind hash alike, 1 and 1.0 too; only NaN is not equal to itself.
         choices = {scalar for value in filter.value if (scalar := classify(value)).kind != "nan"}

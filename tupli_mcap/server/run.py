@@ -43,7 +43,7 @@ class Listening:
 
 
 def run(settings: Settings, listening: Listening, tell: Callable[[str, str | None], None]) -> None:
-    """Serves until the process is told to stop; running requests are finished.
+    """Serves until a signal stops the process; finishes running requests.
 
     tell: called with the address, and the admin's password if it is new and random (else None).
 

@@ -31,7 +31,7 @@ _FLAGS = ("bounded_below", "bounded_above")
 
 
 class _Budget:
-    """What a space may still take in memory.
+    """The memory that a space may still take.
 
     Gymnasium copies what is below a stacked Sequence or a Graph, so each level of these doubles the count.
     """

@@ -114,7 +114,7 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
     """Copies a benchmark and the artifacts that it needs; returns how many of these were new."""
     benchmark = source.load_benchmark(uri)
     wanted: Sequence[str] = ()
-    with contextlib.suppress(FormatError):  # a benchmark of somebody else's making names none
+    with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names none
         wanted = unpack(benchmark.serialized).artifacts
     held = {item.id for item in target.list_artifacts(FilterIN(key="id", value=list(wanted)))}
     missing = [artifact for artifact in wanted if artifact not in held]
@@ -229,7 +229,7 @@ def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: 
         client.load_benchmark(uri)
         return client.count_episodes(own)
     client.publish_benchmark(uri, group)
-    with contextlib.suppress(FormatError):  # a benchmark of somebody else's making names no artifacts
+    with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names no artifacts
         for artifact in unpack(client.load_benchmark(uri).serialized).artifacts:
             client.publish_artifact(artifact, group)
     return client.publish_episodes(own, group)

@@ -157,7 +157,7 @@ class Notes(NamedTuple):
 
     @classmethod
     def read(cls, recording: Path, root: Path | None = None) -> Notes:
-        """`root` is the directory of the recording's storage, by default what its place tells.
+        """`root` is the directory of the recording's storage; by default, it follows from the recording's path.
 
         Raises:
             FormatError: A file with notes holds something else.

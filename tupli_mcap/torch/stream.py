@@ -194,8 +194,9 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
 
 
 def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
-    """How many blocks are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit into half of
-    the cache, and are large enough that few items extend into the next block, which would be read twice."""
+    """The number of blocks that are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit
+    into half of the cache, and are large enough that few items extend into the next block, which would be read
+    twice."""
     chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
     chunks = max(4, cache_bytes // 2 // chunk_bytes)
     single = blocks_of(items, 1)

@@ -397,7 +397,7 @@ def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> None:
-    """Finishes the files, and writes those with discarded episodes anew without them."""
+    """Finishes the files, and rewrites those with discarded episodes without them."""
     work.close()
     while discarded:
         path, numbers = discarded.popitem()

@@ -1,4 +1,4 @@
-"""Values of variable size (Text, Sequence, Graph, OneOf, and whatever is inside them) as fields of a message.
+"""Values of variable size (Text, Sequence, Graph, OneOf, and values inside them) as fields of a message.
 
 `VariableField` turns a space into a tree of small functions. The space alone decides the structure:
 

@@ -230,7 +230,7 @@ def _file_facts(item: Any) -> dict[str, Any]:
 
 
 def _environment(recording: Recording) -> Mapping[str, Any]:
-    """What a recording holds about its environment and the program that made it."""
+    """A recording's facts about its environment and the program that made it."""
     facts = describe(recording, np.empty(0, np.int64))
     return {
         "observation": facts.observation,

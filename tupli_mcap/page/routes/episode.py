@@ -110,7 +110,7 @@ def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Epis
 
 
 class Seen(NamedTuple):
-    """What the page shows of an episode. values: the values at `step`, by field and name."""
+    """The content of an episode's page. values: the values at `step`, by field and name."""
 
     episode: Episode
     curves: Curves

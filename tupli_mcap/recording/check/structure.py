@@ -82,7 +82,7 @@ class Structure:
 
     @property
     def report(self) -> VerifyReport:
-        """What was found."""
+        """The problems found."""
         return self._findings.report
 
     # ---- the data section
@@ -122,7 +122,7 @@ class Structure:
         self._findings.error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
 
     def _is_cut(self, damage: Damage) -> bool:
-        """Whether a record goes on beyond the end of the file."""
+        """Whether a record extends beyond the end of the file."""
         head = self._source.read(damage.offset, min(9, damage.end - damage.offset))
         return len(head) < 9 or damage.offset + 9 + int.from_bytes(head[1:], "little") > self._source.size
 

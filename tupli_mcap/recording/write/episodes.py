@@ -45,7 +45,7 @@ _END_BODY = EpisodeEnd(0, 0, 0, 0, 0.0, 0, True, "{}").encode()
 
 
 class ResetFacts(NamedTuple):
-    """What a reset was given and gave; `options` and `info` are JSON texts."""
+    """The arguments and results of a reset; `options` and `info` are JSON texts."""
 
     seed: int | None
     drawn_seed: int | None

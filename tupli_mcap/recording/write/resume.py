@@ -152,7 +152,7 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
 
 
 def _check_frames_aligned(writer: RecordingWriter, contents: Contents, counts: Mapping[int, int]) -> None:
-    """What a frame shows is told by the row of the same number in another channel."""
+    """Raises RecordingError unless each camera has as many frames as rows that say which steps they show."""
     topics = {channel.topic: channel.id for channel in contents.channels.values()}
     for name, channel in topics.items():
         topic = parse(name)

@@ -30,7 +30,7 @@ _MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 mil
 
 
 class Rotation:
-    """When a recording goes on in another file, and in which one.
+    """Decides when a recording continues in another file, and in which one.
 
     A file is full when whole chunks of `max_bytes` are written to it (attachments left out), when it has been open for
     `max_seconds`, or when a channel nears the most rows it may have. It is left as soon as no episode is running: one
@@ -116,7 +116,7 @@ class Rotation:
         return self.paths[-1]
 
     def open_first(self) -> RecordingWriter:
-        """A writer of the first file, or of the one to go on with; mode "a" makes it where there is none.
+        """A writer of the first file, or of the one to append to; mode "a" makes the file if there is none.
 
         Raises:
             RecordingError: as `RecordingWriter`.

@@ -1,4 +1,4 @@
-"""The mark of unfinished work, which keeps steps safe from whatever interrupts the recorder.
+"""The mark of unfinished work, which keeps steps safe if something interrupts the recorder.
 
 A signal handler, or another thread, may raise at any instruction, and once more while that is handled. So nothing that
 keeps steps safe waits for an exception handler:

@@ -465,7 +465,7 @@ class RecordingWriter:
         self.closed = True
 
     def leave_unfinished(self) -> None:
-        """Lets go of everything; whoever appends to the file next goes on from here."""
+        """Releases the file, its lock and the journal; the next writer that appends continues from here."""
         self.closed = True
         self.let_go()
 

@@ -26,14 +26,14 @@ __all__ = ["BODY", "MADE", "body_of"]
 _MEDIA: Final = "application/octet-stream"
 _SIGNED_SECONDS: Final = 3600
 MADE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {_MEDIA: {}}}}
-"""What the document tells of bytes that are made while they are sent."""
+"""The part of the OpenAPI document for bytes that are made while they are sent."""
 BODY: Final = {
     **MADE,
     206: {"description": "The range that was asked for.", "content": {_MEDIA: {}}},
     304: {"description": "The caller has this version."},
     307: {"description": "The bytes are at another address."},
 }
-"""What the document tells of the answers of `body_of`."""
+"""The part of the OpenAPI document for the answers of `body_of`."""
 _RANGE: Final = re.compile(r"bytes=(\d{0,19})-(\d{0,19})")
 
 

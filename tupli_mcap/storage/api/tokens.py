@@ -68,7 +68,7 @@ class TokenStore:
             self._write({**self._others(url), url: {"username": username, **told}})
 
     def forget(self, url: str) -> None:
-        """Forgets who is signed in to a server."""
+        """Deletes the tokens for a server."""
         with self._lock:
             account = self._servers().get(url, {}).get("keyring")
             if account is not None:

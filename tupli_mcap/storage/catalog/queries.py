@@ -251,7 +251,7 @@ def _query(asked: Asked, found: Narrowed, *columns: Any) -> Select[Any]:
 
 
 class _Counted:
-    """What an iterable gives, counted."""
+    """Counts the items of an iterable while they are taken."""
 
     def __init__(self, items: Iterable[int]) -> None:
         self._items = iter(items)

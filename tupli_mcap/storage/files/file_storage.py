@@ -329,7 +329,7 @@ class FileStorage(TupliStorage):
         return self._settings().declared_keys
 
     def reindex(self) -> None:
-        """Make the catalog anew from the recordings."""
+        """Rebuild the catalog from the recordings."""
         self._catalog.reindex()
 
     def compact(self) -> int:

@@ -1,4 +1,4 @@
-"""What a look at a growing recording finds: new steps, infos, messages."""
+"""New steps, infos and messages of a growing recording."""
 
 from __future__ import annotations
 

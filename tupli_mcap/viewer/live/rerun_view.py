@@ -85,7 +85,7 @@ class RerunView:
         self._panels = LivePanels(self._title)
 
     def _is_there(self) -> bool:
-        """True if a viewer answers. Without one the SDK would keep what it is sent, and wait for one at the end."""
+        """True if a viewer answers. Without one, the SDK would buffer all data, and wait for a viewer at the end."""
         now = time.monotonic()
         if now < self._next_try:
             return self._answers

@@ -64,7 +64,7 @@ class RepairWriter:
             container.attachment_indexes.append(moved)
 
     def _metadata_of_recording(self) -> dict[str, str]:
-        """The recording's metadata; lost or damaged parts are made anew."""
+        """The recording's metadata, with new values for lost or damaged parts."""
         old = dict(self._evidence.metadata or {})
         for key in ("journal", "replaced"):
             old.pop(key, None)

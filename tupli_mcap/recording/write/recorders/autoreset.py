@@ -150,7 +150,7 @@ class Autoreset:
         self._rests = self._rests or bool((rests & ~ended).any())
 
     def note_ends(self, *, known: bool) -> None:
-        """Decides what the caller is told once ends are recorded. `known`: with their final states."""
+        """Chooses the warning for the caller once ends are recorded. `known`: with their final states."""
         if self._has_told:
             return
         if known:

@@ -184,7 +184,7 @@ class VectorRecorder:
     def _count_step(
         self, rewards: Array, ended: Array, active: Array | None, infos: Any, *, any_done: bool
     ) -> None:
-        """What the batch just written leaves for the next one to know."""
+        """Updates the state of each sub-environment after a batch."""
         if not self._derives:
             totals = (
                 rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What all stores of rows have in common.
+"""The interface of all stores of rows.
 
 1. A row is committed by one store of a machine word, once all of it is in the journal: whoever reads the journal finds
    the whole row, or nothing of it.

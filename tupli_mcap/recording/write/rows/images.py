@@ -123,7 +123,7 @@ class ImageRows:
         return data
 
     def _switch(self) -> None:
-        """The half is full: goes on in the other one, whose chunk must be in the file."""
+        """Continues in the other half when one is full; the chunk of the other must be in the file."""
         half, rows, flushed = self._half, self._full, self._flushed
         self._wait(1 - half)
         self._half, self._row, self._flushed = 1 - half, 0, 0
@@ -144,7 +144,7 @@ class ImageRows:
         self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed, None)
 
     def _wait(self, half: int) -> None:
-        """Until the chunk of a half is in the file; raises what its writing raised."""
+        """Waits until the chunk of a half is in the file; raises the error of its writing."""
         write = self._jobs.pop(half, None)
         if write is not None:
             write()

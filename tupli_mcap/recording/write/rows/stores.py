@@ -1,4 +1,4 @@
-"""What the rows of a recording go into on their way to chunks: a store for each channel, in an area of one journal."""
+"""The stores that hold rows until they are in chunks: one for each channel, in an area of one journal."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class PreparedState(NamedTuple):
 
 
 class PreparedStep(NamedTuple):
-    """A step encoded: its whole record but the header, what it adds to the return, and the state after it."""
+    """An encoded step: its record without the header, its reward as a number, and the state after it."""
 
     record: bytearray
     reward: float
@@ -283,7 +283,7 @@ class StepLog:
 
 
 class PreparedBatch(NamedTuple):
-    """What a batch is for each sub-environment: a step, or the state of a reset."""
+    """The part of a batch for each sub-environment: a step, or the state of a reset."""
 
     steps: dict[int, PreparedStep]
     resets: dict[int, PreparedState]

@@ -115,7 +115,7 @@ class VectorRows:
         self._state_bytes: Array = np.frombuffer(self._buffer, np.uint8).reshape(*self._rows.shape, -1)
 
     def _fill_heads(self) -> None:
-        """What is the same in all rows of a channel; all of them are holes."""
+        """Fills in the constant parts of all rows of a channel, and marks them as holes."""
         message = self._layout.step_message
         headers = b"".join(message.header(channel, HOLE) for channel in self._channels)
         heads = np.dtype(
