@@ -15,10 +15,10 @@ Another recording may replace one (`mode="w"`), with episodes of the same number
 
 4. A sidecar, and each entry of `deleting.json`, names the UUID of its recording. A recording that is appended to or
    compacted keeps its UUID.
-5. A note about another recording than the one at the path does not count, and the next note replaces it. 6. A note
-without a UUID (from earlier versions) counts for a recording that was begun before the note was written, by the
-   file's time: a recording that replaces another one is begun after all notes about that one. When it is written again,
-   it gets the UUID.
+5. A note about another recording than the one at the path does not count, and the next note replaces it.
+6. A note without a UUID (from earlier versions) counts for a recording that was begun before the note was written, by
+   the file's time: a recording that replaces another one is begun after all notes about that one. When the note is
+   written again, it gets the UUID.
 """
 
 from __future__ import annotations
