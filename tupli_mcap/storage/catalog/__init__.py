@@ -1,11 +1,11 @@
 """The catalog of a storage: a database of its episodes, a cache that may be deleted at any time.
 
 catalog             answers queries, and takes in recordings
-pages               a page of episodes, found without a look at all others
-queries             what is asked of the tables, in any SQL database
-database, tables    the database, and what is in it
-place               where it lies, for this user alone
-entries             what it holds of a recording, read here or by other processes
+pages               finds a page of episodes without checking all others
+queries             changes and queries of the tables, in any SQL database
+database, tables    the SQLite database, and its tables
+place               its path, in a directory of this user alone
+entries             reads the entry of a recording, here or in other processes
 rows                episodes as rows
 filter_sql          turns filters into SQL that finds all candidates; Python checks them again
 metadata_sql        looks into metadata with SQL

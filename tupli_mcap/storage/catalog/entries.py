@@ -1,8 +1,8 @@
 """Reads the catalog's entry of a recording from its index and the notes beside it; with several processes if there are
 many recordings.
 
-Such a process must not run the caller's script again, as those of `multiprocessing` do. It ends with the process that
-started it, and leaves Ctrl-C to that one. A recording that it fails to read is read in this process.
+Such a process does not run the caller's script again, as one of `multiprocessing` would. It ends with its parent, which
+alone handles Ctrl-C. If it fails to read a recording, this process reads it.
 """
 
 from __future__ import annotations

@@ -141,7 +141,8 @@ def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narr
 
 
 def recordings_of(filter: BaseFilter) -> Condition:
-    """A condition on rows of `RECORDING` alone that is true of all whose episodes a filter may be true of."""
+    """A condition on rows of `RECORDING` alone that is true for all recordings with episodes that may match a
+    filter."""
     if filter.type is FilterType.AND:
         return and_(true(), *(recordings_of(part) for part in filter.filters))
     if filter.type in COMBINING:
@@ -157,10 +158,10 @@ def recordings_of(filter: BaseFilter) -> Condition:
 
 
 def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
-    """Queries of ids of episodes that an index answers: what a filter is true of is in the result of each.
+    """Queries of ids of episodes that an index answers; each finds all episodes that match the filter.
 
-    Those of ranges are in the order of their index: a database that thinks that a few of many are asked for would look
-    for them in the table.
+    Queries of ranges sort by their index: otherwise a database that expects to find a few of many rows would search the
+    table.
     """
     if filter.type is FilterType.AND:
         parts = [*_leaves(filter)]
@@ -195,16 +196,16 @@ def _in_order(source: Source) -> Source:
 
 
 def _ids_of(key: int, parts: Sequence[Sequence[Condition]]) -> Source:
-    """The ids of episodes that `VALUE` has at a key; one of the alternatives of each part has to be true there."""
+    """The ids of episodes whose `VALUE` at a key fulfils one of the alternatives of each part."""
     most = max(parts, key=len)
     if len(most) == 1:
         return select(VALUE.c.episode_id).where(VALUE.c.key == key, *(part[0] for part in parts))
     each = (select(VALUE.c.episode_id).where(VALUE.c.key == key, either) for either in most)
-    return union_all(*each)  # an index leads to each of them, and not to what one OR says
+    return union_all(*each)  # a database uses an index for each of them, but not for one OR
 
 
 def _leaves(filter: BaseFilter) -> Iterator[BaseFilter]:
-    """The comparisons that all have to be true for a filter to be."""
+    """The comparisons that must all be true if a filter is true."""
     for part in filter.filters:
         if part.type is FilterType.AND:
             yield from _leaves(part)

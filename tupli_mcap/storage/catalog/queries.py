@@ -117,8 +117,8 @@ def find_episodes(
 ) -> Iterator[EpisodeHeader]:
     """The episodes that match a filter, by default ordered by recording (path) and episode number.
 
-    after: where to go on. only, of: conditions that hold besides the filter: on rows of EPISODE and RECORDING, and on
-    rows of RECORDING alone, which spares a look at the episodes of others.
+    after: where to continue. only, of: further conditions, on rows of EPISODE and RECORDING, and on rows of RECORDING
+    alone, which skips the episodes of other recordings.
     backwards: in the opposite order; `after` is then the episode before which they lie.
 
     Raises:
@@ -170,7 +170,8 @@ def count_episodes(
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
-    """The SQL of a filter, its parameters, the database's plan for it, and whether Python looks at what that finds."""
+    """The SQL of a filter, its parameters, the database's plan for it, and whether Python checks the rows that it
+    finds."""
     asked = _asked(connection, filter, None, None)
     found = _narrowed(asked)
     compiled = _query(asked, found, EPISODE.c.id).compile(
@@ -237,7 +238,8 @@ def _asked(
 
 
 def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
-    """The condition on rows of EPISODE and RECORDING; by_index: what leads to the rows, too."""
+    """The condition on rows of EPISODE and RECORDING; by_index: with the conditions by which an index finds the
+    rows."""
     also = and_(asked.only, asked.of)
     if asked.filter is None:
         return Narrowed(also, exact=True)
@@ -264,7 +266,7 @@ class _Counted:
 
 
 def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iterator[EpisodeHeader]:
-    """The episodes that match, of those with some ids, in the same order."""
+    """The matching episodes among those with some ids, in the same order."""
     found = _narrowed(asked, by_index=False)
     of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
     ids, size = iter(ids), _FIRST_ROWS
@@ -278,7 +280,7 @@ def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iter
 def _all_of_them(
     connection: Connection, asked: Asked, limit: int | None, offset: int
 ) -> Iterator[EpisodeHeader]:
-    """The episodes that match, as the database finds all of them."""
+    """The matching episodes, all found by one statement."""
     found, order = _narrowed(asked), asked.order(few=asked.filter is not None)
     if asked.after is not None:
         found = found._replace(condition=and_(found.condition, beyond(connection, order, asked.after)))

@@ -95,12 +95,12 @@ EPISODE: Final = Table(
 )
 
 INDEXED_FACTS: Final = ("n_tuples", "episode_return", "created_at")
-"""What of episodes is found, and put in order, by an index."""
+"""The columns of episodes that have an index, for filters and orders."""
 for _name in INDEXED_FACTS:
     Index(f"ix_episode_{_name}", EPISODE.c[_name], EPISODE.c.id)
 
-# Sums over the episodes of a recording that the same people see: what is shown of many recordings looks at no episode.
-# They are made anew, by `tallies.tally`, in each transaction that changes episodes of the recording.
+# Sums over the episodes of a recording that the same people see, so that a list of many recordings reads no episodes.
+# `tallies.tally` computes them again in each transaction that changes episodes of the recording.
 TALLY: Final = Table(
     "tally",
     METADATA,

@@ -1,4 +1,4 @@
-"""Sums over the episodes of recordings: how many, how long, how good, since when."""
+"""Sums over the episodes of recordings: their number, lengths, returns and times."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def recordings_seen(seen: Seen) -> ColumnElement[bool]:
 
 
 def tally(connection: Connection, recording_id: int) -> None:
-    """Computes the sums of a recording anew."""
+    """Computes the sums of a recording again."""
     connection.execute(delete(TALLY).where(TALLY.c.recording_id == recording_id))
     groups = (EPISODE.c.recording_id, EPISODE.c.created_by, EPISODE.c.published_in)
     sums = (
