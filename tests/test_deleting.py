@@ -60,6 +60,17 @@ def test_of_a_file_and_back(runs: Path) -> None:
     assert sorted(path.name for path in runs.rglob("[!.]*")) == ["a.mcap", "b.mcap", "deep"]
 
 
+def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:
+    file, other = runs / "a.mcap", runs / "deep" / "b.mcap"
+    run("delete", str(file), "--episodes", "1,2")
+    assert tupli_mcap.merge_recordings([file, other], tmp_path / "m.mcap", dry_run=True).episodes == 6
+    run("merge", str(file), str(other), "-o", str(tmp_path / "m.mcap"))
+    assert seeds(tmp_path / "m.mcap") == [0, 3, 0, 1, 2, 3]
+    run("split", str(file), "-o", str(tmp_path / "s.mcap"), "--episodes", "1")
+    assert seeds(tmp_path / "s.mcap") + seeds(tmp_path / "s_0001.mcap") == [0, 3]
+    assert not (tmp_path / "s_0002.mcap").exists()
+
+
 def test_of_a_directory_by_filter(runs: Path) -> None:
     assert "deleted 4 episodes" in run("delete", str(runs), "--filter", "seed >= 2")
     assert seeds(runs) == [0, 1, 0, 1]

@@ -199,6 +199,10 @@ def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> N
         _ = episode._sates  # type: ignore[attr-defined]
     with pytest.raises(FilterError, match="did you mean 'name'"):
         dataset.split(0.5, by="run.nme")
+    with pytest.raises(
+        FilterError, match=r"no episode has run\.success \(did you mean 'metadata\.success'\?\)"
+    ):
+        dataset.sort("run.success")
 
 
 def test_an_error_within_a_property_is_not_taken_for_a_wrong_name(

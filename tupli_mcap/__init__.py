@@ -28,7 +28,9 @@ if TYPE_CHECKING:
         Dataset as Dataset,
         TupliDataset as TupliDataset,
         filter_recording as filter_recording,
+        merge_recordings as merge_recordings,
         open as open,
+        split_recording as split_recording,
     )
     from tupli_mcap.errors import (
         FilterError as FilterError,
@@ -50,10 +52,8 @@ if TYPE_CHECKING:
         Step as Step,
         VerifyReport as VerifyReport,
         journal_path as journal_path,
-        merge_recordings as merge_recordings,
         recover_recording as recover_recording,
         rewrite_recording as rewrite_recording,
-        split_recording as split_recording,
         verify_recording as verify_recording,
         write_recording as write_recording,
     )
@@ -86,14 +86,14 @@ if TYPE_CHECKING:
 # The module of each public name, imported on first use, so that `import tupli_mcap` is quick.
 _HOMES = {
     "benchmark": "TupliEnvWrapper",
-    "dataset": "Dataset TupliDataset filter_recording open",
+    "dataset": "Dataset TupliDataset filter_recording merge_recordings open split_recording",
     "errors": (
         "FilterError FormatError MissingExtraError NotFoundError RecordingError SignatureError "
         "SpaceError StepError StorageError TupliError UntrustedError"
     ),
     "recording": (
-        "EpisodeData Recording RecoveryReport Step VerifyReport journal_path merge_recordings "
-        "recover_recording rewrite_recording split_recording verify_recording write_recording"
+        "EpisodeData Recording RecoveryReport Step VerifyReport journal_path recover_recording rewrite_recording "
+        "verify_recording write_recording"
     ),
     "schema": (
         "EpisodeMetadataCallback F FilterAND FilterCONTAINS FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "

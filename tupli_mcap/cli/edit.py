@@ -65,7 +65,7 @@ def merge(
     the new one. Each episode keeps its run. The new recording has the environment of the
     first one, and no signature.
     """
-    from tupli_mcap.recording import merge_recordings
+    from tupli_mcap.dataset import merge_recordings
 
     report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
     if as_json:
@@ -94,7 +94,7 @@ def split(
     """
     if (episodes is None) == (max_bytes is None):
         raise typer.BadParameter("expected either --episodes or --max-bytes")
-    from tupli_mcap.recording import split_recording
+    from tupli_mcap.dataset import split_recording
 
     parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         TorchTupleParser,
     )
     from tupli_mcap.dataset.columns.saved import SavedColumns, open_columns
-    from tupli_mcap.dataset.curate import FilterReport, filter_recording
+    from tupli_mcap.dataset.curate import FilterReport, filter_recording, merge_recordings, split_recording
     from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.dataset.opening import open
     from tupli_mcap.dataset.sources import DatasetError
@@ -42,8 +42,10 @@ _HOMES = {
     "TorchTupleParser": "columns.convert",
     "TupliDataset": "tupli",
     "filter_recording": "curate",
+    "merge_recordings": "curate",
     "open": "opening",
     "open_columns": "columns.saved",
+    "split_recording": "curate",
 }
 
 __all__ = [
@@ -57,8 +59,10 @@ __all__ = [
     "TorchTupleParser",
     "TupliDataset",
     "filter_recording",
+    "merge_recordings",
     "open",
     "open_columns",
+    "split_recording",
 ]
 
 

@@ -23,8 +23,10 @@ from tupli_mcap.recording import (
     say_made_of,
     trim_recording,
 )
-from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit import merge, split
+from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, merge_excerpts
 from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport
 from tupli_mcap.schema import BaseFilter, parse_filter
 
@@ -36,8 +38,10 @@ __all__ = [
     "file_path",
     "filter_dataset",
     "filter_recording",
+    "merge_recordings",
     "relabel",
     "save",
+    "split_recording",
     "trim",
     "trim_dataset",
 ]
@@ -93,6 +97,36 @@ def filter_recording(
         numbers = rows["episode"].tolist()
         rewrite_recording(recording, target, episodes=numbers, attachments=said, compression=compression)
     return report._replace(size=target.stat().st_size)
+
+
+def merge_recordings(
+    sources: Sequence[str | os.PathLike[str]],
+    target: str | os.PathLike[str],
+    *,
+    compression: str = "zstd",
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> MergeReport:
+    """`tupli_mcap.recording.merge_recordings` without the episodes that a storage has deleted."""
+    return merge.merge_recordings(
+        sources, target, compression=compression, overwrite=overwrite, dry_run=dry_run, positions=candidates
+    )
+
+
+def split_recording(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    *,
+    episodes: int | None = None,
+    max_bytes: int | None = None,
+    compression: str = "zstd",
+    dry_run: bool = False,
+) -> list[Part]:
+    """`tupli_mcap.recording.split_recording` without the episodes that a storage has deleted."""
+    return split.split_recording(
+        source, target, episodes=episodes, max_bytes=max_bytes, compression=compression, dry_run=dry_run,
+        positions=candidates,
+    )  # fmt: skip
 
 
 def filter_dataset(

@@ -48,8 +48,10 @@ def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
     for comparison in comparisons(wanted) if among else ():
         path = path_in(comparison.key or "", EpisodeHeader)
         for there, keys in known.items():
-            if path[:-1][: len(there)] == there and path[len(there)] not in keys:
+            if path[:-1][: len(there)] == there and (name := path[len(there)]) not in keys:
+                elsewhere = [".".join((*place, name)) for place, others in known.items() if name in others]
+                meant = f" (did you mean {elsewhere[0]!r}?)" if elsewhere else did_you_mean(name, keys)
                 raise FilterError(
-                    f"no episode has {comparison.key}{did_you_mean(path[len(there)], keys)}; "
+                    f"no episode has {comparison.key}{meant}; "
                     f"{'.'.join(there)} has {', '.join(sorted(keys)) or 'no keys'}"
                 )

@@ -7,7 +7,7 @@ import heapq
 import os
 import time
 import warnings
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -76,6 +76,7 @@ def merge_recordings(
     compression: str = "zstd",
     overwrite: bool = False,
     dry_run: bool = False,
+    positions: Callable[[Recording], Array] | None = None,
 ) -> MergeReport:
     """Writes one recording, with a new UUID, of the episodes of several, in the order of their times.
 
@@ -83,6 +84,9 @@ def merge_recordings(
     which would not fit. Episodes get new numbers, times stay. Recordings that were made at the same time, or that have
     different numbers of sub-environments, become different sub-environments; their episodes are numbered one recording
     after the other, and their runs tell them apart. The environment and the labels are those of the first recording.
+
+    Args:
+        positions: returns the positions of the episodes to merge; by default of all.
 
     Raises:
         SpaceError: they have different spaces or dtypes.
@@ -96,7 +100,9 @@ def merge_recordings(
     with contextlib.ExitStack() as stack:
         opened = [stack.enter_context(Recording(source)) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
-        excerpts = [Excerpt(recording, recording.index) for recording in opened]
+        excerpts = [
+            Excerpt(one, one.index if positions is None else one.index[positions(one)]) for one in opened
+        ]
         parts = [(len(excerpt.rows), int(excerpt.rows["length"].sum())) for excerpt in excerpts]
         if not any(episodes for episodes, _ in parts):
             raise RecordingError("expected recordings with episodes to merge, found none")

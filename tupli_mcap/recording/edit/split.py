@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.replacing import replacing
@@ -39,6 +41,7 @@ def split_recording(
     max_bytes: int | None = None,
     compression: str = "zstd",
     dry_run: bool = False,
+    positions: Callable[[Recording], Array] | None = None,
 ) -> list[Part]:
     """Writes the episodes of a recording to `target`, and to target_0001, … beside it, each with a new UUID.
 
@@ -49,6 +52,7 @@ def split_recording(
         target: path of the first file.
         episodes: number of episodes in each file.
         max_bytes: size of each file, assuming that all steps take the same number of bytes; at least one episode.
+        positions: returns the positions of the episodes to write; by default of all.
 
     Raises:
         RecordingError: neither limit is given, or both; the source cannot be read; a target exists or cannot be
@@ -63,7 +67,8 @@ def split_recording(
         )
     target = Path(target)
     with Recording(source) as recording:
-        groups = _groups(recording, episodes, max_bytes)
+        rows = recording.index if positions is None else recording.index[positions(recording)]
+        groups = _groups(recording, rows, episodes, max_bytes)
         paths = [target.with_stem(f"{target.stem}_{i:04}") if i else target for i in range(len(groups))]
         taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
         if taken:
@@ -76,15 +81,17 @@ def split_recording(
     return parts
 
 
-def _groups(recording: Recording, episodes: int | None, max_bytes: int | None) -> list[np.ndarray]:
-    """Numbers of episodes, by file."""
-    numbers, lengths = recording.index["episode"].astype(np.int64), recording.index["length"].astype(np.int64)
+def _groups(
+    recording: Recording, rows: Array, episodes: int | None, max_bytes: int | None
+) -> list[np.ndarray]:
+    """Numbers of the episodes in `rows` of the index, by file."""
+    numbers, lengths = rows["episode"].astype(np.int64), rows["length"].astype(np.int64)
     if not len(numbers):
         raise RecordingError(f"{recording.name} has no episodes to split")
     if episodes is not None:
         return [numbers[at : at + episodes] for at in range(0, len(numbers), episodes)]
     attached = sum(info.size for info in recording.attachments.values())
-    share = max(1, recording.size - attached) / int(lengths.sum())
+    share = max(1, recording.size - attached) / int(recording.index["length"].sum())
     room, groups, begin, filled = max(1, (max_bytes or 0) - attached), [], 0, 0.0
     for i, size in enumerate((lengths * share).tolist()):
         if filled and filled + size > room:
