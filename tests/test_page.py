@@ -322,6 +322,11 @@ class TestChosen:
         assert (answer.status_code, answer.headers["access-control-allow-origin"]) == (206, "*")
         assert answer.content == (lab / best[0]["recording"]).read_bytes()[:8]
         assert httpx.get(re.sub("/file/[^/]*/", "/file/guessed/", url)).status_code == 404
+        broken = lab / "line\nbreak.mcap"
+        broken.write_bytes(b"no recording, but a file of this directory")
+        found = httpx.get(re.sub("(/file/[^/]*/).*", r"\1line%0Abreak.mcap", url))
+        broken.unlink()
+        assert found.content == b"no recording, but a file of this directory"
 
 
 class TestDocumentation:

@@ -12,6 +12,7 @@ from pathlib import Path
 import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse
+from starlette.convertors import PathConvertor, register_url_convertor
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
@@ -31,6 +32,13 @@ _FOR_VIEWERS = {
 }
 
 
+class _FileName(PathConvertor):
+    regex = "(?s:.+)"  # a file's name may have line breaks
+
+
+register_url_convertor("file_name", _FileName())
+
+
 def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
     """Sends a recording to a viewer of another host. The secret ticket in its address comes from one of our pages."""
     shelf: DirectoryShelf | FileShelf = request.app.state.shelf
@@ -46,7 +54,7 @@ def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
     app.state.shelf_of = lambda request: shelf
     for router in PAGES:
         app.include_router(router)
-    app.get("/file/{ticket}/{name:path}")(read_recording)
+    app.get("/file/{ticket}/{name:file_name}")(read_recording)
     app.add_exception_handler(HTTPException, error_page)  # for addresses of no route
     # Against DNS rebinding: a foreign page whose host name resolves to this machine must not read our pages.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])
