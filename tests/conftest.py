@@ -114,11 +114,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all-cases", action="store_true", help="run all cases of sampled tests, not a sample")
 
 
+@pytest.hookimpl(tryfirst=True)  # before -k and -m choose
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Of a test that is marked as sampled(n, keep=[…]), n of its cases run, and those whose ids are in `keep`.
 
-    Which ones depends on nothing but the test's own name and the ids of its cases."""
-    if config.getoption("all_cases"):
+    Which ones depends on nothing but the test's own name and the ids of its cases. Who names a test gets all of them."""
+    if config.getoption("all_cases") or any("::" in argument for argument in config.args):
         return
     cases: dict[str, list[pytest.Item]] = {}
     for item in items:

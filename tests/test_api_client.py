@@ -55,6 +55,7 @@ def admin(url: str) -> Iterator[TupliAPIClient]:
         yield client
 
 
+@pytest.mark.sampled(1)  # each on one of the two servers
 class TestContract(StorageContract):
     @pytest.fixture
     def storage(self, admin: TupliAPIClient) -> TupliAPIClient:

@@ -47,7 +47,10 @@ from serving import ENGINES, serving, settings_of
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
+pytestmark = [
+    pytest.mark.sampled(1),  # each on one of the two servers
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),  # of moto and boto3
+]
 
 SQL = (
     "' OR 1=1 --",
@@ -274,6 +277,7 @@ class TestInjection:
                         assert "x-evil" not in answer.headers
                         assert text.count("DROP") == 0 or f">{text}<" not in answer.text
 
+    @pytest.mark.sampled(9)
     @pytest.mark.parametrize(
         "told",
         [
@@ -481,6 +485,7 @@ class TestSizes:
         long = httpx.get(f"{lab.url}/health", headers={"X-A": "a" * 60_000})
         assert long.status_code == 200
 
+    @pytest.mark.sampled(3)
     @pytest.mark.parametrize(
         "claim", [None, 1 << 30, 1 << 62], ids=["claims little", "claims it", "claims more"]
     )

@@ -42,6 +42,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
+@pytest.mark.sampled(0)  # of a tool; at night, all of it
 class TestQuickRun:
     def test_every_cell_has_a_figure_or_a_reason(self, quick: Path) -> None:
         results = json.loads((quick / "results.json").read_text())

@@ -37,7 +37,7 @@ def test_what_was_synced_survives(kind: str, durability: str, tmp_path: Path) ->
     rng = random.Random(f"{kind} {durability}")
     place = tmp_path / "r.mcap"
     kept = []
-    for _ in range(6 if kind == "frames" else 40):
+    for _ in range(6 if kind == "frames" else 15):
         at = rng.randrange(len(story.moments))
         kept.append(check(story, place, crash(story, at, place, rng)))
     if durability != "os":

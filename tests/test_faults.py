@@ -169,7 +169,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 def test_the_kth_call_on_a_storage_fails(tmp_path: Path, lab: Lab, name: str) -> None:
     calls = run_storage_case(name, lab, tmp_path / "whole", Case(-1, errno.EIO, False)).calls
     wanted = [case for case in cases(calls) if calls[case.at][0] not in ("mkdir", "close", "stat")]
-    for i, case in enumerate(random.Random(name).sample(wanted, 2)):
+    for i, case in enumerate(random.Random(name).sample(wanted, 1)):
         assert run_storage_case(name, lab, tmp_path / str(i), case).hit, case
 
 

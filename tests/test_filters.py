@@ -293,7 +293,7 @@ def _zone() -> Iterator[None]:
 
 
 class TestOneMeaning:
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=60, deadline=None)
     @given(data=st.lists(rows, min_size=1, max_size=4), filter=filters)
     def test_memory_and_databases_agree(
         self, catalogs: list[Catalog | ServerCatalog], data: list[dict[str, Any]], filter: BaseFilter

@@ -235,6 +235,7 @@ def test_other_processes_are_not_asked_what_they_stack(tmp_path: Path) -> None:
         assert np.array_equal(recording.episodes[1].final_state, states[1])
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
 @pytest.mark.parametrize("stacked", [FrameStackObservation, Older])
 @BOTH

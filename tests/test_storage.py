@@ -546,9 +546,9 @@ class TestFileStorage(StorageContract):
         for i in range(3):
             storage.record_episodes([episode(header.id, score=float(score)) for score in (i == 2, 1)])
         (storage.root / next(storage.root.rglob("*.mcap"))).rename(storage.root / "dropped\udcff.mcap")
-        seen, k = set(), -1
+        seen, k = set(), -1 if kind is OSError else -2
         while True:
-            k += 1
+            k += 2
             root = tmp_path / f"{k}"
             shutil.copytree(storage.root, root)
             calls = Calls(k, kind)
