@@ -118,7 +118,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Of a test that is marked as sampled(n, keep=[…]), n of its cases run, and those whose ids are in `keep`.
 
-    Which ones depends on nothing but the test's own name and the ids of its cases. Who names a test gets all of them."""
+    Which ones depends on nothing but the test's own name and the ids of its cases. A test that is named runs whole."""
     if config.getoption("all_cases") or any("::" in argument for argument in config.args):
         return
     cases: dict[str, list[pytest.Item]] = {}

@@ -399,6 +399,7 @@ class TestKilled:
         done = subprocess.run([sys.executable, "-c", code], timeout=60, check=False, stderr=subprocess.PIPE)
         assert done.returncode == -signal.SIGKILL, done.stderr.decode()
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(("every", "chunk"), [(1, 2000), (1, 10), (3, 300), (2, 1 << 18)])
     def test_no_frame_of_a_finished_step_is_lost(self, tmp_path: Path, every: int, chunk: int) -> None:
         path = tmp_path / "r.mcap"

@@ -218,6 +218,7 @@ def followed(path: Path, inner: gym.Env[Any, Any], num_envs: int, **options: Any
     return env, Looker(env)
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     "space", [MIXED, spaces.Text(8), spaces.Box(-1, 1, (3,))], ids=["mixed", "text", "box"]
 )
@@ -491,6 +492,7 @@ def test_images_and_sub_environments_come_to_rerun(tmp_path: Path) -> None:
             assert np.array(value[0], np.uint8).tobytes() == cams[row].tobytes()
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("axis", [0, -1])
 @pytest.mark.parametrize("shape", [(8, 6), (8, 6, 3), (1, 2)])
 def test_stacks_of_frames_come_to_rerun(shape: tuple[int, ...], axis: int, tmp_path: Path) -> None:

@@ -104,6 +104,7 @@ def rollout(env: Any, moves: int, seed: int, look: Callable[[int], None] = lambd
         look(i)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("infos", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(4))
 def test_one_environment(tmp_path: Path, seed: int, infos: float) -> None:
@@ -115,6 +116,7 @@ def test_one_environment(tmp_path: Path, seed: int, infos: float) -> None:
     assert same(told(mine), told(oracle))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("infos", [0.0, 0.01])
 @pytest.mark.parametrize("seed", range(3))
 def test_sub_environments(tmp_path: Path, seed: int, infos: float) -> None:

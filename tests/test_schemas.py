@@ -270,6 +270,7 @@ class TestMessages:
 
 
 class TestJsonSchemas:
+    @pytest.mark.sampled(24)
     @pytest.mark.parametrize("space", SPACES, ids=space_id)
     def test_every_space(self, space: gym.Space[Any]) -> None:
         validator("space.schema.json").validate(json.loads(json.dumps(space_to_json(space))))

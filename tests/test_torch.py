@@ -353,6 +353,7 @@ def resumable(stream: StreamDataset, workers: int) -> Any:
     return StatefulDataLoader(stream, batch_size=None, num_workers=workers, collate_fn=collate)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("seed", [None, 0])
 @settings(max_examples=4)

@@ -23,6 +23,7 @@ from tupli_mcap.schema import FilterEQ
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import TupliAPIClient, TupliStorage, storage_at
 
+pytestmark = pytest.mark.sampled(1)  # each with a directory or with a server
 SOURCE = Path(__file__).parents[1] / "tools" / "tutorial.py"
 
 
