@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import buckets
 import numpy as np
@@ -204,6 +205,27 @@ def test_what_fails_for_ever_ends_with_one_error(
         Recording(server.url())
 
 
+def test_a_server_that_cannot_be_reached_is_said_to_be_so(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "2")
+    for name, value in {
+        "ACCESS_KEY_ID": "me",
+        "SECRET_ACCESS_KEY": "no",
+        "ENDPOINT_URL": "http://127.0.0.1:1",
+    }.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    server.failures = [503] * 20
+    for url, said in {
+        "http://127.0.0.1:1/x.mcap": "127.0.0.1:1 refuses connections; check the address, or try again later",
+        "s3://lab/x.mcap": "127.0.0.1:1 refuses connections; check the address, or try again later",
+        "https://me:x@lab.invalid/x.mcap": "there is no server of the name lab.invalid; check the address",
+        server.url(): "its server answers 503 Service Unavailable; try again later",
+    }.items():
+        with pytest.raises(RecordingError, match=f"x?.mcap cannot be read: {said}"):
+            Recording(url)
+
+
 def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:
     with between(server.url("")) as proxy:
         proxy.faults.extend(
@@ -327,6 +349,27 @@ def test_buckets_and_patterns(bucket: str, large: Path, monkeypatch: pytest.Monk
     dataset = TupliDataset.from_files(f"{bucket}/runs/*.mcap")
     dataset.load()
     assert len(dataset.episodes) == EPISODES
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_commands_take_urls_and_patterns(bucket: str, tmp_path: Path) -> None:
+    def told(*words: str) -> Any:
+        done = CliRunner().invoke(app, [*words, "--json"])
+        assert done.exit_code == 0, done.output
+        return json.loads(done.output)["result"]
+
+    url, pattern = f"{bucket}/runs/a.mcap", f"{bucket}/**/*.mcap"
+    listed = told("ls", pattern, "--filter", "metadata.number < 3")
+    assert [(item["recording"], item["episodes"]) for item in listed] == [
+        (f"{bucket}/{name}", 3) for name in ("other.mcap", "runs/a.mcap", "runs/deep/b.mcap")
+    ]
+    assert told("info", f"{bucket}/runs/*.mcap")["episodes"] == EPISODES
+    assert [report["path"] for report in told("verify", pattern)["reports"]] == matching(pattern)
+    assert told("merge", url, "-o", str(tmp_path / "merged.mcap"))["episodes"] == EPISODES
+    assert len(told("split", url, "--episodes", "20", "-o", str(tmp_path / "part.mcap"))["recordings"]) == 2
+    gone = CliRunner().invoke(app, ["ls", url, f"{bucket}/gone.mcap"])
+    assert gone.exit_code == 1 and "gone.mcap does not exist" in gone.stderr
+    assert "a.mcap" in gone.stdout
 
 
 def test_other_addresses_go_through_fsspec(large: Path) -> None:

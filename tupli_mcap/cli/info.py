@@ -25,7 +25,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_server, is_url, shown
+from tupli_mcap.remote import is_pattern, is_server, is_url, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -87,7 +87,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         return
     ended = ", ".join(f"{count:,} {name}" for name, count in ends.items())
     lines = {
-        "server" if is_url(source) else "directory": shown(source),
+        "server" if is_server(source) else "pattern" if is_url(source) else "directory": shown(source),
         "recordings": number(recordings),
         "runs": _some(runs),
         "environments": _some(environments),
@@ -107,7 +107,8 @@ def _some(names: Sequence[str]) -> str:
 
 def info(
     source: Annotated[
-        str, typer.Argument(metavar="PATH|URL", help="A recording, a directory, a storage or a server.")
+        str,
+        typer.Argument(metavar="PATH|URL", help="A recording, a directory, a server, or a pattern of URLs."),
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -128,7 +129,7 @@ def info(
     from tupli_mcap.recording.description import describe
 
     wanted = filter_of(filter_text)
-    if is_server(source) or (not is_url(source) and Path(source).is_dir()):
+    if is_server(source) or (is_pattern(source) if is_url(source) else Path(source).is_dir()):
         _print_many(source, episodes, wanted, as_json=as_json)
         return
     with Recording(source) as recording:

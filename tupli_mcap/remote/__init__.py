@@ -1,6 +1,7 @@
 """Files on web servers and in buckets, read in place.
 
 objects:  one object behind a URL: its size, its version, and ranges of its bytes (obstore, or fsspec).
+failures: errors of failed requests.
 plan:     which ranges are fetched in one request, and when a server should cut out episodes instead.
 source:   the file as a reader sees it: ranges are fetched ahead and cached; a changed object is an error.
 patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
@@ -9,7 +10,7 @@ names:    recognises URLs, and removes secrets from them.
 
 from tupli_mcap.remote.names import is_server, is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
-from tupli_mcap.remote.patterns import matching
+from tupli_mcap.remote.patterns import is_pattern, matching
 from tupli_mcap.remote.plan import is_cut_cheaper
 from tupli_mcap.remote.source import RemoteSource, copied, open_url, watching
 
@@ -17,6 +18,7 @@ __all__ = [
     "RemoteSource",
     "copied",
     "is_cut_cheaper",
+    "is_pattern",
     "is_server",
     "is_url",
     "is_web",

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import RecordingError, missing_extra
+from tupli_mcap.remote.failures import SECONDS_VARIABLE, BrokenOffError, RefusedError, asked
 from tupli_mcap.remote.names import is_web, shown
 
 __all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store"]
@@ -22,10 +23,7 @@ Tell = Callable[[int], None]  # called with the number of bytes that have just a
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
 _PIECE = 256 << 10  # least bytes of a piece
 _RANGE = 8 << 20  # bytes of each request of fsspec for a whole file
-_SECONDS_VARIABLE = "TUPLI_MCAP_REMOTE_SECONDS"
 _SECONDS = 120.0
-# Without credentials in the environment, obstore would ask the cloud's machine for them.
-_WHERE_MACHINES_ASK = ("//169.254.", "//metadata.google.internal")
 _CLIENT = {"connect_timeout": "10s", "allow_http": True}
 # A body may take any time while bytes arrive; a broken request is retried for a minute.
 _UNLIMITED = {
@@ -87,7 +85,7 @@ def listed(folder: str) -> Iterator[str]:
     if not _is_bucket(folder):
         system, path = _fsspec(folder)
         scheme = folder.partition("://")[0]
-        for name in _asked(folder, lambda: system.find(path)):
+        for name in asked(folder, lambda: system.find(path)):
             yield f"{scheme}://{name.lstrip('/') if not path.startswith('/') else name}"
         return
     store, path = open_store(folder)
@@ -96,7 +94,7 @@ def listed(folder: str) -> Iterator[str]:
     def names() -> list[str]:
         return [entry["path"] for page in store.list(path or None) for entry in page]
 
-    for name in _asked(folder, names):
+    for name in asked(folder, names):
         yield f"{bucket}/{name}"
 
 
@@ -127,13 +125,11 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
     options: Any = _UNLIMITED if within is None else _limited(within)
     parts = urlsplit(url)
     if is_web(url):
-        return _asked(url, lambda: HTTPStore.from_url(url, **options)), ""
+        return asked(url, lambda: HTTPStore.from_url(url, **options)), ""
     if parts.scheme.lower() == "az":  # az://account/container/path
         account, _, path = parts.path.lstrip("/").partition("/")
-        return _asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
-    return _asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), parts.path.lstrip(
-        "/"
-    )
+        return asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
+    return asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), parts.path.lstrip("/")
 
 
 def _limited(within: timedelta) -> dict[str, Any]:
@@ -147,14 +143,14 @@ def _limited(within: timedelta) -> dict[str, Any]:
 
 def _patience() -> timedelta:
     """The time limit of one range, with all retries."""
-    text = os.environ.get(_SECONDS_VARIABLE, str(_SECONDS))
+    text = os.environ.get(SECONDS_VARIABLE, str(_SECONDS))
     try:
         seconds = float(text)
     except ValueError:
         seconds = 0.0
     if not 1 <= seconds <= 1e6:
         raise RecordingError(
-            f"expected {_SECONDS_VARIABLE} to be a number of seconds from 1 on, found {text!r:.80}"
+            f"expected {SECONDS_VARIABLE} to be a number of seconds from 1 on, found {text!r:.80}"
         )
     return timedelta(seconds=seconds)
 
@@ -185,15 +181,15 @@ class _StoredObject:
 
         try:
             found = self._ask({"range": {"suffix": length}})
-        except (_RefusedError, NotSupportedError):
-            size = _asked(self._url, lambda: self._store.head(self._path))["size"]
+        except (RefusedError, NotSupportedError):
+            size = asked(self._url, lambda: self._store.head(self._path))["size"]
             if not size:
                 return End(memoryview(b""), 0, "")
             try:
                 found = self._ask({"range": (max(0, size - length), size)})
-            except (_RefusedError, NotSupportedError) as err:
+            except (RefusedError, NotSupportedError) as err:
                 raise NoRangesError from err
-        return End(memoryview(_asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
+        return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data, at = bytearray(stop - start), 0
@@ -217,7 +213,7 @@ class _StoredObject:
                     start += len(piece)
                     yield piece
                 return
-            except _BrokenOffError:
+            except BrokenOffError:
                 if start == before:
                     raise
 
@@ -228,11 +224,11 @@ class _StoredObject:
         if version and version.startswith('"'):  # servers match no weak tag (W/"…")
             options["if_match"] = version
         try:
-            found = _asked(self._url, lambda: store.get(self._path, options=options))
-        except _RefusedError as err:
+            found = asked(self._url, lambda: store.get(self._path, options=options))
+        except RefusedError as err:
             raise changed(self._url) from err
         except NotSupportedError:
-            raise _BrokenOffError(
+            raise BrokenOffError(
                 f"{shown(self._url)}: the server sends whole files only; try again"
             ) from None
         if version is not None and _version(found.meta) != version:
@@ -242,60 +238,17 @@ class _StoredObject:
     def _streamed(self, found: Any) -> Iterator[memoryview]:
         stream = iter(found.stream(_PIECE))
         try:
-            while (piece := _asked(self._url, lambda: next(stream, None))) is not None:
+            while (piece := asked(self._url, lambda: next(stream, None))) is not None:
                 yield memoryview(piece)
-        except _RefusedError as err:
+        except RefusedError as err:
             raise changed(self._url) from err
 
     def _ask(self, options: Any) -> Any:
-        return _asked(self._url, lambda: self._store.get(self._path, options=options))
+        return asked(self._url, lambda: self._store.get(self._path, options=options))
 
 
 def _version(meta: Any) -> str:
     return meta["e_tag"] or f"{meta['last_modified']} {meta['size']}"
-
-
-class _BrokenOffError(RecordingError):
-    """The server does not answer, or stops in the middle of it."""
-
-
-class _RefusedError(Exception):
-    """The server refuses the range, or has another version."""
-
-
-def _asked(url: str, ask: Callable[[], _T]) -> _T:
-    """The answer to a request; RecordingError, without secrets in its message, if the request fails."""
-    from obstore import exceptions as told
-
-    try:
-        return ask()
-    except told.PreconditionError as err:
-        raise _RefusedError from err
-    except (told.NotFoundError, FileNotFoundError):
-        raise RecordingError(f"{shown(url)} does not exist; check the address") from None
-    except (told.PermissionDeniedError, told.UnauthenticatedError):
-        raise RecordingError(
-            f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
-        ) from None
-    except told.NotSupportedError:
-        raise
-    except (told.BaseError, OSError, ValueError) as err:
-        said = str(err).partition("\n")[0]
-        if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
-            raise _RefusedError from None
-        if any(where in said for where in _WHERE_MACHINES_ASK):
-            raise RecordingError(
-                f"{shown(url)} cannot be read: no credentials are in the environment; set those of its provider, such "
-                "as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or for a public bucket AWS_SKIP_SIGNATURE=true"
-            ) from None
-        if said.startswith(("Generic Config error", "Generic URL error")):
-            raise RecordingError(
-                f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
-            ) from None
-        slow = f", or give it more time with {_SECONDS_VARIABLE}" if "kind: Timeout" in str(err) else ""
-        raise _BrokenOffError(
-            f"{shown(url)} cannot be read: {shown(said):.300}; try again later{slow}"
-        ) from None
 
 
 # ---- fsspec

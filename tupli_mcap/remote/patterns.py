@@ -8,9 +8,14 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.names import is_web, shown
 from tupli_mcap.remote.objects import listed
 
-__all__ = ["matching"]
+__all__ = ["is_pattern", "matching"]
 
 _MAGIC = re.compile(r"[*?\[]")
+
+
+def is_pattern(url: str) -> bool:
+    """Whether a URL has wildcards."""
+    return _MAGIC.search(url.partition("?")[0] if is_web(url) else url) is not None
 
 
 def matching(url: str) -> list[str]:
@@ -21,14 +26,12 @@ def matching(url: str) -> list[str]:
     Raises:
         RecordingError: nothing matches, or the server cannot list files.
     """
-    web = is_web(url)
-    path = url.partition("?")[0] if web else url
-    if not _MAGIC.search(path):
+    if not is_pattern(url):
         return [url]
-    if web:
+    if is_web(url):
         raise RecordingError(f"{shown(url)}: a web server does not list its files; give the address of each")
-    folder = _MAGIC.split(path, maxsplit=1)[0].rpartition("/")[0]
-    wanted = re.compile(_expression(path))
+    folder = _MAGIC.split(url, maxsplit=1)[0].rpartition("/")[0]
+    wanted = re.compile(_expression(url))
     found = sorted(name for name in listed(folder) if wanted.fullmatch(name))
     if not found:
         raise RecordingError(f"no file matches {shown(url)!r}; give the URL of a recording (.mcap)")

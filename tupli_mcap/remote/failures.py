@@ -1,0 +1,85 @@
+"""Turns failed requests of obstore into errors that say what to do, without secrets in their messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from tupli_mcap.errors import RecordingError
+from tupli_mcap.remote.names import shown
+
+__all__ = ["SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked"]
+
+SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
+_T = TypeVar("_T")
+# Without credentials in the environment, obstore would ask the cloud's machine for them.
+_WHERE_MACHINES_ASK: Final = ("//169.254.", "//metadata.google.internal")
+_AGAIN: Final = "try again later"
+# obstore says why a connection fails only in the debug text of its errors.
+_CAUSES: Final = (
+    ("dns error", "there is no server of the name {}", "check the address, and the network"),
+    ("ConnectionRefused", "{} refuses connections", f"check the address, or {_AGAIN}"),
+    ("NetworkUnreachable", "there is no way to {}", "check the network"),
+    ("HostUnreachable", "there is no way to {}", "check the network"),
+    ("invalid peer certificate", "the certificate of {} is not valid", "check the address, and the clock"),
+    (
+        "kind: Timeout",
+        "{} does not answer in time",
+        f"{_AGAIN}, or give it more time with {SECONDS_VARIABLE}",
+    ),
+)
+_ASKED: Final = re.compile(r"https?://(?:[^/@\s]*@)?([^/@\s,]+)")
+_STATUS: Final = re.compile(r"status code: (\d{3}(?: [A-Z][A-Za-z]*)*)")
+
+
+class BrokenOffError(RecordingError):
+    """The server does not answer, or stops in the middle of it."""
+
+
+class RefusedError(Exception):
+    """The server refuses the range, or has another version."""
+
+
+def asked(url: str, ask: Callable[[], _T]) -> _T:
+    """The answer to a request; RecordingError, without secrets in its message, if the request fails."""
+    from obstore import exceptions as told
+
+    try:
+        return ask()
+    except told.PreconditionError as err:
+        raise RefusedError from err
+    except (told.NotFoundError, FileNotFoundError):
+        raise RecordingError(f"{shown(url)} does not exist; check the address") from None
+    except (told.PermissionDeniedError, told.UnauthenticatedError):
+        raise RecordingError(
+            f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
+        ) from None
+    except told.NotSupportedError:
+        raise
+    except (told.BaseError, OSError, ValueError) as err:
+        said = str(err).partition("\n")[0]
+        if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
+            raise RefusedError from None
+        if any(where in said for where in _WHERE_MACHINES_ASK):
+            raise RecordingError(
+                f"{shown(url)} cannot be read: no credentials are in the environment; set those of its provider, such "
+                "as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or for a public bucket AWS_SKIP_SIGNATURE=true"
+            ) from None
+        if said.startswith(("Generic Config error", "Generic URL error")):
+            raise RecordingError(
+                f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
+            ) from None
+        raise BrokenOffError(f"{shown(url)} cannot be read: {_why(str(err))}") from None
+
+
+def _why(told: str) -> str:
+    """Why a request failed, and what to do, from an error's text with its debug text."""
+    said = told.partition("\n")[0]
+    if status := _STATUS.search(said):
+        return f"its server answers {status[1]}; {_AGAIN}"
+    for sign, cause, advice in _CAUSES:
+        if sign in told:
+            where = _ASKED.search(said)
+            return f"{cause.format(where[1] if where else 'its server')}; {advice}"
+    return f"{shown(said):.300}; {_AGAIN}"
