@@ -139,6 +139,15 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     assert told("filter", "seed > 2", "-o", made)["episodes"] == 2
     assert told("trim", "--steps", "1:", "--episodes", "best", "-o", made, "--force")["left_out"] == 1
     assert told("doctor")["episodes"] == 5
+    (listed,) = told("ls", "--filter", "seed > 1")
+    assert (listed["run"], listed["episodes"], listed["size"], listed["error"]) == ("ppo", 3, None, None)
+    assert listed["steps"] == sum(e["steps"] for e in told("episodes", "--filter", "seed > 1"))
+    assert told("render", "--episodes", "0", "-o", str(tmp_path / "film.gif"))["ok"]
+    for words in (["merge"], ["split", "--episodes", "1"]):
+        done = CliRunner().invoke(app, [words[0], url, *words[1:], "-o", made])
+        assert f"tupli-mcap filter {url} FILTER -o FILE" in " ".join(done.output.split()), done.output
+    done = CliRunner().invoke(app, ["verify", url])
+    assert "is a server; fetch its recordings with tupli-mcap pull" in " ".join(done.output.split())
     failed = CliRunner().invoke(app, ["info", url, "--episodes", "9"])
     assert f"{url} has no episode '9'; see tupli-mcap episodes {url}" in failed.output
 

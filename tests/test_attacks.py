@@ -150,7 +150,7 @@ class TestTokens:
         lab.ann.ask("POST", "/v1/episodes/publish", {"group": "global"})
         path = dan.ask("POST", "/v1/tickets", {"recording": lab.recording})["path"]
         assert httpx.get(lab.url + path).status_code == 200
-        dan.ask("PUT", "/v1/users/dan/password", {"password": "new", "old": "dan's password"})
+        dan.ask("PUT", "/v1/users/dan/password", {"password": "new password", "old": "dan's password"})
         assert httpx.get(lab.url + path).status_code == 401
         lab.ann.ask("POST", "/v1/episodes/publish", {"group": "global", "published": False})
 
@@ -176,8 +176,10 @@ class TestRights:
     def test_who_manages_users_does_not_become_the_admin(self, lab: Lab, managers: Any) -> None:
         mia, _ = managers
         tries = [
-            mia.call("PUT", "/v1/users/admin/password", {"password": "mine"}),
-            mia.call("PUT", "/access/users/change-password", {"username": "admin", "password": "mine"}),
+            mia.call("PUT", "/v1/users/admin/password", {"password": "my password"}),
+            mia.call(
+                "PUT", "/access/users/change-password", {"username": "admin", "password": "my password"}
+            ),
             mia.call("DELETE", "/v1/users/admin"),
             mia.call("DELETE", "/access/users/delete", params={"username": "admin"}),
             mia.call("PUT", "/v1/groups/global/members", [{"user": "mia", "roles": ["admin"]}]),
@@ -185,7 +187,7 @@ class TestRights:
         assert {each.status_code for each in tries} <= {403, 404}
         assert Person(lab.url, "admin").ask("GET", "/v1/me")["memberships"]["global"][-1] == "admin"
         people(mia, "new")
-        mia.ask("PUT", "/v1/users/new/password", {"password": "other"})
+        mia.ask("PUT", "/v1/users/new/password", {"password": "other password"})
         mia.ask("DELETE", "/v1/users/new")
 
     def test_who_manages_groups_does_not_lock_the_admin_out(self, lab: Lab, managers: Any) -> None:
@@ -299,7 +301,7 @@ class TestInjection:
 
     def test_of_names_of_users_and_groups(self, lab: Lab) -> None:
         for text in TEXTS:
-            made = lab.admin.call("POST", "/v1/users", {"username": text, "password": "x"})
+            made = lab.admin.call("POST", "/v1/users", {"username": text, "password": "a password"})
             assert made.status_code == 400, text
             group = lab.eve.call("POST", "/v1/groups", {"name": text})
             assert group.status_code in (200, 400), text

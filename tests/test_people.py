@@ -6,10 +6,12 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from serving import PASSWORD, serving
 from typer.testing import CliRunner
 
+from tupli_mcap import FileStorage, TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.server.settings import Settings
 
@@ -46,8 +48,41 @@ def test_a_group_of_two(url: str) -> None:
     assert "bob" not in run("remove-members robots bob")
     assert run("delete-group robots") == f"deleted the group robots at {url}\n"
     assert "Group not found" in run("read-group robots", code=1)
-    assert run("delete-user ann") == f"deleted the user ann at {url}\n"
+    assert "to delete without being asked, give --yes" in run("delete-user ann", code=1)
+    assert "ann" in run("list-users")
+    assert run("delete-user ann --yes") == f"deleted the user ann at {url}\n"
     assert run("whoami", code=1).endswith(f"sign in: tupli-mcap login USER --url {url}\n")
+
+
+def test_a_password_must_be_long_enough(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run("login admin")
+    monkeypatch.setenv("TUPLI_MCAP_NEW_PASSWORD", "seven77")
+    monkeypatch.setenv("TUPLI_MCAP_PASSWORD", "seven77")
+    for line in ("signup ann", "password admin"):
+        monkeypatch.setenv("TUPLI_MCAP_PASSWORD", PASSWORD if line == "password admin" else "seven77")
+        assert "expected a password of 8 to 1024 characters, found 7 characters" in run(line, code=1)
+    monkeypatch.setenv("TUPLI_MCAP_PASSWORD", "eight888")
+    assert run("signup ann") == f"created the user ann at {url}\n"
+
+
+def test_lists_are_of_the_server_of_the_last_login(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert f"sign in: tupli-mcap login USER --url {url}" in run(
+        "list-benchmarks", code=1
+    )  # of TUPLI_MCAP_URL
+    run("login admin")
+    monkeypatch.delenv("TUPLI_MCAP_URL")
+    assert run("list-benchmarks") == "no benchmarks\n"
+    Path("_local_storage").mkdir()
+    with FileStorage("_local_storage") as storage:
+        TupliEnvWrapper(gym.make("CartPole-v1"), storage).store("cart")
+    assert "cart" in run("list-benchmarks")
+    Path("_local_storage").rename("lab")
+    assert "no storage" in run("list-artifacts --storage nowhere", code=1)
+    monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "stranger"))
+    assert "there is no storage at '_local_storage'" in run("list-episodes", code=1)
 
 
 def test_a_role_and_what_it_cannot_be(url: str) -> None:

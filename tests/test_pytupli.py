@@ -46,7 +46,7 @@ def kept() -> Iterator[Keyring]:
 
 @pytest.fixture
 def url(tmp_path: Path) -> Iterator[str]:
-    with serving(Settings(tmp_path / "served", guests=True)) as url:
+    with serving(Settings(tmp_path / "served", guests=True, min_password=3)) as url:
         yield url
 
 

@@ -325,13 +325,13 @@ def test_a_new_password_ends_every_sign_in(users: Users) -> None:
     old = token_of(users.ann)
     made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "robot", "scope": "write"})
     with pytest.raises(StorageError, match="the old password is not right"):
-        users.ann.change_password("ann", "new", old="wrong")
-    users.ann.change_password("ann", "new", old="ann-password")
+        users.ann.change_password("ann", "new-password", old="wrong")
+    users.ann.change_password("ann", "new-password", old="ann-password")
     for token in (old, {"Authorization": f"Bearer {made['token']}"}):
         assert httpx.get(f"{users.url}/v1/me", headers=token).status_code == 401
     with pytest.raises(StorageError, match="tupli-mcap login"):
         users.ann.list_benchmarks()
-    users.ann.login("ann", "new")
+    users.ann.login("ann", "new-password")
     assert users.ann.whoami().username == "ann"
 
 

@@ -158,7 +158,7 @@ class TestSigningIn:
             assert client.post("/v1/episodes/delete", json={"filter": None}).status_code == 401
 
     def test_only_an_open_server_takes_everybody(self, server: str, tmp_path: Path) -> None:
-        told = {"username": "eve", "password": "e", "new": "1"}
+        told = {"username": "eve", "password": "eve's password", "new": "1"}
         with browser(server) as client:
             assert client.post("/sign-in", data=told).status_code == 403
         with serving(Settings(tmp_path, open_signup=True)) as url, browser(url) as client:
@@ -335,7 +335,7 @@ class TestPeople:
 
     def test_users(self, server: str) -> None:
         with browser(server, "ann") as ann, browser(server, "admin", PASSWORD) as admin:
-            told = {"username": "carl", "password": "c"}
+            told = {"username": "carl", "password": "carl's password"}
             assert ann.post("/users", data={**told, "code": code(ann)}).status_code == 403
             assert admin.post("/users", data={**told, "code": code(admin)}).status_code == 303
             assert admin.post("/users", data={**told, "code": code(admin)}).status_code == 409

@@ -72,8 +72,8 @@ def test_where_the_keyring_refuses_they_are_in_a_private_file(kept: Keyring, url
 
 def test_a_token_in_the_environment_comes_first(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with signed_in(url) as client:
-        client.signup("ann", "ann")
-        client.login("ann", "ann")
+        client.signup("ann", "ann-password")
+        client.login("ann", "ann-password")
         token = client.create_token("robot", "write", days=None)
         assert (token.name, token.expires, client.list_tokens()[0].token) == ("robot", None, "")
         assert token.token not in repr(token)
@@ -81,7 +81,7 @@ def test_a_token_in_the_environment_comes_first(url: str, monkeypatch: pytest.Mo
         monkeypatch.setenv("TUPLI_MCAP_TOKEN", token.token)
         assert client.username == "ann"
         monkeypatch.delenv("TUPLI_MCAP_TOKEN")
-        client.login("ann", "ann")
+        client.login("ann", "ann-password")
         client.delete_token(token.id)
         monkeypatch.setenv("TUPLI_MCAP_TOKEN", token.token)
         with pytest.raises(StorageError, match="not valid.*put another token into TUPLI_MCAP_TOKEN") as told:

@@ -17,6 +17,7 @@ from tupli_mcap.cli.options import (
     filter_of,
     local_path,
     pair_of,
+    recordings_of,
 )
 from tupli_mcap.cli.output import (
     Column,
@@ -29,7 +30,7 @@ from tupli_mcap.cli.output import (
     print_wrapped,
 )
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
@@ -50,8 +51,9 @@ _SHOWN = 20  # how many damaged places or lost episodes are shown; --json has al
 
 
 def merge(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE", help="Recordings with the same spaces.", parser=local_path)
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="PATH|URL", help="Recordings with the same spaces, or directories of them."),
     ],
     output: _Output,
     force: _Force = False,
@@ -67,7 +69,7 @@ def merge(
     """
     from tupli_mcap.dataset import merge_recordings
 
-    report = merge_recordings(files, output, overwrite=force, dry_run=dry_run)
+    report = merge_recordings(recordings_of(sources), output, overwrite=force, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, **report._asdict()})
         return
@@ -75,7 +77,7 @@ def merge(
 
 
 def split(
-    file: File,
+    source: Annotated[str, typer.Argument(metavar="FILE|URL", help="A recording.")],
     output: Annotated[
         Path,
         typer.Option(
@@ -96,7 +98,12 @@ def split(
         raise typer.BadParameter("expected either --episodes or --max-bytes")
     from tupli_mcap.dataset import split_recording
 
-    parts = split_recording(file, output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
+    found = recordings_of([source])
+    if len(found) != 1:
+        raise typer.BadParameter(
+            f"expected one recording, found {len(found)} at {shown(source)}; give one of them"
+        )
+    parts = split_recording(found[0], output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:
         print_json({"dry_run": dry_run, "recordings": parts})
         return
@@ -152,11 +159,11 @@ def tag(
         return
     for one in done:
         would = "would be " if dry_run else ""
-        shown = ", ".join(
+        noted = ", ".join(
             f"{key}={'' if value is None else dumps_any(value)}" for key, value in one["values"].items()
         )
         count = counted(len(one["episodes"]), "episode")
-        say(f"{one['path']}: {count} {would}{'undone' if undo else 'annotated'}: {shown}")
+        say(f"{one['path']}: {count} {would}{'undone' if undo else 'annotated'}: {noted}")
 
 
 def edit(
@@ -205,11 +212,11 @@ def edit(
         edited = zip(files, runs, strict=True)
         print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
         return
-    from tupli_mcap.jsonvalue import shown
+    from tupli_mcap.jsonvalue import shown as as_text
 
     for file, run in zip(files, runs, strict=True):
         facts = {"recording": str(file), "run": run.name, "split": run.split, "tags": ", ".join(run.tags)}
-        facts |= {key: shown(value) for key, value in run.metadata.items()}
+        facts |= {key: as_text(value) for key, value in run.metadata.items()}
         print_facts([(key, text) for key, text in facts.items() if text])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -20,7 +20,6 @@ from tupli_mcap.cli.options import (
     any_storage,
     dataset_of,
     filter_of,
-    local_path,
 )
 from tupli_mcap.cli.output import (
     Column,
@@ -36,7 +35,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import fail, terminal_width
 from tupli_mcap.errors import did_you_mean
-from tupli_mcap.remote import is_server
+from tupli_mcap.remote import is_server, is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -89,7 +88,9 @@ _COLUMNS = {
         _each(_success),
     ),
     "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
-    "size": _Listed("size", Column("SIZE", "right"), _each(lambda r: bytes_of(r.size))),
+    "size": _Listed(
+        "size", Column("SIZE", "right"), _each(lambda r: "" if r.size is None else bytes_of(r.size))
+    ),
     "state": _Listed("state", Column("STATE"), _each(lambda r: r.state)),
     "split": _Listed("split", Column("SPLIT"), _each(lambda r: r.split)),
     "tags": _Listed("tags", Column("TAGS", shrink="end"), _each(lambda r: ", ".join(r.tags))),
@@ -112,11 +113,10 @@ _MEANT = {
 
 def ls(
     paths: Annotated[
-        list[Path] | None,
+        list[str] | None,
         typer.Argument(
-            metavar="PATH",
-            help="Files, directories, storages; by default, this directory.",
-            parser=local_path,
+            metavar="PATH|URL",
+            help="Recordings, directories, storages, URLs; by default, this directory.",
         ),
     ] = None,
     filter_text: FilterText = None,
@@ -124,28 +124,19 @@ def ls(
     columns: ColumnNames = None,
     as_json: Json = False,
 ) -> None:
-    """List the recordings in files and directories.
+    """List recordings of files, directories and servers.
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
     state, split, tags, settings. The last three appear only with --columns; settings are the
     metadata of the run. RETURN is the mean over episodes. STATE is `complete`; `recording`
     while a process writes the file; `recovered` if its writer was killed or failed: all
-    finished steps are there as long as the journal is. Deleted episodes are not counted. With
-    --filter, only the episodes that match are counted.
+    finished steps are there as long as the journal is. A server does not tell SIZE and STATE.
+    Deleted episodes are not counted. With --filter, only the episodes that match are counted.
     """
-    from tupli_mcap.storage.listing import list_recordings
-
     wanted = filter_of(filter_text)
-    choose = None
-    if wanted is not None:
-        from tupli_mcap.dataset.which import candidates
-        from tupli_mcap.schema import EpisodeHeader, check_keys
-
-        check_keys(wanted, EpisodeHeader)
-        choose = partial(candidates, filter=wanted)
-    listed = list(list_recordings(paths or [Path()], choose))
+    listed = [item for source in paths or ["."] for item in _listed(source, wanted)]
     if wanted is not None and not listed:
-        _check_there(paths or [Path()], wanted)
+        _check_there(paths or ["."], wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
@@ -160,14 +151,33 @@ def ls(
         raise typer.Exit(1)
 
 
-def _check_there(paths: Sequence[Path], wanted: BaseFilter) -> None:
-    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has."""
-    from tupli_mcap import open as open_dataset
-    from tupli_mcap.storage.listing import find_recordings
+def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]:
+    """The recordings of one source."""
+    from tupli_mcap.storage.listing import list_recordings, recordings_of
 
-    files = [file for path in paths for file in find_recordings(path)]
+    if is_server(source):
+        with any_storage(source) as storage:
+            yield from recordings_of(storage.list_episodes(wanted))
+        return
+    choose = None
+    if wanted is not None:
+        from tupli_mcap.dataset.which import candidates
+        from tupli_mcap.schema import EpisodeHeader, check_keys
+
+        check_keys(wanted, EpisodeHeader)
+        choose = partial(candidates, filter=wanted)
+    yield from list_recordings([source if is_url(source) else Path(source)], choose)
+
+
+def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
+    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has."""
+    from tupli_mcap.storage.listing import recordings_at
+
+    if is_server(sources[0]):
+        len(dataset_of(sources[:1]).filter(wanted))
+    files = [str(file) for source in sources if not is_server(source) for file in recordings_at(source)]
     if files:
-        len(open_dataset(files).filter(wanted))
+        len(dataset_of(files).filter(wanted))
 
 
 def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.remote import is_url, shown
+from tupli_mcap.remote import is_server, is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AnyStorage", "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "Sources", "StoragePath",
-    "any_storage", "dataset_of", "filter_of", "full_id", "local_path", "open_storage", "pair_of"
+    "any_storage", "dataset_of", "filter_of", "full_id", "local_path", "open_storage", "pair_of", "recordings_of"
 ]  # fmt: skip
 
 
@@ -69,13 +69,13 @@ StoragePath = Annotated[
 ]
 DEFAULT_STORAGE = Path("_local_storage")
 AnyStorage = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--storage",
         "--url",
-        envvar="TUPLI_MCAP_STORAGE",
+        envvar=["TUPLI_MCAP_STORAGE", "TUPLI_MCAP_URL"],
         metavar="PATH|URL",
-        help="The storage's directory, or a server.",
+        help="The storage's directory, or a server; by default, _local_storage, or else the server of the last login.",
     ),
 ]
 _SHORTEST_ID = 4
@@ -86,6 +86,23 @@ def dataset_of(sources: Sequence[str]) -> Dataset:
     from tupli_mcap import open as open_dataset
 
     return open_dataset(sources[0] if len(sources) == 1 else sources)
+
+
+def recordings_of(sources: Sequence[str]) -> list[str]:
+    """The recordings that paths and URLs name; those of directories and patterns in their order by name.
+
+    Raises:
+        BadParameter: a source is a server.
+        RecordingError: there is no such file.
+    """
+    from tupli_mcap.storage.listing import recordings_at
+
+    for source in filter(is_server, sources):
+        raise typer.BadParameter(
+            f"expected recordings, found the server {shown(source)}; fetch them with tupli-mcap pull, or write its "
+            f"episodes into one file: tupli-mcap filter {shown(source)} FILTER -o FILE"
+        )
+    return [str(file) for source in sources for file in recordings_at(source)]
 
 
 def filter_of(text: str | None) -> BaseFilter | None:
@@ -127,10 +144,15 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
     return FileStorage(path)
 
 
-def any_storage(place: str) -> AbstractContextManager[TupliStorage]:
-    """The storage in an existing directory, or on a server."""
+def any_storage(place: str | None) -> AbstractContextManager[TupliStorage]:
+    """The storage in an existing directory, or on a server; by default, the usual directory, or else the server of the
+    last login."""
     from tupli_mcap.storage import TupliAPIClient
+    from tupli_mcap.storage.api import last_server
 
+    if place is None:
+        place = "" if DEFAULT_STORAGE.is_dir() else last_server()
+        place = place or str(DEFAULT_STORAGE)
     return TupliAPIClient(place) if is_url(place) else open_storage(Path(place))
 
 

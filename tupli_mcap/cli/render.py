@@ -15,7 +15,7 @@ from tupli_mcap.cli.options import Episodes, FilterText, Json, Sources, filter_o
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
@@ -40,7 +40,7 @@ class _X(StrEnum):
 
 _Source = Annotated[
     str,
-    typer.Argument(metavar="PATH|URL", help="A recording (a path or a URL), or a directory that holds it."),
+    typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it."),
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]
@@ -132,7 +132,7 @@ def _chosen(
     from tupli_mcap.dataset.which import choose_episodes
     from tupli_mcap.recording import Recording
 
-    if is_url(source) or not Path(source).is_dir():
+    if not is_server(source) and not Path(source).is_dir():
         with Recording(source) as recording:
             yield recording, choose_episodes(recording, episodes, wanted)
         return

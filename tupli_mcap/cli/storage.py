@@ -53,7 +53,7 @@ _ROOMY = 100  # columns a terminal needs for benchmarks and their environments s
 
 
 def list_benchmarks(
-    place: AnyStorage = str(DEFAULT_STORAGE),
+    place: AnyStorage = None,
     filter_text: Annotated[
         str | None,
         typer.Option(
@@ -96,7 +96,7 @@ def list_benchmarks(
 
 
 def list_artifacts(
-    place: AnyStorage = str(DEFAULT_STORAGE),
+    place: AnyStorage = None,
     filter_text: Annotated[
         str | None,
         typer.Option("--filter", metavar="FILTER", help="Which artifacts, such as 'name = \"wind.csv\"'."),
@@ -123,7 +123,7 @@ def list_artifacts(
 
 
 def list_episodes(
-    place: AnyStorage = str(DEFAULT_STORAGE),
+    place: AnyStorage = None,
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,

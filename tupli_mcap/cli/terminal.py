@@ -21,6 +21,7 @@ from typing import TextIO
 __all__ = [
     "ask_secret",
     "can_print",
+    "confirmed",
     "fail",
     "fetch_progress",
     "flush",
@@ -188,6 +189,15 @@ def ask_secret(question: str) -> str | None:
 
     answer: str = typer.prompt(visible(question), hide_input=True, err=True)
     return answer
+
+
+def confirmed(question: str) -> bool:
+    """Ask a question; whether the answer is yes. False if stdin is no terminal."""
+    if not sys.stdin.isatty():
+        return False
+    import typer
+
+    return typer.confirm(visible(question), err=True)
 
 
 @contextlib.contextmanager

@@ -95,7 +95,7 @@ class Library:
                 return None
             chosen = os.environ.get(_PASSWORD_VARIABLE)
             password = chosen or secrets.token_urlsafe(12)
-            accounts.create_user(connection, _ADMIN, password)
+            accounts.create_user(connection, _ADMIN, password, shortest=self.settings.min_password)
             connection.execute(MEMBERSHIP.insert().values(user=_ADMIN, team="global", role=_ADMIN))
         return None if chosen else password
 

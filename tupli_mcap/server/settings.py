@@ -16,13 +16,14 @@ class Settings:
     directory. blobs: the URL of a bucket for recordings and artifacts; by default, the directory. presigned: whether
     clients can reach the bucket, and are redirected there. accel: the internal location of nginx for the directory.
 
-    open_signup: whether everybody may create a user. guests: whether what is published in `global` is shown without a
-    sign-in. access_seconds, refresh_seconds, ticket_seconds: how long tokens and tickets are valid. max_upload,
-    max_body, max_message: most bytes of a recording, of a benchmark or an artifact, and of any other request. max_page:
-    most items of a page. max_uploads: most unfinished uploads of a user. quota: most bytes that each user may store;
-    None without a limit. query_seconds: how long a query may take. head_seconds, stall_seconds: how long a client may
-    keep the server waiting, see `patience`. pending_seconds: after this time, a pending file counts as left by a killed
-    process. upkeep_seconds: time between two clean-ups. open_metrics: whether metrics are shown without a sign-in.
+    open_signup: whether everybody may create a user. min_password: least characters of a new password. guests: whether
+    what is published in `global` is shown without a sign-in. access_seconds, refresh_seconds, ticket_seconds: how long
+    tokens and tickets are valid. max_upload, max_body, max_message: most bytes of a recording, of a benchmark or an
+    artifact, and of any other request. max_page: most items of a page. max_uploads: most unfinished uploads of a user.
+    quota: most bytes that each user may store; None without a limit. query_seconds: how long a query may take.
+    head_seconds, stall_seconds: how long a client may keep the server waiting, see `patience`. pending_seconds: after
+    this time, a pending file counts as left by a killed process. upkeep_seconds: time between two clean-ups.
+    open_metrics: whether metrics are shown without a sign-in.
     """
 
     directory: Path
@@ -31,6 +32,7 @@ class Settings:
     presigned: bool = False
     accel: str = ""
     open_signup: bool = False
+    min_password: int = 8  # as NIST SP 800-63B demands
     guests: bool = False
     access_seconds: int = 30 * 60
     refresh_seconds: int = 30 * 24 * 3600

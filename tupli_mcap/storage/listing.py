@@ -1,4 +1,4 @@
-"""Finds, lists and reads the recordings of files and directories, storages or not; nothing is written."""
+"""Finds, lists and reads the recordings of files, directories and URLs, storages or not; nothing is written."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from tupli_mcap.errors import NotFoundError, RecordingError, TupliError, os_reas
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.prefix import metadata_at
+from tupli_mcap.remote import is_url, matching, shown
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
@@ -32,6 +34,8 @@ __all__ = [
     "find_recordings",
     "is_storage",
     "list_recordings",
+    "recordings_at",
+    "recordings_of",
     "scan",
     "stamp_of",
     "with_tuples",
@@ -75,7 +79,7 @@ class ListedRecording(NamedTuple):
     Attributes:
         return_mean: over its episodes, None if there are none; it leaves out the `return_nan` episodes whose return is
             NaN, and is NaN if there is no other.
-        size: of the file (bytes).
+        size: of the file (bytes); None if unknown.
         state: see `tupli_mcap.recording.description.state_of`.
         name, environment, started (ISO 8601 in UTC), split, tags, settings (its metadata): of its run.
         success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
@@ -87,7 +91,7 @@ class ListedRecording(NamedTuple):
     steps: int = 0
     return_mean: float | None = None
     return_nan: int = 0
-    size: int = 0
+    size: int | None = 0
     created_ns: int = 0
     benchmark_id: str = ""
     state: str = ""
@@ -186,22 +190,59 @@ def find_recordings(path: Path) -> list[Path]:
 
 
 def list_recordings(
-    paths: Iterable[Path], choose: Callable[[Recording], Array] | None = None
+    sources: Iterable[Path | str], choose: Callable[[Recording], Array] | None = None
 ) -> Iterator[ListedRecording]:
-    """The recordings of files and directories; one that cannot be read is listed with its error.
+    """The recordings of files, directories and URLs; one that cannot be read is listed with its error.
 
     `choose` returns the positions of the episodes that count; recordings without any are left out.
     """
-    for path in paths:
+    for source in sources:
         try:
-            found = find_recordings(path)
+            found = recordings_at(source)
         except TupliError as err:
-            yield ListedRecording(str(path), error=str(err))
+            yield ListedRecording(shown(str(source)), error=str(err))
             continue
         for file in found:
-            listed = _listed(file, path if path.is_dir() else None, choose)
+            listed = _listed(file, source if isinstance(source, Path) and source.is_dir() else None, choose)
             if listed.episodes or listed.error or choose is None:
                 yield listed
+
+
+def recordings_at(source: Path | str) -> Sequence[Path | str]:
+    """The recordings of a path, as `find_recordings` finds them, or the URLs that match a URL.
+
+    Raises:
+        RecordingError: there are none.
+    """
+    return matching(source) if isinstance(source, str) and is_url(source) else find_recordings(Path(source))
+
+
+def recordings_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
+    """The recordings that episodes of a storage are in, as far as their headers tell; size and state are unknown."""
+    by_recording: dict[str, list[EpisodeHeader]] = {}
+    for header in headers:
+        by_recording.setdefault(header.recording, []).append(header)
+    for name, same in by_recording.items():
+        returns = spread_of(np.array([header.episode_return for header in same], np.float64))
+        said = [found for header in same if (found := success_of(header.metadata)) is not None]
+        run = same[0].run
+        yield ListedRecording(
+            path=name,
+            episodes=len(same),
+            steps=sum(header.n_tuples for header in same),
+            return_mean=None if returns is None else returns.mean,
+            return_nan=0 if returns is None else returns.nan,
+            size=None,
+            benchmark_id=same[0].benchmark_id,
+            name=", ".join(dict.fromkeys(str(header.run.get("name", "")) for header in same)),
+            environment=str(run.get("environment") or ""),
+            started=str(run.get("started") or ""),
+            success=sum(said) / len(said) if said else None,
+            success_known=len(said),
+            split=str(run.get("split") or ""),
+            tags=tuple(map(str, run.get("tags") or ())),
+            settings=run.get("metadata"),
+        )
 
 
 def compactable(root: Path) -> list[Compactable]:
@@ -222,11 +263,14 @@ def compactable(root: Path) -> list[Compactable]:
     return compactables
 
 
-def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] | None) -> ListedRecording:
+def _listed(
+    file: Path | str, root: Path | None, choose: Callable[[Recording], Array] | None
+) -> ListedRecording:
+    name = shown(str(file))
     try:
-        notes = Notes.read(path, root)
-        with Recording(path) as recording:
-            deleted = notes.about(recording.metadata).deleted
+        notes = Notes.read(file, root) if isinstance(file, Path) else None
+        with Recording(file) as recording:
+            deleted = set() if notes is None else notes.about(recording.metadata).deleted
             numbers = recording.index["episode"]
             if choose is not None:
                 kept = choose(recording)
@@ -236,12 +280,12 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
             returns = spread_of(rows["return"])
             said, run = successes(recording, kept), recording.readable_runs[0]
             return ListedRecording(
-                path=str(path),
+                path=name,
                 episodes=len(rows),
                 steps=int(rows["length"].sum()),
                 return_mean=None if returns is None else returns.mean,
                 return_nan=0 if returns is None else returns.nan,
-                size=path.stat().st_size,
+                size=recording.size,
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,
                 state=state_of(recording),
@@ -255,7 +299,7 @@ def _listed(path: Path, root: Path | None, choose: Callable[[Recording], Array] 
                 settings=run.metadata,
             )
     except (TupliError, OSError) as err:
-        return ListedRecording(str(path), error=str(err))
+        return ListedRecording(name, error=str(err))
 
 
 def with_tuples(

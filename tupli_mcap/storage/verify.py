@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from tupli_mcap import files
-from tupli_mcap.errors import NotFoundError, TupliError
+from tupli_mcap.errors import NotFoundError, RecordingError, TupliError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
-from tupli_mcap.remote import copied, is_url, shown
+from tupli_mcap.remote import copied, is_server, is_url, matching, shown
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.bundles import carried_benchmark
 from tupli_mcap.storage.files import FileStorage
@@ -71,7 +71,7 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
     beside: dict[Path, None] = {}
     for given in paths:
         if isinstance(given, str) and is_url(given):
-            yield _at_url(given)
+            yield from map(_at_url, _found_at(given))
             continue
         path = Path(given)
         if path.is_dir():
@@ -98,9 +98,21 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
         yield from _left_in(directory)
 
 
+def _found_at(url: str) -> list[str]:
+    """The URLs that match a URL, or the URL itself: whether there is a file will be seen."""
+    try:
+        return matching(url)
+    except TupliError:
+        return [url]
+
+
 def _at_url(url: str) -> VerifyReport:
     """The report on a file on a server, from a copy."""
     try:
+        if is_server(url):
+            raise RecordingError(
+                f"{shown(url)} is a server; fetch its recordings with tupli-mcap pull, and verify them"
+            )
         with copied(url) as path:
             report = _recording(path)
     except TupliError as err:

@@ -185,5 +185,5 @@ def _print_written(path: Path, as_json: bool) -> None:
         print_json({**facts, "episodes": item.episodes, "steps": item.steps, "size": item.size})
     else:
         say(
-            f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size)}"
+            f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size or 0)}"
         )

@@ -12,7 +12,8 @@ import typer
 from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import Column, print_facts, print_json, print_table, when
 from tupli_mcap.cli.share.account import Url
-from tupli_mcap.cli.terminal import say
+from tupli_mcap.cli.terminal import confirmed, say
+from tupli_mcap.errors import StorageError
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import GroupMembershipQuery, GroupWithMembers
@@ -43,16 +44,23 @@ def list_users(url: Url = None, as_json: Json = False) -> None:
 
 def delete_user(
     username: Annotated[str, typer.Argument(metavar="USER", help="The user's name.")],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
     """Delete a user, and what only they could see.
 
-    What they published stays. Nobody can take the name again. You may delete yourself.
+    What they published stays. Nobody can take the name again. You may delete yourself. The
+    command asks first; without a terminal, it takes --yes.
     """
     from tupli_mcap.storage import TupliAPIClient
 
     with TupliAPIClient(url) as client:
+        question = f"Delete the user {username} at {client.url}, and what only they could see?"
+        if not (yes or confirmed(question)):
+            raise StorageError(
+                f"the user {username} was not deleted; to delete without being asked, give --yes"
+            )
         client.delete_user(username)
         _deleted(client.url, "user", username, as_json=as_json)
 
@@ -120,7 +128,9 @@ def add_group_members(
 ) -> None:
     """Add users to a group, or give them roles there.
 
-    `list-roles` lists the roles. You cannot give a right that you do not have.
+    A member reads what is published in the group, a contributor also publishes there, and a
+    group_admin adds and removes members. An admin of the server sees all roles, and their
+    rights, with list-roles. You cannot give a right that you do not have.
     """
     from tupli_mcap.storage import TupliAPIClient
 

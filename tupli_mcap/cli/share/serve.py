@@ -39,6 +39,9 @@ _Presigned = Annotated[
 _Host = Annotated[str, typer.Option(help="The address to listen on; 0.0.0.0 means all addresses.")]
 _Port = Annotated[int, typer.Option(min=0, max=65535, help="The port to listen on; 0 takes a free one.")]
 _Signup = Annotated[bool, typer.Option("--open-signup", help="Let everybody sign up.")]
+_MinPassword = Annotated[
+    int, typer.Option(min=1, max=1024, help="The least number of characters of a new password.")
+]
 _Guests = Annotated[
     bool, typer.Option("--guests", help="Show what is published in 'global' without a sign-in.")
 ]
@@ -70,6 +73,7 @@ def serve(
     host: _Host = "127.0.0.1",
     port: _Port = 8080,
     open_signup: _Signup = False,
+    min_password: _MinPassword = 8,
     guests: _Guests = False,
     workers: _Workers = 1,
     database: Database = "",
@@ -108,6 +112,7 @@ def serve(
         presigned=presigned,
         accel=accel,
         open_signup=open_signup,
+        min_password=min_password,
         guests=guests,
         quota=None if quota is None else int(quota * 1e9),
         query_seconds=query_seconds,

@@ -36,7 +36,7 @@ def change_password(request: Request, visit: Code, old: _Text = "", new: _Text =
         with library.database.writing() as connection:
             if not accounts.verify_password(connection, name, old):
                 raise SignInError("the old password is not right")
-            accounts.change_password(connection, name, new)
+            accounts.change_password(connection, name, new, shortest=library.settings.min_password)
             audit(connection, name, "change_password", name)
 
     response = tried(change, lambda wrong, status: _page(request, visit, wrong, status), "/account")

@@ -83,7 +83,7 @@ def _sign_up(library: Library, username: str, password: str) -> None:
     if not library.settings.open_signup:
         raise DeniedError("only an administrator makes users here")
     with library.database.writing() as connection:
-        create_user(connection, username, password)
+        create_user(connection, username, password, shortest=library.settings.min_password)
         audit(connection, username, "create_user", username)
 
 

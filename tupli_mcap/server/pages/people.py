@@ -32,7 +32,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
     def change() -> None:
         visit.caller.demand(Right.USER_CREATE)
         with visit.library.database.writing() as connection:
-            accounts.create_user(connection, username, password)
+            accounts.create_user(connection, username, password, shortest=visit.library.settings.min_password)
             audit(connection, visit.caller.name, "create_user", username)
 
     return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")

@@ -68,8 +68,8 @@ def prepare(connection: Connection) -> None:
 # --- users ---
 
 
-def create_user(connection: Connection, name: str, password: str) -> None:
-    """Creates a user.
+def create_user(connection: Connection, name: str, password: str, *, shortest: int) -> None:
+    """Creates a user, with a password of `shortest` characters at least.
 
     Raises:
         StorageError: the name or the password is not valid.
@@ -79,7 +79,7 @@ def create_user(connection: Connection, name: str, password: str) -> None:
         raise StorageError(
             f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
         )
-    hashed = _hashed(password)
+    hashed = _hashed(password, shortest)
     if not _reserve(connection, name, "user"):
         raise ConflictError("User already exists")
     row = {"name": name, "password": hashed, "epoch": 0, "created_at": int(time.time())}
@@ -93,13 +93,14 @@ def verify_password(connection: Connection, name: str, password: str) -> bool:
     return valid and found is not None
 
 
-def change_password(connection: Connection, name: str, password: str) -> None:
+def change_password(connection: Connection, name: str, password: str, *, shortest: int) -> None:
     """Changes a user's password, and ends all sign-ins and tokens of the user.
 
     Raises:
+        StorageError: the password has fewer than `shortest` characters, or too many.
         NotFoundError: there is no such user.
     """
-    hashed = _hashed(password)
+    hashed = _hashed(password, shortest)
     changed = connection.execute(
         update(USER).where(USER.c.name == name).values(password=hashed, epoch=USER.c.epoch + 1)
     )
@@ -160,9 +161,12 @@ def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
     return found
 
 
-def _hashed(password: str) -> str:
-    if not isinstance(password, str) or not 1 <= len(password) <= _MOST_PASSWORD:
-        raise StorageError(f"expected a password of 1 to {_MOST_PASSWORD} characters; choose another")
+def _hashed(password: str, shortest: int) -> str:
+    if not isinstance(password, str) or not shortest <= len(password) <= _MOST_PASSWORD:
+        found = f"{len(password)} characters" if isinstance(password, str) else "no text"
+        raise StorageError(
+            f"expected a password of {shortest} to {_MOST_PASSWORD} characters, found {found}; choose another"
+        )
     return _HASHES.hash(password)
 
 

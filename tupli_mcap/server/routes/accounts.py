@@ -146,7 +146,7 @@ def create_user(library: Served, caller: AnyCaller, told: Credentials) -> User:
     if not library.settings.open_signup:
         caller.demand(Right.USER_CREATE)
     with library.database.writing() as connection:
-        accounts.create_user(connection, told.username, told.password)
+        accounts.create_user(connection, told.username, told.password, shortest=library.settings.min_password)
         audit(connection, caller.name, "create_user", told.username)
         return User(username=told.username, memberships=accounts.memberships_of(connection, told.username))
 
@@ -185,7 +185,7 @@ def change_password(library: Served, caller: Writer, username: str, told: Passwo
         if username == caller.name and not accounts.verify_password(connection, username, told.old or ""):
             raise SignInError("the old password is not right")
         accounts.demand_over(connection, caller, username)
-        accounts.change_password(connection, username, told.password)
+        accounts.change_password(connection, username, told.password, shortest=library.settings.min_password)
         audit(connection, caller.name, "change_password", username)
 
 

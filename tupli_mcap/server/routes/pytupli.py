@@ -123,7 +123,7 @@ def create_user(library: Served, caller: AnyCaller, told: Credentials) -> dict[s
     if not library.settings.open_signup:
         caller.demand(Right.USER_CREATE)
     with library.database.writing() as connection:
-        accounts.create_user(connection, told.username, told.password)
+        accounts.create_user(connection, told.username, told.password, shortest=library.settings.min_password)
     return _user(library, told.username)
 
 
@@ -148,7 +148,9 @@ def change_password(library: Served, caller: Changing, told: Credentials) -> Non
     caller.demand(Right.USER_UPDATE, told.username)
     with library.database.writing() as connection:
         accounts.demand_over(connection, caller, told.username)
-        accounts.change_password(connection, told.username, told.password)
+        accounts.change_password(
+            connection, told.username, told.password, shortest=library.settings.min_password
+        )
 
 
 @router.post("/access/users/token")

@@ -7,5 +7,6 @@ upload                        sending one recording
 """
 
 from tupli_mcap.storage.api.client import TupliAPIClient
+from tupli_mcap.storage.api.tokens import last_server
 
-__all__ = ["TupliAPIClient"]
+__all__ = ["TupliAPIClient", "last_server"]

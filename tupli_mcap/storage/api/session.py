@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 from urllib.parse import urlsplit
 
-from tupli_mcap import jsonvalue, trust
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
 from tupli_mcap.remote import shown
 from tupli_mcap.storage.api.answers import LATER, Page, TokenPair, UnreachableError, as_told, error_of
-from tupli_mcap.storage.api.tokens import TokenStore
+from tupli_mcap.storage.api.tokens import TokenStore, user_tokens
 
 if TYPE_CHECKING:
     import httpx
@@ -51,7 +51,7 @@ class Session:
             import httpx  # noqa: F401
         except ImportError as err:
             raise missing_extra("a storage on a server needs httpx", "remote") from err
-        self.tokens = tokens or TokenStore(trust.config_dir() / "servers.json")
+        self.tokens = tokens or user_tokens()
         self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self.tokens.last() or DEFAULT_URL)
         self._closed = False
         self._process = os.getpid()

@@ -13,14 +13,14 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from tupli_mcap import files
+from tupli_mcap import files, trust
 from tupli_mcap.errors import StorageError
 from tupli_mcap.storage.atomic import Lock, os_errors
 
 if TYPE_CHECKING:
     from keyring.backend import KeyringBackend
 
-__all__ = ["TokenStore"]
+__all__ = ["TokenStore", "last_server", "user_tokens"]
 
 _SERVICE: Final = "tupli-mcap"
 _TOKENS: Final = ("access_token", "refresh_token")
@@ -107,6 +107,16 @@ class TokenStore:
             return {}
         known = found.items() if isinstance(found, dict) else ()
         return {url: kept for url, kept in known if isinstance(kept, dict)}
+
+
+def user_tokens() -> TokenStore:
+    """The tokens of this user."""
+    return TokenStore(trust.config_dir() / "servers.json")
+
+
+def last_server() -> str:
+    """The server that this user signed in to last, or chose since; empty if there is none."""
+    return user_tokens().last()
 
 
 def _keyring() -> KeyringBackend | None:
