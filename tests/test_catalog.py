@@ -19,13 +19,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
 
+from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR, parse_filter
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
-from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies

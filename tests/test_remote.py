@@ -438,3 +438,78 @@ def test_patterns() -> None:
 def test_what_changes_files_takes_none_on_a_server(command: list[str]) -> None:
     told = CliRunner().invoke(app, [command[0], "https://me:SECRET@lab/x.mcap", *command[1:]])
     assert told.exit_code == 2 and "download" in told.stderr and "SECRET" not in told.output
+
+
+# ---- blocks that outlive the process
+
+_READS = """
+import sys, tupli_mcap
+with tupli_mcap.Recording(sys.argv[1]) as recording:
+    for part in sys.argv[2:]:
+        print(recording.read(None if part == "all" else [int(part)], fields=["states"]).states.sum())
+"""
+
+
+def _read_elsewhere(url: str, *parts: str) -> str:
+    """What another process reads: single episodes by number, or all of them."""
+    done = subprocess.run([sys.executable, "-c", _READS, url, *parts], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_another_process_reads_kept_blocks(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path))
+    assert (
+        _read_elsewhere(server.url(), "3", "7") and not (tmp_path / "blocks").exists()
+    )  # only if it is wanted
+    monkeypatch.setenv("TUPLI_MCAP_BLOCK_BYTES", str(64 << 20))
+    first = _read_elsewhere(server.url(), "all", "7")
+    (folder,) = (tmp_path / "blocks").iterdir()
+    assert (folder.stat().st_mode & 0o777, folder.parent.stat().st_mode & 0o777) == (0o700, 0o700)
+    server.asked.clear()
+    assert _read_elsewhere(server.url(), "all", "7") == first
+    assert len(server.asked) == 1  # of the tail, which tells that the file is the same
+
+    blocks = sorted(folder.iterdir())
+    damaged = bytearray(blocks[0].read_bytes())
+    damaged[-1] ^= 1
+    blocks[0].write_bytes(damaged)
+    blocks[-1].write_bytes(blocks[-1].read_bytes()[:-1])
+    server.asked.clear()
+    assert _read_elsewhere(server.url(), "all", "7") == first
+    assert len(server.asked) > 1
+
+    server.tags["/r.mcap"] = '"second"'
+    server.files["/r.mcap"] = bytes(server.files["/r.mcap"])
+    server.asked.clear()
+    assert _read_elsewhere(server.url(), "all", "7") == first
+    assert len(server.asked) > 1 and len(list((tmp_path / "blocks").iterdir())) == 2
+    server.tags["/r.mcap"] = 'W/"weak"'
+    assert _read_elsewhere(server.url(), "all", "7") == first
+    assert len(list((tmp_path / "blocks").iterdir())) == 2
+
+
+def test_kept_blocks_stay_within_their_budget(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    budget = 1 << 20
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("TUPLI_MCAP_BLOCK_BYTES", str(budget))
+    together = [
+        subprocess.Popen(
+            [sys.executable, "-c", _READS, server.url(), *map(str, range(first, EPISODES, 2))],
+            stdout=subprocess.PIPE,
+        )
+        for first in (0, 1)
+    ]
+    told = "".join(each.communicate()[0].decode() for each in together)
+    assert [each.returncode for each in together] == [0, 0] and len(told.split()) == EPISODES
+    kept = [path.stat().st_size for path in (tmp_path / "blocks").rglob("*") if path.is_file()]
+    assert budget // 2 < sum(kept) <= budget * 17 // 16
+    monkeypatch.setenv("TUPLI_MCAP_BLOCK_BYTES", "much")
+    with pytest.raises(
+        RecordingError, match="expected TUPLI_MCAP_BLOCK_BYTES to be a number of bytes, found 'much'"
+    ):
+        Recording(server.url())

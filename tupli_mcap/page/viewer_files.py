@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from tupli_mcap import files
+from tupli_mcap.cache import cache_dir, make_private
 from tupli_mcap.errors import StorageError, os_reason
-from tupli_mcap.storage.catalog.place import cache_dir, is_private, make_private
+from tupli_mcap.storage.catalog.place import is_private
 
 __all__ = ["NAMES", "viewer_file", "viewer_version"]
 

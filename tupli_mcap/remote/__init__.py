@@ -4,6 +4,7 @@ objects:  one object behind a URL: its size, its version, and ranges of its byte
 failures: errors of failed requests.
 plan:     which ranges are fetched in one request, and when a server should cut out episodes instead.
 source:   the file as a reader sees it: ranges are fetched ahead and cached; a changed object is an error.
+kept:     blocks that stay on disk for other processes, where the user wants it.
 patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
 names:    recognises URLs, and removes secrets from them.
 """

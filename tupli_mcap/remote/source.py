@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.progress import progress
+from tupli_mcap.remote.kept import kept_blocks
 from tupli_mcap.remote.names import shown
 from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
@@ -120,6 +121,7 @@ class RemoteSource:
         self.size = tail.size
         self._url, self._remote, self._tail = url, remote, tail
         self._file = f"{tail.version} {url}"
+        self._kept = kept_blocks(url, tail.version)
         self._lock = threading.Lock()
         self._planned: list[Range] = []  # not requested yet; the next one is the last
         self._unread: set[tuple[int, int]] = set()  # of the plan: requested, and not read yet
@@ -140,7 +142,8 @@ class RemoteSource:
         if offset >= first:
             return self._tail.data[offset - first : stop - first]
         check_process(self._url)
-        block = _blocks.find(self._file, offset, stop) or self._ask_for(offset, stop)
+        block = _blocks.find(self._file, offset, stop) or self._kept_block(offset, stop)
+        block = block or self._ask_for(offset, stop)
         try:
             data = block.coming.result()
         except BaseException:
@@ -152,10 +155,13 @@ class RemoteSource:
     def fetch(self, ranges: Sequence[Range]) -> None:
         """Starts to fetch ranges that will be read next; fetching continues while they are read."""
         first = self.size - len(self._tail.data)
+        kept = self._kept.ranges() if self._kept else []
         missing = [
             (start, min(stop, self.size))
             for start, stop in ranges
-            if start < first and not _blocks.find(self._file, start, stop)
+            if start < first
+            and not _blocks.find(self._file, start, stop)
+            and not any(begin <= start and stop <= end for begin, end in kept)
         ]
         with self._lock:
             given_up = sum(stop - start for start, stop in self._planned)
@@ -163,6 +169,20 @@ class RemoteSource:
             self._unread = set()
             _tell(sum(stop - start for start, stop in self._planned) - given_up, 0)
             self._fill()
+
+    def _kept_block(self, start: int, stop: int) -> _Block | None:
+        """The block with a range, from the disk."""
+        kept = self._kept
+        if kept is None:
+            return None
+        for begin, end in kept.ranges():
+            if begin <= start and stop <= end and (data := kept.read((begin, end))) is not None:
+                coming: Future[memoryview] = Future()
+                coming.set_result(data)
+                block = _Block(begin, end, coming)
+                _blocks.put(self._file, block)
+                return block
+        return None
 
     def _ask_for(self, start: int, stop: int) -> _Block:
         """Requests the planned range that holds this range, or else the range alone."""
@@ -202,10 +222,13 @@ class RemoteSource:
             _tell(0, came)
 
         try:
-            return self._remote.get(start, stop, self._tail.version, tell)
+            data = self._remote.get(start, stop, self._tail.version, tell)
         except BaseException:
             _tell(-left, 0)
             raise
+        if self._kept:
+            self._kept.write((start, stop), data)
+        return data
 
     def refresh(self) -> None:
         """Does nothing, since this source is one version of the file."""

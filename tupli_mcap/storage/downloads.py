@@ -20,13 +20,13 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from tupli_mcap import files
+from tupli_mcap.cache import cache_dir, delete_oldest, make_private
 from tupli_mcap.errors import FormatError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.progress import progress
 from tupli_mcap.remote import copied, shown
 from tupli_mcap.remote.objects import NoRangesError, find
 from tupli_mcap.storage.atomic import os_errors
-from tupli_mcap.storage.catalog.place import cache_dir, make_private
 
 __all__ = ["fetched", "fetched_url"]
 
@@ -65,7 +65,7 @@ def fetched(
     finally:
         drop_private(fd)
         with contextlib.suppress(OSError):
-            _tidy(path.parent, budget)
+            delete_oldest(path.parent.iterdir(), budget, _delete)
 
 
 @contextlib.contextmanager
@@ -151,21 +151,6 @@ def _fetch(
         part.replace(path)
     finally:
         drop_private(fd)
-
-
-def _tidy(directory: Path, budget: int) -> None:
-    """Deletes files until the rest is within the budget, those used longest ago first."""
-    found = []
-    for path in directory.iterdir():
-        with contextlib.suppress(FileNotFoundError):
-            status = path.stat()
-            found.append((status.st_mtime_ns, status.st_size, path))
-    over = sum(size for _, size, _ in found) - budget
-    for _, size, path in sorted(found):
-        if over <= 0:
-            return
-        if _delete(path):
-            over -= size
 
 
 def _delete(path: Path) -> bool:

@@ -15,10 +15,11 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Dialect, Engine, Pool, StaticPool, create_engine, event
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
+from tupli_mcap.cache import make_private
 from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private
 from tupli_mcap.storage.atomic import Lock, LockError, locked
-from tupli_mcap.storage.catalog.place import is_private, make_private
+from tupli_mcap.storage.catalog.place import is_private
 from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
 
 _BUSY_MS: Final = 30_000

@@ -1,9 +1,8 @@
 """The path of a storage's catalog: in a directory of this user, never in the storage.
 
 Somebody else may have written the storage, and a database file and the files beside it can make SQLite run code. So a
-catalog is opened only where nobody else can write: `<cache>/catalogs/<storage>/`, where `<cache>` is
-`$TUPLI_MCAP_CACHE_DIR`, else the platform's user cache directory, and `<storage>` is a hash of the storage's real path,
-device and inode. All of it may be deleted at any time.
+catalog is opened only where nobody else can write: `<cache>/catalogs/<storage>/`, where `<storage>` is a
+hash of the storage's real path, device and inode. All of it may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ import time
 from pathlib import Path
 from typing import Final
 
-import platformdirs
+from tupli_mcap.cache import cache_dir, make_private
 
-__all__ = ["cache_dir", "catalog_path", "is_private", "make_private"]
+__all__ = ["catalog_path", "is_private"]
 
 _MOUNTS: Final = Path("/proc/self/mounts")
 # SQLite needs locks and memory maps that hold between machines.
@@ -31,13 +30,6 @@ _REMOTE: Final = re.compile(
 )
 _OCTAL: Final = re.compile(r"\\([0-7]{3})")
 _FORGOTTEN: Final = 90 * 86_400  # seconds after which a catalog that nobody opened is deleted
-
-
-def cache_dir() -> Path:
-    """The directory of this user's catalogs; it need not exist yet."""
-    override = os.environ.get("TUPLI_MCAP_CACHE_DIR")
-    found = Path(override) if override else platformdirs.user_cache_path("tupli-mcap", appauthor=False)
-    return found.absolute()
 
 
 def catalog_path(root: Path) -> Path | None:
@@ -61,13 +53,6 @@ def catalog_path(root: Path) -> Path | None:
         _forget_old(catalogs)
         make_private(directory)
     return directory / "catalog.sqlite"
-
-
-def make_private(directory: Path) -> None:
-    """Make a directory, and those above it that are missing, for this user alone."""
-    if not directory.parent.exists():
-        make_private(directory.parent)
-    directory.mkdir(mode=0o700, exist_ok=True)
 
 
 def is_private(path: Path) -> bool:

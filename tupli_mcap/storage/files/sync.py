@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from sqlalchemy import Connection
 
+from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FormatError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.progress import progress
@@ -26,7 +27,7 @@ from tupli_mcap.storage.catalog.catalog import (
     RecordingStamp,
 )
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
-from tupli_mcap.storage.catalog.place import cache_dir, catalog_path
+from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.listing import LIVE, scan, stamp_of
 
 __all__ = ["SyncedCatalog"]
