@@ -55,6 +55,13 @@ def test_the_commands_are_understood() -> None:
     assert variables <= known | {"TUPLI_MCAP_ADMIN_PASSWORD"}
 
 
+def test_images_have_versions() -> None:
+    images = [service["image"] for service in COMPOSE["services"].values() if "build" not in service]
+    images += re.findall(r"^FROM (\S+)", CONTAINER, re.MULTILINE)
+    tags = [image.partition(":")[2] for image in images]
+    assert tags and not {"", "latest"} & set(tags), images
+
+
 def test_what_the_services_say_of_each_other_is_true() -> None:
     told, services = parsed(SERVER["command"]), COMPOSE["services"]
     (subnet,) = COMPOSE["networks"]["inside"]["ipam"]["config"]

@@ -156,6 +156,7 @@ pull: pull {pole} --storage pulled
 publish: publish {pole}
 unpublish: unpublish {pole}
 password: password ann
+ls: ls {url}
 list-users: list-users
 create-group: create-group lab --description us
 list-groups: list-groups
@@ -170,7 +171,7 @@ create-token: create-token ci --forever
 create-token: create-token robot --write
 list-tokens: list-tokens
 delete-token: delete-token {token}
-delete-user: delete-user ann
+delete-user: delete-user ann --yes
 push: push --dry-run
 backup-server: backup-server served -o backup
 restore-server: restore-server backup again
@@ -187,7 +188,7 @@ EMPTY = {
 def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A server."""
     monkeypatch.setenv("TUPLI_MCAP_PASSWORD", PASSWORD)
-    monkeypatch.setenv("TUPLI_MCAP_NEW_PASSWORD", "another")
+    monkeypatch.setenv("TUPLI_MCAP_NEW_PASSWORD", "another password")
     with serving(Settings(tmp_path / "served")) as url:
         yield url
 

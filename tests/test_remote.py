@@ -434,7 +434,7 @@ def test_patterns() -> None:
     assert matches("a[0-9].m", "a7.m") and not matches("a[!0-9].m", "a7.m") and not matches("a.m", "aXm")
 
 
-@pytest.mark.parametrize("command", [["ls"], ["tag", "a=1"], ["edit", "--name", "x"]])
+@pytest.mark.parametrize("command", [["recover"], ["tag", "a=1"], ["edit", "--name", "x"]])
 def test_what_changes_files_takes_none_on_a_server(command: list[str]) -> None:
     told = CliRunner().invoke(app, [command[0], "https://me:SECRET@lab/x.mcap", *command[1:]])
     assert told.exit_code == 2 and "download" in told.stderr and "SECRET" not in told.output

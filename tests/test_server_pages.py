@@ -145,11 +145,11 @@ class TestSigningIn:
         with browser(server, "bob") as here, browser(server, "bob") as there:
             told = {"code": code(here), "old": "wrong", "new": "n"}
             assert here.post("/account/password", data=told).status_code == 401
-            told["old"], told["new"] = "bob's password", "another"
+            told["old"], told["new"] = "bob's password", "another password"
             assert here.post("/account/password", data=told).status_code == 303
             assert here.get("/account").status_code == 200
             assert there.get("/account").status_code == 303
-            told = {"code": code(here), "old": "another", "new": "bob's password"}
+            told = {"code": code(here), "old": "another password", "new": "bob's password"}
             assert here.post("/account/password", data=told).status_code == 303
 
     def test_the_programming_interface_takes_no_cookie(self, server: str) -> None:
