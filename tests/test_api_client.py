@@ -147,7 +147,9 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
         done = CliRunner().invoke(app, [words[0], url, *words[1:], "-o", made])
         assert f"tupli-mcap filter {url} FILTER -o FILE" in " ".join(done.output.split()), done.output
     done = CliRunner().invoke(app, ["verify", url])
-    assert "is a server; fetch its recordings with tupli-mcap pull" in " ".join(done.output.split())
+    assert "is a server, not a recording → fetch its recordings with tupli-mcap pull" in " ".join(
+        done.output.split()
+    )
     failed = CliRunner().invoke(app, ["info", url, "--episodes", "9"])
     assert f"{url} has no episode '9'; see tupli-mcap episodes {url}" in failed.output
 

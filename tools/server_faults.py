@@ -4,8 +4,9 @@
 
 Three users store, fetch, publish and delete recordings and artifacts at the same time, through a proxy that refuses,
 resets, stalls, answers 503 and flips bits. At a random moment, the server is killed, its PostgreSQL crashes, or its
-bucket is cut off; a while later it is back. Every tenth kill hits a server that upgrades the tables of the first
-version. After each:
+bucket is cut off; a while later it is back. A bucket that is back resets some connections, and answers some with 503.
+(The bucket's stand-in keeps objects in memory, so a proxy before it goes away instead.) Every tenth kill hits a server
+that upgrades the tables of the first version. After each:
 
 - everything acknowledged is there, whole and exact, and nothing that was deleted;
 - a request without an answer has happened completely, or not at all, and not twice;
@@ -172,6 +173,8 @@ class Campaign:
             finally:
                 stop.set()
                 self._proxy.faults.clear()
+                if self.store is not None:
+                    self.store.faults.clear()
                 self._proxy.release()
         for each in at_work:
             each.result()
@@ -182,6 +185,9 @@ class Campaign:
         for _ in range(rng.choice((0, 0, 3, 8))):
             self._proxy.faults.append(Fault(rng.choice(_FAULTS), int(10 ** rng.uniform(1, 5.5))))
         time.sleep(rng.uniform(0.05, 0.8))
+        if victim == "bucket" and self.store is not None:
+            for _ in range(rng.choice((0, 4, 12))):  # once it is back
+                self.store.faults.append(Fault(rng.choice(("5xx", "reset")), int(10 ** rng.uniform(1, 5.5))))
         self.counts[victim] += 1
         getattr(self, f"_kill_{victim}")(rng.choice((0, rng.uniform(0, 0.5))))
         time.sleep(rng.uniform(0, 0.2))

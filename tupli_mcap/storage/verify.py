@@ -111,7 +111,7 @@ def _at_url(url: str) -> VerifyReport:
     try:
         if is_server(url):
             raise RecordingError(
-                f"{shown(url)} is a server; fetch its recordings with tupli-mcap pull, and verify them"
+                f"{shown(url)} is a server, not a recording; fetch its recordings with tupli-mcap pull, and verify them"
             )
         with copied(url) as path:
             report = _recording(path)
