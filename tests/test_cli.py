@@ -1286,10 +1286,13 @@ class TestProgram:
             assert max(map(len, lines)) <= width or args[0] == "info"
             assert len({len(line) for line in lines}) > 1 or (width == 60 and args[0].startswith("list-"))
 
-    def test_a_terminal_gets_a_progress_bar(self, here: Path) -> None:
+    @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
+    def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:
         pid, fd = pty.fork()
         if pid == 0:
-            os.execv(TOOL, [str(TOOL), "record", "CartPole-v1", "-o", "a.mcap", "--steps", "30000"])
+            environment = os.environ | ({"JPY_PARENT_PID": "1"} if in_notebook else {})
+            command = [str(TOOL), "record", "CartPole-v1", "-o", "a.mcap", "--steps", "30000"]
+            os.execve(TOOL, command, environment)
         seen = b""
         while select.select([fd], [], [], 30)[0]:
             try:
@@ -1301,8 +1304,8 @@ class TestProgram:
             seen += part
         os.close(fd)
         assert os.waitpid(pid, 0)[1] == 0
-        assert b"steps" in seen
-        assert b"/30000" in seen
+        assert (b"/30000" in seen) != in_notebook
+        assert (b"\x1b[" in seen) != in_notebook
         assert b"a.mcap: " in seen
 
 

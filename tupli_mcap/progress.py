@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
-__all__ = ["Progress", "alone", "progress"]
+__all__ = ["Progress", "alone", "can_redraw", "progress"]
 
 _PATIENCE = 1.0  # seconds without a bar
 _shown: list[object] = []  # the bar or other display that shows at the moment: at most one
@@ -106,7 +107,12 @@ def progress(total: int, what: str, *, in_bytes: bool = False) -> Iterator[Progr
         shown.close()
 
 
+def can_redraw() -> bool:
+    """Whether stderr is a terminal that can replace what it shows. That of a notebook's `!command` cannot."""
+    return sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
+
+
 def _visible() -> bool:
     # In a notebook, rich needs ipywidgets; without them it would print a warning instead of a bar.
     in_notebook = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
-    return in_notebook or sys.stderr.isatty()
+    return in_notebook or can_redraw()

@@ -150,9 +150,17 @@ def _skip(app: Sphinx, what: str, name: str, value: Any, skip: bool, options: An
     return True if plain and not isinstance(value, property) else None
 
 
+def _signature(
+    app: Sphinx, what: str, name: str, value: Any, options: Any, arguments: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """A default that a factory makes is `...`: Sphinx cannot parse `<factory>`."""
+    return arguments and arguments.replace("<factory>", "..."), returned
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("doctree-read", _name)
     app.connect("missing-reference", _resolve)
     app.connect("autodoc-skip-member", _skip)
+    app.connect("autodoc-process-signature", _signature)
     app.connect("autodoc-process-docstring", _as_rest, priority=100)  # before napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,4 +1,4 @@
-"""Tables of what filters, checks and extras are called, from the program itself."""
+"""Tables of the keys of filters, checks and extras, made from the program itself."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, facts
 
 ROOT = Path(__file__).parents[2]
 
-_ABOUT = {  # what a key's name does not say
+_ABOUT = {  # the meaning of each key
     "benchmark_id": "the benchmark it belongs to",
-    "created_by": "the user who recorded it, on a server",
-    "end": "`terminal`, `timeout`, `interrupted`, or empty where it is not known",
+    "created_by": "the user who stored it, on a server",
+    "end": "`terminal`, `timeout`, `interrupted`, or empty if not known",
     "ended": "when its last step returned; also `created_at`",
     "env": "number of the sub-environment, from 0",
     "episode": "its number in the recording, from 0",
-    "id": "never the same for two episodes",
-    "metadata": "what the callback, the recorder or an annotation said: `metadata.score`",
+    "id": "unique",
+    "metadata": "its metadata, with annotations applied: `metadata.score`",
     "published_in": "groups that may see it",
     "recording": "path of its file; in a storage, below the storage",
     "return": "sum of its rewards; also `episode_return`",
     "run": "see below",
-    "seed": "of its reset",
-    "steps": "how many it has; also `n_tuples`",
+    "seed": "seed of its reset",
+    "steps": "number of its steps; also `n_tuples`",
     "terminated": "its last step was terminal",
     "timeout": "its last step was a timeout",
     "environment": "Gymnasium id, or the class",
@@ -39,7 +39,7 @@ _ABOUT = {  # what a key's name does not say
 }
 _RUN = {
     "id": "the same in all files of a run",
-    "name": "given when it was recorded, else the file's",
+    "name": "the name given to the recorder, else the file's",
     "metadata": "settings: `run.metadata.lr`",
     "tags": 'a list: `"baseline" in run.tags`',
     "split": "`train`, `eval` or another word",
@@ -54,7 +54,7 @@ _RUN = {
 
 
 def filter_keys_of(model: Any) -> dict[str, tuple[str, str]]:
-    """Key -> its type, and what it is."""
+    """Key -> its type, and its meaning."""
     fields = model.model_fields
     return {
         key: (_kind(fields[facts.path_in(key, model)[0]].annotation), _ABOUT[key])

@@ -202,14 +202,14 @@ def confirmed(question: str) -> bool:
 
 @contextlib.contextmanager
 def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
-    """Shows a progress bar; yields a function that takes the number of steps done. None if stderr is no terminal."""
-    if not sys.stderr.isatty():
+    """Shows a progress bar; yields a function that takes the number of steps done, or None if it cannot show one."""
+    from tupli_mcap.progress import alone, can_redraw
+
+    if not can_redraw():
         yield None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from tupli_mcap.progress import alone
 
     shown = (BarColumn(), MofNCompleteColumn(), TextColumn("steps"), TimeRemainingColumn())
     columns = TextColumn(what), *shown
@@ -243,14 +243,14 @@ def fetch_progress() -> Iterator[None]:
 
 @contextlib.contextmanager
 def status(doing: str) -> Iterator[Callable[[str], None] | None]:
-    """Yields a function that shows what is being worked on; None if stderr is no terminal, or a bar is shown."""
-    if not sys.stderr.isatty() or _hide_bar is not None:
+    """Yields a function that shows what is being worked on, or None if it cannot, or a bar is shown."""
+    from tupli_mcap.progress import alone, can_redraw
+
+    if not can_redraw() or _hide_bar is not None:
         yield None
         return
     from rich.console import Console
     from rich.text import Text
-
-    from tupli_mcap.progress import alone
 
     with alone(), Console(stderr=True).status("") as shown:
         yield lambda name: shown.update(Text(visible(f"{doing} {name}"), overflow="ellipsis", no_wrap=True))
