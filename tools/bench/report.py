@@ -141,28 +141,28 @@ def machine(results: dict[str, Any]) -> str:
     )
 
 
-LEGEND = """▼ less is better, ▲ more is better; ⚡ somebody is faster than tupli-mcap, and how many times. Figures are \
-medians of rounds in alternation, ± half the range. What was recorded or read is compared with what was rolled out \
-before its time counts.
+LEGEND = """▼ less is better, ▲ more is better; ⚡2x is twice as good as tupli-mcap. Figures are medians over rounds \
+in which the contenders take turns, ± half the range. The time of a contender counts only if it recorded or read \
+exactly the steps of the rollout.
 
 | | |
 |---|---|
-| record | what a step costs over the same rollout without a recorder, closing included |
-| open, list | opening, and the length of each episode |
-| read all, one field | opening, and all columns, or the actions only |
-| episode, window | one at a random place of an open dataset that was read before |
-| epoch | a shuffled epoch of windows in PyTorch's `DataLoader`, its start included: 20,000 windows, fewer where they \
-are read one by one and slowly |
-| filter | opening, and the steps of the best 1 % of episodes |
-| append | adding about 1,000 steps to what is there (200 images) |"""
+| record | time of a step, without that of the rollout itself; closing included |
+| open, list | opening, and reading the length of each episode |
+| read all, one field | opening, and reading all columns, or only the actions |
+| episode, window | reading one at a random place of an open dataset that was read before |
+| epoch | a shuffled epoch of windows in PyTorch's `DataLoader`, its start included: 20,000 windows, fewer for \
+slow contenders that read them one by one |
+| filter | opening, and reading the best 1 % of episodes |
+| append | adding about 1,000 steps (200 images) to a dataset |"""
 
 
 VECTORS = (
-    "A vector environment (next-step autoreset) of four random floats and two actions, episodes of 1,000 steps: what "
-    "an env-step costs over the same rollout without a recorder, its bytes, and opening and reading all of them. By "
-    "hand, in `.npz` and in `.npy` a row is a vector step with a mask of who took it; nothing else tells episodes "
-    "apart. `mcap` and foxglove-sdk write a message an env-step. Minari's and PyTupli's recorders refuse a vector "
-    "environment; LeRobot and d3rlpy are given the steps of one episode at a time."
+    "A vector environment (next-step autoreset) of four random floats and two actions, with episodes of 1,000 steps: "
+    "the time of recording an env-step, its bytes, and opening and reading all of them. By hand, in `.npz` and in "
+    "`.npy`, a row is a vector step with a mask of the sub-environments that took it; nothing else separates "
+    "episodes. `mcap` and foxglove-sdk write a message per env-step. Minari's and PyTupli's recorders refuse a vector "
+    "environment; LeRobot and d3rlpy take the steps of one episode at a time."
 )
 
 
