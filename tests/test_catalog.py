@@ -215,8 +215,10 @@ class TestRecordings:
         assert "SEARCH episode USING INTEGER PRIMARY KEY" in catalog.explain(F("id") == "a-b-7")
 
 
-def put_in_order(found: Iterable[EpisodeHeader], key: str, descending: bool) -> list[EpisodeHeader]:
-    """Numbers, then texts, each in order; then what has neither, or cannot be looked into."""
+def put_in_order(
+    found: Iterable[EpisodeHeader], key: str, descending: bool, declared: bool
+) -> list[EpisodeHeader]:
+    """Numbers, then texts, each in order; then what has neither, or cannot be looked into without a declared key."""
     ordered = sorted(found, key=lambda header: (header.recording, header.episode))
 
     def value(header: EpisodeHeader) -> Any:
@@ -226,7 +228,7 @@ def put_in_order(found: Iterable[EpisodeHeader], key: str, descending: bool) -> 
         return getattr(header, names.get(key, key)) if key else 0
 
     numbers = [h for h in ordered if isinstance(value(h), int | float) and not math.isnan(value(h))]
-    texts = [h for h in ordered if isinstance(value(h), str) and "\x00" not in value(h)]
+    texts = [h for h in ordered if isinstance(value(h), str) and (declared or "\x00" not in value(h))]
     rest = [h for h in ordered if h not in numbers and h not in texts]
     return [*(h for part in (numbers, texts) for h in sorted(part, key=value, reverse=descending)), *rest]
 
@@ -260,12 +262,18 @@ class TestOrder:
             self.check_pages(mixed, wanted, key, descending)
 
     def check_pages(
-        self, mixed: Catalog | ServerCatalog, wanted: Any, key: str, descending: bool, limit: int = 7
+        self,
+        mixed: Catalog | ServerCatalog,
+        wanted: Any,
+        key: str,
+        descending: bool,
+        limit: int = 7,
+        declared: bool = False,
     ) -> None:
         sort = Sort(key, descending) if key else None
         with mixed._read() as connection:
             whole = [header.id for header in find_episodes(connection, wanted, sort=sort)]
-            expected = put_in_order(find_episodes(connection, wanted), key, descending)
+            expected = put_in_order(find_episodes(connection, wanted), key, descending, declared)
             assert whole == [header.id for header in expected]
             for backwards in (False, True):
                 after, paged = None, []
@@ -284,12 +292,19 @@ class TestOrder:
         self, mixed: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch, few: int
     ) -> None:
         """By an index that names few; through the next episodes; by several indexes; by nothing of the kind."""
-        for name, value in {"_FEW": few, "_NEAR": 9, "_MOST": 50, "_RECORDINGS": 1}.items():
+        for name, value in {
+            "_FEW": few,
+            "_FEW_TO_SORT": few,
+            "_NEAR": 9,
+            "_MOST": 50,
+            "_RECORDINGS": 1,
+        }.items():
             monkeypatch.setattr(pages, name, value)
         mixed.declare_key("metadata.score")
         score, time = F("metadata.score"), F("created_at")
         second = CREATED_NS // 1000 * 1000 + 10**9
         for wanted in (
+            None,
             (score > 0) & (F("steps") > 1),
             (score >= 0) & (score < 3.2) & (F("return") == 1),
             (score == "a") | (score == 3),
@@ -303,8 +318,8 @@ class TestOrder:
             F("run.name").isin(["run 1% b.mcap", "run"]) & (score == 3),
             F("run.name") == "run _% a.mcap",
         ):
-            for key, descending in (("", False), ("return", True)):
-                self.check_pages(mixed, wanted, key, descending)
+            for key, descending in (("", False), ("return", True), ("metadata.score", True)):
+                self.check_pages(mixed, wanted, key, descending, declared=True)
 
     def test_recordings_of_few_episodes_are_asked_about_together(
         self, any_catalog: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import shutil
 import socket
@@ -101,7 +102,9 @@ def configured(
 
 def _application(settings: Settings) -> FastAPI:
     logs.set_up()
-    return create_app(Library(settings))
+    app = create_app(Library(settings))
+    gc.freeze()  # modules and routes are no garbage: looking at them again and again takes long
+    return app
 
 
 def _bound(listening: Listening) -> socket.socket:

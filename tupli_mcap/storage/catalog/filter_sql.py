@@ -21,12 +21,12 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import (
     CompoundSelect,
     Select,
+    Subquery,
     and_,
     case,
     exists,
     false,
     func,
-    intersect,
     not_,
     or_,
     select,
@@ -59,16 +59,14 @@ __all__ = [
     "Condition",
     "Narrowed",
     "Source",
+    "in_all",
     "merged",
     "narrowed",
     "recordings_of",
     "sources",
-    "with_recording",
 ]
 
 Condition = ColumnElement[bool]
-Source = Select[Any] | CompoundSelect[Any]
-"""A query of ids of episodes."""
 
 # Most comparisons in a statement, and most values in each: databases limit both.
 _MOST_COMPARISONS: Final = 64
@@ -157,12 +155,40 @@ def recordings_of(filter: BaseFilter) -> Condition:
     return true()
 
 
-def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
-    """Queries of ids of episodes that an index answers; each finds all episodes that match the filter.
+class Source(NamedTuple):
+    """Episodes that an index leads to.
 
-    Queries of ranges sort by their index: otherwise a database that expects to find a few of many rows would search the
-    table.
+    Attributes:
+        row_id: the column of their ids.
+        all: conditions that hold for them.
+        either: one of these holds, too. A database uses an index for each of them, but not for one OR.
+        by: the columns of the index.
     """
+
+    row_id: ColumnElement[int]
+    all: Sequence[Condition]
+    either: Sequence[Condition]
+    by: Sequence[ColumnElement[Any]]
+
+    def first(self, most: int) -> Subquery:
+        """At most so many of their ids. Those of a range are sorted by its index: otherwise a database that expects to
+        find a few of many rows would search the table."""
+        if len(self.either) > 1:
+            return self._union().limit(most).subquery()
+        return select(self.row_id).where(*self.all, *self.either).order_by(*self.by).limit(most).subquery()
+
+    def _union(self) -> CompoundSelect[Any]:
+        return union_all(*(select(self.row_id).where(*self.all, one) for one in self.either))
+
+    def has(self, ids: Subquery) -> Condition:
+        """The condition that a row of ids is one of theirs."""
+        row_id = ids.c[0]
+        same = self.row_id == row_id, _recording(self.row_id) == _recording(row_id)
+        return exists().where(*same, *self.all, or_(*self.either)).correlate(ids)
+
+
+def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
+    """What an index finds for a filter; each has all episodes that match."""
     if filter.type is FilterType.AND:
         parts = [*_leaves(filter)]
     else:
@@ -177,31 +203,35 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
             facts.setdefault(path[0], []).append(_compared(part).condition)
         elif path in indexed:
             values.setdefault(indexed[path], []).append(_near_value(part))
-    of_facts = (
-        select(EPISODE.c.id).where(*conditions).order_by(EPISODE.c[name], EPISODE.c.id)
-        for name, conditions in facts.items()
-    )
-    return [*of_facts, *(_in_order(_ids_of(key, values[key])) for key in values)]
+    row_id = EPISODE.c.id
+    of_facts = (Source(row_id, found, [true()], (EPISODE.c[name], row_id)) for name, found in facts.items())
+    return [*of_facts, *(_of_values(key, values[key]) for key in values)]
 
 
-def with_recording(source: Source) -> Select[Any]:
-    """Ids of episodes, and of their recordings: PostgreSQL hashes ids alone so that many of them collide."""
-    row_id = source.subquery().c[0]
-    return select(row_id, row_id // (1 << EPISODE_BITS))
+def in_all(given: Sequence[Source]) -> Select[Any]:
+    """Ids of episodes that each source has, and of their recordings: PostgreSQL hashes ids alone so that many of them
+    collide."""
+    first, *others = sorted(given, key=_alternatives, reverse=True)
+    ids = first._union().subquery()
+    row_id = ids.c[0]
+    return select(row_id, _recording(row_id)).where(*(other.has(ids) for other in others))
 
 
-def _in_order(source: Source) -> Source:
-    by = (VALUE.c.number, VALUE.c.text, VALUE.c.episode_id)
-    return source.order_by(*by) if isinstance(source, Select) else source
+def _alternatives(source: Source) -> int:
+    """How many there are: of more than one, each is for one value, and an index has its ids in order."""
+    return len(source.either)
 
 
-def _ids_of(key: int, parts: Sequence[Sequence[Condition]]) -> Source:
-    """The ids of episodes whose `VALUE` at a key fulfils one of the alternatives of each part."""
+def _recording(row_id: ColumnElement[int]) -> ColumnElement[int]:
+    return row_id // (1 << EPISODE_BITS)
+
+
+def _of_values(key: int, parts: Sequence[Sequence[Condition]]) -> Source:
+    """The episodes whose `VALUE` at a key fulfils one of the alternatives of each part."""
     most = max(parts, key=len)
-    if len(most) == 1:
-        return select(VALUE.c.episode_id).where(VALUE.c.key == key, *(part[0] for part in parts))
-    each = (select(VALUE.c.episode_id).where(VALUE.c.key == key, either) for either in most)
-    return union_all(*each)  # a database uses an index for each of them, but not for one OR
+    others = [or_(*part) for part in parts if part is not most]
+    by = (VALUE.c.number, VALUE.c.text, VALUE.c.episode_id)
+    return Source(VALUE.c.episode_id, [VALUE.c.key == key, *others], most, by)
 
 
 def _leaves(filter: BaseFilter) -> Iterator[BaseFilter]:
@@ -257,9 +287,8 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
         parts.append(narrow)
     conditions = [part.condition for part in parts]
     if values:
-        held = [with_recording(_ids_of(key, values[key])) for key in values]
         both = tuple_(EPISODE.c.id, EPISODE.c.recording_id)
-        conditions.append(both.in_(held[0] if len(held) == 1 else intersect(*held)))
+        conditions.append(both.in_(in_all([_of_values(key, values[key]) for key in values])))
     return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))
 
 

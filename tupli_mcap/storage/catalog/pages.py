@@ -1,7 +1,8 @@
 """A page of episodes: the first in some order that a filter is true of, without a look at all others.
 
 1. Where an index names few episodes that may match, these are put in order and looked at one after another.
-2. Where it names many, or there is none, the next episodes in order are looked at: of many, some are among them.
+2. Where it names many, or there is none, the next episodes in order are looked at, if an index has that order: of many,
+   some are among them.
 3. If they are not, all that may match by all indexes are put in order, and looked at one after another.
 
 The statements of 1 and 2 leave a database one way to go: from columns that depend on each other, as `VALUE` has, it
@@ -10,14 +11,15 @@ cannot tell how many rows it will find.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, intersect, or_, select
+from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, or_, select, true
 
 from tupli_mcap.schema import BaseFilter
-from tupli_mcap.storage.catalog.filter_sql import Source, recordings_of, sources, with_recording
-from tupli_mcap.storage.catalog.order import After, Place, Sort, beyond, places
+from tupli_mcap.storage.catalog.filter_sql import Source, in_all, recordings_of, sources
+from tupli_mcap.storage.catalog.order import After, Range, Sort, beyond, has_index, ranges
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     EPISODE_BITS,
@@ -25,17 +27,19 @@ from tupli_mcap.storage.catalog.tables import (
     RECORDING,
     TALLY,
     episodes_of,
-    of_one_recording,
+    in_order,
 )
 from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["Asked", "candidates"]
 
 _FEW: Final = 20_000
+_FEW_TO_SORT: Final = 5_000  # by a value, which has to be fetched for each
 _MOST: Final = 200_000
 _NEAR: Final = 10_000
 _RECORDINGS: Final = 100  # at once
 _GROUP: Final = 500  # episodes that are worth a statement
+_FETCHED: Final = 500  # ids at once
 
 
 class Asked(NamedTuple):
@@ -57,73 +61,101 @@ class Asked(NamedTuple):
         """The recordings that may have such episodes."""
         return self.of if self.filter is None else and_(self.of, recordings_of(self.filter))
 
-    def order(self, *, few: bool, row_id: ColumnElement[int] = EPISODE.c.id) -> list[Place]:
-        """What decides on the places of episodes, see `places`."""
-        return places(self.sort, few=few, backwards=self.backwards, row_id=row_id)
+    def order(
+        self, connection: Connection, *, few: bool, row_id: ColumnElement[int] = EPISODE.c.id
+    ) -> list[Range]:
+        """The ranges in which episodes lie, from where the page begins; see `ranges`."""
+        found = ranges(self.sort, self.indexed, few=few, backwards=self.backwards, row_id=row_id)
+        return found if self.after is None else beyond(connection, found, self.sort, self.after)
 
 
 def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tuple[Iterable[int], int]]:
     """The ids of episodes, in order, among which the first `wanted` that match are likely to be; and how many ids these
     are at most: if they are fewer, all that match are among them. If those were not enough, others that start anew."""
     given = [] if asked.filter is None else sources(asked.filter, asked.indexed)
-    fewest = _fewest(connection, given)
+    near = wanted if asked.filter is None and asked.sort is None else max(wanted, _NEAR)
+    if asked.sort is None:
+        fewest = _fewest(connection, given, _FEW)
+    else:
+        fewest = _fewest(connection, [*given, _of_recordings(asked)], _FEW_TO_SORT)
     if fewest is not None:
         yield _ids(connection, asked, fewest, _FEW + 1), _FEW + 1
         return
-    near = wanted if asked.filter is None else max(wanted, _NEAR)
-    yield _next(connection, asked, near) if asked.sort is None else _ids(connection, asked, None, near), near
+    if asked.sort is None:
+        yield _next(connection, asked, near), near
+    elif has_index(asked.sort, asked.indexed):
+        yield _ids(connection, asked, None, near), near
     if given:
-        each = [with_recording(source.order_by(None)) for source in given]
-        common = each[0] if len(each) == 1 else intersect(*each)
-        yield _ids(connection, asked, common.subquery(), _MOST), _MOST
+        yield _ids(connection, asked, in_all(given).subquery(), _MOST), _MOST
 
 
-def _fewest(connection: Connection, given: Iterable[Source]) -> Subquery | None:
+def _fewest(connection: Connection, given: Iterable[Source], few: int) -> Subquery | None:
     """The source that has the fewest ids, if they are few."""
-    fewest, least = None, _FEW + 1
+    fewest, least = None, few + 1
     for source in given:
-        some = source.limit(_FEW + 1).subquery()
+        some = source.first(few + 1)
         count = connection.execute(select(func.count()).select_from(some)).scalar_one()
         if count < least:
             fewest, least = some, count
     return fewest
 
 
-def _ids(connection: Connection, asked: Asked, source: Subquery | None, most: int) -> list[int]:
-    """The ids of a source in order, or, without one, of all episodes; at most so many."""
-    query: Select[Any]
-    row_id: ColumnElement[int]
-    if source is None:
-        row_id, order = EPISODE.c.id, asked.order(few=False)
-        query = select(row_id).select_from(EPISODE.join(RECORDING, of_one_recording())).where(asked.only)
-    else:
-        row_id = source.c[0]
-        joined = source.join(RECORDING, RECORDING.c.id == row_id // (1 << EPISODE_BITS))
-        if asked.sort is not None:
-            joined, row_id = joined.join(EPISODE, EPISODE.c.id == row_id), EPISODE.c.id
-        order = asked.order(few=True, row_id=row_id)
-        query = select(row_id).select_from(joined)
-    query = query.where(asked.recordings())
-    if asked.after is not None:
-        query = query.where(beyond(connection, order, asked.after))
-    by = (value.desc() if descending else value for value, descending in order)
-    return list(connection.execute(query.order_by(*by).limit(most)).scalars())
+def _of_recordings(asked: Asked) -> Source:
+    """All episodes of the recordings that may have such."""
+    return Source(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
+
+
+def _ids(connection: Connection, asked: Asked, source: Subquery | None, most: int) -> Iterator[int]:
+    """The ids of a source in order, or, without one, of all episodes; at most so many, found as they are needed."""
+    parts = asked.order(
+        connection, few=source is not None, row_id=EPISODE.c.id if source is None else source.c[0]
+    )
+    for part in parts:
+        recording = part.row_id // (1 << EPISODE_BITS)
+        query: Select[Any] = select(part.row_id).select_from(
+            part.table.join(RECORDING, RECORDING.c.id == recording)
+        )
+        if source is not None:
+            joined = source.join(RECORDING, RECORDING.c.id == source.c[0] // (1 << EPISODE_BITS))
+            if asked.sort is not None:
+                joined = joined.join(part.table, part.row_id == source.c[0])
+            query = select(part.row_id).select_from(joined).where(asked.recordings())
+        query = query.where(part.having).order_by(*part.order).limit(most)
+        for row_id in _streamed(connection, query):
+            yield row_id
+            most -= 1
+        if most <= 0:
+            return
 
 
 def _next(connection: Connection, asked: Asked, most: int) -> Iterator[int]:
     """The ids of the next episodes in the order of their recordings, looked for as they are needed."""
-    sign = -1 if asked.backwards else 1
+    found: Iterable[int]
     for group in _groups(connection, asked):
         if most <= 0:
             return
         query = select(EPISODE.c.id).where(asked.only, or_(*(_part(asked, item) for item in group)))
         if len(group) == 1:  # of many, all are put in order below
             query = query.order_by(EPISODE.c.id.desc() if asked.backwards else EPISODE.c.id).limit(most)
-        places = {number: i for i, (number, _) in enumerate(group)}
-        found = connection.execute(query).scalars().all()
-        found = sorted(found, key=lambda row_id: (places[row_id >> EPISODE_BITS], sign * row_id))[:most]
+            found = _streamed(connection, query)
+        else:
+            found = _in_order(connection.execute(query).scalars(), group, asked.backwards)[:most]
+        for row_id in found:
+            yield row_id
+            most -= 1
+
+
+def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards: bool) -> list[int]:
+    """Ids in the order of recordings."""
+    places, sign = {number: i for i, (number, _) in enumerate(group)}, -1 if backwards else 1
+    return sorted(found, key=lambda row_id: (places[row_id >> EPISODE_BITS], sign * row_id))
+
+
+def _streamed(connection: Connection, query: Select[Any]) -> Iterator[int]:
+    """What a query of ids finds, fetched as it is needed."""
+    found = connection.execute(query, execution_options={"yield_per": _FETCHED}).scalars()
+    with contextlib.closing(found):
         yield from found
-        most -= len(found)
 
 
 def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:

@@ -16,6 +16,7 @@ from typing import Any, Final
 from sqlalchemy import (
     Connection,
     CursorResult,
+    FromClause,
     Select,
     Table,
     and_,
@@ -33,7 +34,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.filter_sql import Condition, Narrowed, merged, narrowed, recordings_of
-from tupli_mcap.storage.catalog.order import After, Sort, beyond
+from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.pages import Asked, candidates
 from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
@@ -76,6 +77,7 @@ _ROWS_AT_ONCE: Final = 20_000
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
 _FIRST_ROWS: Final = 100
 _ROWS_OF_ANSWER: Final = 500  # as many recordings are named in a statement at most
+_STREAMED: Final = {"yield_per": _ROWS_OF_ANSWER}
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
 
@@ -126,13 +128,14 @@ def find_episodes(
             the key to sort by is unknown.
         NotFoundError: The episode to go on after is gone.
     """
-    asked = _asked(connection, filter, only, of)._replace(sort=sort, after=after, backwards=backwards)
+    asked = _asked(connection, filter, only, of, sort)._replace(after=after, backwards=backwards)
     if limit is None:
         return _all_of_them(connection, asked, None, offset)
     wanted = offset + limit
-    if wanted <= (_MOST_NEAR if filter is not None else _ROWS_AT_ONCE):
+    in_file_order = filter is None and asked.sort is None
+    if wanted <= (_ROWS_AT_ONCE if in_file_order else _MOST_NEAR):
         for ids, most in candidates(connection, asked, wanted):
-            if filter is None:
+            if in_file_order:
                 return _looked_at(connection, asked, itertools.islice(ids, offset, None))
             counted = _Counted(ids)
             found = list(itertools.islice(_looked_at(connection, asked, counted), wanted))
@@ -166,7 +169,8 @@ def count_episodes(
     if found.exact:
         some = _query(asked, found, EPISODE.c.id).limit(most).subquery()
         return int(connection.execute(select(func.count()).select_from(some)).scalar_one())
-    return sum(1 for _ in itertools.islice(_all_of_them(connection, asked, None, 0), most))
+    rows = connection.execute(_query(asked, found, *_COLUMNS, *_OF_RECORDING), execution_options=_STREAMED)
+    return sum(1 for _ in itertools.islice(_in_pages(connection, asked, found, rows), most))
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
@@ -230,11 +234,15 @@ _OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.
 
 
 def _asked(
-    connection: Connection, filter: BaseFilter | None, only: Condition | None, of: Condition | None
+    connection: Connection,
+    filter: BaseFilter | None,
+    only: Condition | None,
+    of: Condition | None,
+    sort: Sort | None = None,
 ) -> Asked:
     meant = None if filter is None else merged(bound(filter, EpisodeHeader))
-    indexed = {} if filter is None else _indexed(connection)
-    return Asked(meant, indexed, true() if only is None else only, true() if of is None else of)
+    indexed = {} if filter is None and sort is None else _indexed(connection)
+    return Asked(meant, indexed, true() if only is None else only, true() if of is None else of, sort)
 
 
 def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
@@ -247,9 +255,11 @@ def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
     return found._replace(condition=and_(found.condition, recordings_of(asked.filter), also))
 
 
-def _query(asked: Asked, found: Narrowed, *columns: Any) -> Select[Any]:
-    of = of_one_recording() if asked.filter is not None else in_order()
-    return select(*columns).select_from(EPISODE.join(RECORDING, of)).where(found.condition)
+def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None = None) -> Select[Any]:
+    """rows: EPISODE and RECORDING, and maybe more."""
+    if rows is None:
+        rows = EPISODE.join(RECORDING, of_one_recording() if asked.filter is not None else in_order())
+    return select(*columns).select_from(rows).where(found.condition)
 
 
 class _Counted:
@@ -271,7 +281,11 @@ def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iter
     of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
     ids, size = iter(ids), _FIRST_ROWS
     while some := list(itertools.islice(ids, size)):
-        rows = connection.execute(of_them.where(EPISODE.c.id.in_(some), found.condition))
+        least, largest = min(some), max(some)
+        these = EPISODE.c.id.between(least, largest)
+        if largest - least >= 2 * len(some):
+            these = EPISODE.c.id.in_(some)
+        rows = connection.execute(of_them.where(these, found.condition))
         known = {row.id: row for row in rows}
         yield from _headers(connection, asked, found, [known[number] for number in some if number in known])
         size = _ROWS_OF_ANSWER
@@ -280,20 +294,27 @@ def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iter
 def _all_of_them(
     connection: Connection, asked: Asked, limit: int | None, offset: int
 ) -> Iterator[EpisodeHeader]:
-    """The matching episodes, all found by one statement."""
-    found, order = _narrowed(asked), asked.order(few=asked.filter is not None)
-    if asked.after is not None:
-        found = found._replace(condition=and_(found.condition, beyond(connection, order, asked.after)))
-    by = [value.desc() if descending else value for value, descending in order]
+    """The matching episodes, all found by one statement for each range of the order."""
+    found, parts = _narrowed(asked), asked.order(connection, few=asked.filter is not None)
+    skipped = offset if found.exact and len(parts) == 1 else 0  # by the database
+    first, last = offset - skipped, None if limit is None else min(offset - skipped + limit, sys.maxsize)
+
+    def queries(*columns: Any) -> Iterator[Select[Any]]:
+        for part in parts:
+            of = None if asked.sort is None else part.rows
+            query = _query(asked, found, *columns, rows=of).where(part.having).order_by(*part.order)
+            yield query.limit(last if found.exact else None).offset(skipped or None)
+
     if limit is not None and found.exact:  # a database puts ids in order quicker than whole rows
-        ids = _query(asked, found, EPISODE.c.id).order_by(*by).limit(limit).offset(offset or None)
-        return _looked_at(connection, asked, connection.execute(ids).scalars().all())
-    query = _query(asked, found, *_COLUMNS, *_OF_RECORDING).order_by(*by)
-    if found.exact:
-        query, offset = query.offset(offset or None), 0
-    rows = connection.execute(query, execution_options={"yield_per": _ROWS_OF_ANSWER})
-    headers = _in_pages(connection, asked, found, rows)
-    return itertools.islice(headers, offset, None if limit is None else min(offset + limit, sys.maxsize))
+        each = (connection.execute(query).scalars() for query in queries(EPISODE.c.id))
+        return _looked_at(
+            connection, asked, itertools.islice(itertools.chain.from_iterable(each), first, last)
+        )
+    rows = (
+        connection.execute(query, execution_options=_STREAMED) for query in queries(*_COLUMNS, *_OF_RECORDING)
+    )
+    headers = (_in_pages(connection, asked, found, each) for each in rows)
+    return itertools.islice(itertools.chain.from_iterable(headers), first, last)
 
 
 def _in_pages(
