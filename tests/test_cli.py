@@ -503,6 +503,25 @@ class TestLook:
         assert "/step           tupli_mcap/msg/Step" in out
         assert "benchmark.json" in out
 
+    def test_info_of_infos_and_seeds(self, here: Path) -> None:
+        def score(step: tupli_mcap.Step) -> dict[str, Any]:
+            return {"logp": -0.5, "step": float(step.state[0]), "name": "x"}
+
+        env = gym.make("CartPole-v1", max_episode_steps=5)
+        with RecordEpisodes(env, here / "i.mcap", step_callback=score) as recorded:
+            for seed in (1, 2, 2):
+                recorded.reset(seed=seed)
+                while not any(recorded.step(0)[2:4]):
+                    pass
+        out = ok("info", "i.mcap")
+        assert re.search(r"^seeds +2 different$", out, re.M) and re.search(
+            r"^infos +logp, name, step$", out, re.M
+        )
+        assert re.search(r"^info\.logp .* -0\.500 +-0\.500$", out, re.M) and "info.step" in out
+        assert "info.name" not in out
+        facts = json.loads(ok("info", "i.mcap", "--json", "--episodes", "1,2"))["result"]
+        assert (facts["info_keys"], facts["seeds"]) == (["logp", "name", "step"], 1)
+
     def test_info_as_json(self, cartpole: Path, here: Path) -> None:
         told = run("info", cartpole, "--json").json
         with Recording(cartpole) as recording:

@@ -178,8 +178,8 @@ restore-server: restore-server backup again
 logout: logout
 """
 EMPTY = {
-    "attachments_lost[]", "ends_lost[]", "final_states_lost[]", "foreign[]", "imports.gaps[]", "left_over[]", "notes[]",
-    "options[]", "skipped[]", "starts_lost[]",
+    "attachments_lost[]", "ends_lost[]", "final_states_lost[]", "foreign[]", "imports.gaps[]", "info_keys[]",
+    "left_over[]", "notes[]", "options[]", "skipped[]", "starts_lost[]",
 }  # fmt: skip
 """Lists in which nothing is here."""
 

@@ -117,10 +117,11 @@ def info(
     """Show what is in a recording, a directory or a server.
 
     For a recording: its run, spaces, benchmark, returns and lengths of episodes,
-    distributions of rewards, actions and states, channels and attachments. Distributions of
-    a long recording come from a sample of its steps; for a URL, they are left out. For a
-    directory: its runs, environments, episodes and metadata keys. --episodes and --filter
-    choose episodes; channels, attachments and size are those of the whole file.
+    distributions of rewards, actions, states and infos, channels and attachments.
+    Distributions and keys of infos of a long recording come from a sample of its steps; for
+    a URL, they are left out. For a directory: its runs, environments, episodes and metadata
+    keys. --episodes and --filter choose episodes; channels, attachments and size are those
+    of the whole file.
     """
     import numpy as np
 
@@ -193,7 +194,9 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
         *([] if d.made_of is None else [("made of", _made_of_text(d.made_of))]),
         *([] if d.success is None else [("success", f"{d.success:.0%} of the episodes that say it")]),
+        *([("seeds", f"{number(d.seeds)} different")] if d.seeds else []),
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
+        *([("infos", _some(d.info_keys))] if d.info_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
 

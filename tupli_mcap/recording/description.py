@@ -22,6 +22,7 @@ from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.made_of import made_of
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.series import sampled_infos
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
@@ -66,6 +67,8 @@ class RecordingDescription:
         runs: `name` and number of `episodes` of each run.
         made_of: the recordings it was made of; None if it was recorded.
         metadata_keys: keys of the episodes' metadata.
+        info_keys: keys of the infos of its steps; of a long recording, of a sample.
+        seeds: number of different seeds of its episodes.
         success: see `success_rate`.
         ends: number of episodes by how they ended.
         observation, action: their spaces in lines for people, see `space_lines`; empty without a step.
@@ -87,6 +90,8 @@ class RecordingDescription:
     runs: list[dict[str, Any]]
     made_of: dict[str, Any] | None
     metadata_keys: list[str]
+    info_keys: list[str]
+    seeds: int
     success: float | None
     num_envs: int
     episodes: int
@@ -116,7 +121,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
     """
     positions = np.arange(len(recording.index)) if positions is None else positions
     rows, run = recording.index[positions], recording.readable_runs[0]
-    contents = recording.file.contents
+    contents, seeds = recording.file.contents, recording.seeds
     table = contents.table
     chunks = table[table["offset"] < IN_MEMORY]
     stored = int(chunks["length"].sum())
@@ -138,6 +143,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         runs=_runs(recording, positions),
         made_of=made_of(recording),
         metadata_keys=_metadata_keys(recording, positions),
+        info_keys=_info_keys(recording, positions),
+        seeds=len({seeds[i] for i in positions.tolist()} - {None}),
         success=success_rate(recording, positions),
         num_envs=recording.num_envs,
         episodes=len(rows),
@@ -185,6 +192,12 @@ def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
     for text in texts:
         found.update(dict.fromkeys(jsonvalue.loads(text)))
     return sorted(found)
+
+
+def _info_keys(recording: Recording, positions: Array) -> list[str]:
+    with contextlib.suppress(FormatError):  # `verify` names damage; the other facts are known all the same
+        return sorted({key for info in sampled_infos(recording, positions) for key in info})
+    return []
 
 
 def success_rate(recording: Recording, positions: Array) -> float | None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
+from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
@@ -22,7 +24,7 @@ READ_BYTES = 4 << 20
 _PLACES, _AT_EACH = 16, 256
 _VARIABLE_PLACES, _VARIABLE_AT_EACH = 8, 32  # steps of variable size are decoded one by one
 _FIELDS = ("states", "actions", "rewards")
-_MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS = 2, 12, 6
+_MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS, _MOST_INFOS = 2, 12, 6, 6
 
 
 class Series(NamedTuple):
@@ -76,6 +78,7 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
         return Sketch(courses, (), 0, 0)
     try:
         pieces = list(_pieces(recording, positions))
+        infos = sampled_infos(recording, positions)
     except TupliError as err:  # a damaged chunk must not hide the other series
         return Sketch(courses, (), 0, 0, str(err))
     layout = recording.layout
@@ -89,7 +92,35 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
         for series in itertools.islice(_distributions(recording, leaves, field, pieces, points), most)
     )
     dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind != "variable" and not leaf.apart)
-    return Sketch(courses, shown, sum(len(piece) for piece in pieces), dimensions - len(shown))
+    hidden = dimensions - len(shown)
+    shown += tuple(itertools.islice(_of_infos(infos, points), _MOST_INFOS))
+    return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden)
+
+
+def sampled_infos(recording: Recording, positions: Array) -> list[dict[str, Any]]:
+    """Infos of steps of these episodes: all, or of a long recording some at even distances; none of a URL."""
+    file = recording.file
+    channel = file.topics.get(INFO)
+    total = 0 if channel is None or recording.path is None else file.store.count(channel)
+    if channel is None or not total:
+        return []
+    table = file.contents.table
+    size = int(table["uncompressed"][table["channel"] == channel].sum())
+    each = max(1, min(_AT_EACH, READ_BYTES * total // max(1, size) // _PLACES))
+    places, each = (1, total) if total <= _PLACES * each else (_PLACES, each)
+    codec = InfoCodec.from_metadata(file.contents.channels[channel].metadata)
+    wanted = set(recording.index["episode"][positions].tolist())
+    starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
+    bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)
+    return [info for episode, _, info in map(codec.decode, bodies) if episode in wanted]
+
+
+def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[Series]:
+    """The distribution of each number of infos."""
+    for key in dict.fromkeys(key for info in infos for key in info):
+        found = [info[key] for info in infos if key in info]
+        if all(isinstance(value, int | float | np.number | np.bool_) for value in found):
+            yield _distribution(None, f"info.{key}", np.array(found, np.float64), points)
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:
@@ -149,14 +180,14 @@ def _distributions(
             yield _distribution(leaf, name, flat[:, i].astype(np.float64), points)
 
 
-def _distribution(leaf: Leaf, name: str, values: Array, points: int) -> Series:
+def _distribution(leaf: Leaf | None, name: str, values: Array, points: int) -> Series:
     known = np.isfinite(values)
     odd = int((~known).sum())
     values = values[known]
     if not len(values):
         return Series(name, (), np.nan, np.nan, odd)
     least, most = float(values.min()), float(values.max())
-    if isinstance(leaf.space, spaces.Discrete):  # values that never occur are shown, too
+    if leaf is not None and isinstance(leaf.space, spaces.Discrete):  # values that never occur are shown, too
         least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
     bins, end = points, most
     if (
