@@ -948,7 +948,7 @@ def test_foxgloves_port_is_taken(tmp_path: Path, capfd: pytest.CaptureFixture[st
             roll(env, 100)
     (told,) = said(capfd, [])
     assert f"live={live!r} cannot show the rollout" in told
-    assert told.endswith("it is recorded all the same")
+    assert told.endswith("the recording goes on")
     assert_exact(path, 100)
 
 

@@ -294,7 +294,7 @@ class TestEdits:
         assert "ppo" in command("edit", str(path), "--undo")
         again = Recording(path).run
         assert (again.name, again.metadata, again.started) == ("ppo", {"lr": 1}, run.started)
-        with pytest.raises(RecordingError, match="nothing was edited"):
+        with pytest.raises(RecordingError, match="there is no edit to undo"):
             undo_edit(path)
         assert CliRunner().invoke(app, ["edit", str(path), "--undo", "--name", "x"]).exit_code == 2
         for edit in range(30):

@@ -259,7 +259,7 @@ def test_nothing_is_published_in_a_group_that_is_not_there_or_not_known(users: U
             lambda group=group: users.ann.publish_artifact(things.artifact, group),
             lambda group=group: users.ann.publish_episode(things.episodes[0].id, group),
         ):
-            with pytest.raises(StorageError, match=f"{group}. Either it is not there, or you are not in it"):
+            with pytest.raises(StorageError, match=f"{group}. It does not exist, or you are not in it"):
                 publish()
     users.ann.publish_benchmark(things.benchmark, "bob")  # a user's own group
     assert [header.id for header in users.bob.list_benchmarks()] == [things.benchmark]

@@ -164,7 +164,7 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
         with pytest.raises(
-            StorageError, match="ann may keep 20000 bytes, uses 15000, and these are 9000 more"
+            StorageError, match="ann may store 20000 bytes, uses 15000, and cannot store 9000 more"
         ):
             ann.store_artifact(b"y" * 9000, ArtifactMetadata(name="y"))
         assert begin(ann, b"z" * 5000).status_code == 201
@@ -180,7 +180,7 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         benchmark = ann.store_benchmark(query()).id
         ann.record_episodes([episode(benchmark)])
         used = ann._session.ask("GET", "/v1/me")["used"]
-        with pytest.raises(StorageError, match=f"may keep 60000 bytes, uses {used}"):
+        with pytest.raises(StorageError, match=f"may store 60000 bytes, uses {used}"):
             ann.store_artifact(b"y" * 60_000, ArtifactMetadata(name="y"))
         ann.delete_episodes(F("steps") > 0)
         ann.delete_benchmark(benchmark)

@@ -488,7 +488,7 @@ def test_a_file_that_others_read_otherwise_does_not_fit(
     assert name in ("summary", "twice") or seen(tmp_path / "forged.mcap") != honest
     with Recording(bundle) as original, Recording(tmp_path / "forged.mcap") as forged:
         assert str(forged.read().rewards) == str(original.read().rewards)
-    expected = f"other readers may see something else in it than was signed: .*{message}"
+    expected = f"other readers may see other data than what was signed: .*{message}"
     with pytest.raises(SignatureError, match=expected):
         verified(tmp_path / "forged.mcap")
     with pytest.raises(SignatureError, match=expected):
@@ -499,7 +499,7 @@ def test_a_file_that_others_read_otherwise_does_not_fit(
 
 def test_a_signed_recording_is_not_appended_to(bundle: Path) -> None:
     before = bundle.read_bytes()
-    with pytest.raises(RecordingError, match="is signed, and would be another recording"):
+    with pytest.raises(RecordingError, match="is signed, and appending would make"):
         RecordEpisodes(gym.wrappers.TimeLimit(Counter(2.0), 4), bundle, mode="a")
     assert bundle.read_bytes() == before
 

@@ -118,7 +118,7 @@ class TestASecondWriter:
         roll(env, 5)
         path.unlink()
         with pytest.warns(
-            RuntimeWarning, match=r"r\.mcap was deleted while it is recorded, and nothing"
+            RuntimeWarning, match=r"r\.mcap was deleted while it is being recorded, and nothing"
         ) as told:
             env.flush()
             env.close()

@@ -32,7 +32,7 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
     """
     if size > len(data) * MAX_RATIO.get(name, size):
         raise FormatError(
-            f"{where}: {len(data)} compressed bytes cannot hold the {size} that they are said to"
+            f"{where}: {len(data)} compressed bytes cannot hold the {size} bytes that the file declares"
         )
     try:
         if name == "zstd":

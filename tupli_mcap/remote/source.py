@@ -258,7 +258,7 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
     except NoRangesError:
         warnings.warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
-            "a server that answers range requests saves that",
+            "a server that supports range requests avoids this",
             stacklevel=2,
         )
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it

@@ -182,7 +182,7 @@ class Sampler:
         weights = state["weights"]
         if (self._tree is None) != (weights is None):
             raise SamplingError(
-                "expected a state of a sampler with weights if this one has some, and without if not"
+                f"expected the state of a sampler {'without' if self._tree is None else 'with'} weights, as this one is"
             )
         if self._tree is not None:
             if not isinstance(weights, bytes) or len(weights) % 8:

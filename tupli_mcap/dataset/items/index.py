@@ -60,7 +60,7 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     if gone.any():
         raise NotFoundError(
             f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is missing or shorter: "
-            "the file was changed afterwards; open it again, or list the episodes anew with load()"
+            "the file was changed afterwards; open it again, or list the episodes again with load()"
         )
     return positions
 

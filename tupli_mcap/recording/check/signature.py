@@ -149,8 +149,8 @@ def check_readers(recording: Recording, covered: Container[str], walk: Structure
     ]
     if wrong:
         raise SignatureError(
-            f"{recording.name}: other readers may see something else in it than was signed: {wrong[0]}; "
-            "ask its signer for another copy, or write it anew with tupli-mcap bundle"
+            f"{recording.name}: other readers may see other data than what was signed: {wrong[0]}; "
+            "ask its signer for another copy, or write it again with tupli-mcap bundle"
         )
 
 

@@ -128,7 +128,7 @@ def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
     with _changing(path, dry_run) as (recording, say):
         said, before = _only_run(path, recording)
         if not before:
-            raise RecordingError(f"{path}: nothing was edited that could be taken back")
+            raise RecordingError(f"{path}: there is no edit to undo")
         was = before[-1]
         run = replace(said, name=was.name, metadata=was.metadata, tags=was.tags, split=was.split)
         say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run], before=before[:-1]).to_json())

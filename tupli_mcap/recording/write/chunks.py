@@ -129,7 +129,7 @@ class ChunkWriter:
         if self._lock.is_deleted and not self._told_deleted:
             self._told_deleted = True
             warnings.warn(
-                f"{self._path} was deleted while it is recorded, and nothing of it will be left; "
+                f"{self._path} was deleted while it is being recorded, and nothing of it will remain; "
                 "record to another file",
                 RuntimeWarning,
                 stacklevel=2,

@@ -54,8 +54,7 @@ def resume(writer: RecordingWriter) -> None:
             )
         if SIGNATURE_NAME in contents.attachments:
             raise RecordingError(
-                f"{writer.path} is signed, and would be another recording than the one that was signed; record to "
-                "another file"
+                f"{writer.path} is signed, and appending would make its signature invalid; record to another file"
             )
         _check_nothing_behind(writer, contents, source)
         _check_aligned(writer, contents)

@@ -114,8 +114,8 @@ def demand_audience(connection: Connection, caller: Caller, right: Right, group:
         names = [select(name).where(name == group) for right, name in known.items() if caller.may(right)]
         if not any(connection.execute(query).first() for query in names):
             raise DeniedError(
-                f"Insufficient permissions in group: {group:.100}. Either it is not there, or you are not in it; "
-                "`tupli-mcap list-groups` names those that you may know of"
+                f"Insufficient permissions in group: {group:.100}. It does not exist, or you are not in it; "
+                "`tupli-mcap list-groups` lists the groups that you may see"
             )
     caller.demand(right, group)
 

@@ -53,6 +53,6 @@ def demand_room(connection: Connection, settings: Settings, caller: Caller, size
     used = used_by(connection, caller.name)
     if used + size > allowed:
         raise FullError(
-            f"{caller.name} may keep {allowed} bytes, uses {used}, and these are {size} more; delete what you do not "
-            "need, or ask who runs the server for more"
+            f"{caller.name} may store {allowed} bytes, uses {used}, and cannot store {size} more; delete something, "
+            "or ask the server's admin for a larger quota"
         )

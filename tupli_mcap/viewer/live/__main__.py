@@ -118,7 +118,7 @@ def main() -> None:
     try:
         view = _view_of(parse_target(live), title)
     except (OSError, RuntimeError, TupliError) as err:  # for example, the port is taken
-        _say(f"live={live!r} cannot show the rollout ({err}); it is recorded all the same")
+        _say(f"live={live!r} cannot show the rollout ({err}); the recording goes on")
         return
     try:
         _run(view, _Files())

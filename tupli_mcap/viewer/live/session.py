@@ -71,8 +71,6 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
             start_new_session=True,  # Ctrl-C reaches the recorder only
         )
     except OSError as err:
-        warnings.warn(
-            f"live={live!r} cannot show the rollout ({err}); it is recorded all the same", stacklevel=4
-        )
+        warnings.warn(f"live={live!r} cannot show the rollout ({err}); the recording goes on", stacklevel=4)
         return None
     return LiveSession(process, writer)
