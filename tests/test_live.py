@@ -24,6 +24,7 @@ from typing import Any
 import aiohttp
 import gymnasium as gym
 import numpy as np
+import psutil
 import pytest
 from environments import Sampler
 from gymnasium import spaces
@@ -76,6 +77,16 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "_FAREWELL", 120.0)
 
 
+def used(pid: int) -> float:
+    """The processor time of a process and its children, in seconds; 0 if it is gone."""
+    try:
+        process = psutil.Process(pid)
+        every = [one.cpu_times() for one in (process, *process.children(recursive=True))]
+    except psutil.NoSuchProcess:
+        return 0.0
+    return sum(times.user + times.system for times in every)
+
+
 @contextlib.contextmanager
 def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Rerun's own receiver, without a window: what it is sent goes to a file."""
@@ -85,9 +96,9 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         wait_for(lambda: answers(port))
         yield process
-        size = -1
-        while out.exists() and size != (size := out.stat().st_size):  # something is on its way
-            time.sleep(1)
+        before = None
+        while out.exists() and before != (before := (out.stat().st_size, used(process.pid))):
+            time.sleep(1)  # something is on its way, or the receiver is at work with it
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
