@@ -768,6 +768,7 @@ with Catalog(path) as catalog:
 
 
 class TestSharing:
+    @pytest.mark.sampled(0)
     def test_several_processes(self, tmp_path: Path) -> None:
         path = tmp_path / "catalog.sqlite"
         path.write_bytes(b"garbage, which all of them find")

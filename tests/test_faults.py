@@ -41,6 +41,7 @@ def sampler(space: gym.Space[Any] = BOX) -> gym.Env[Any, Any]:
     return Sampler(space, spaces.Discrete(3), length=5)
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("name", WORKLOADS)
 def test_the_kth_call_of_a_rollout_fails(tmp_path: Path, name: str) -> None:
     calls = calls_of(name, tmp_path / "whole")
@@ -130,6 +131,7 @@ def test_a_journal_that_cannot_be_read_is_not_passed_over(tmp_path: Path) -> Non
     live.close()
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", ["growing", "append", "append-text", "journal-elsewhere"])
 def test_what_cannot_be_asked_about_a_file_leaves_nothing_open(tmp_path: Path, name: str) -> None:
     calls = run_case(name, tmp_path / "whole", Case(-1, errno.EIO, False)).calls

@@ -615,6 +615,7 @@ class TestFileStorage(StorageContract):
         storage.declare_key("metadata.score")
         assert "USING COVERING INDEX ix_value" in storage.explain(F("metadata.score") > 3)
 
+    @pytest.mark.sampled(0)
     def test_several_processes_at_once(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         context = multiprocessing.get_context("spawn")
