@@ -20,6 +20,7 @@ from tupli_mcap.errors import RecordingError, SpaceError
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import png_leaves
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO, Topics, parse
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.described import MADE_OF_NAME
@@ -183,6 +184,8 @@ def check_mergeable(
     """The excerpts with episodes, in the order of their times, and the attachments. Raises as `merge_excerpts` does."""
     sources = sorted((e for e in excerpts if len(e.rows)), key=lambda e: int(e.rows["start_time"].min()))
     _check_alike(sources, without)
+    if "infos" not in without:
+        _check_infos(sources)
     return sources, _attachments([source.recording for source in sources])
 
 
@@ -321,6 +324,26 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
                 raise UnmergeableError(
                     f"{other.name} holds episode {number} of {before.name} again; leave one out"
                 )
+
+
+def _check_infos(sources: Sequence[Excerpt]) -> None:
+    """Raises UnmergeableError if the infos of two recordings have different fields: one channel holds them all."""
+    first: tuple[str, list[str]] | None = None
+    for recording, _ in sources:
+        channel = recording.file.topics.get(INFO)
+        if channel is None:
+            continue
+        named = InfoCodec.from_metadata(recording.file.contents.channels[channel].metadata).names
+        first = first or (recording.name, named)
+        if named != first[1]:
+            raise UnmergeableError(
+                f"{recording.name}: expected infos recorded as in {first[0]}, {_recorded_as(first[1])}, found "
+                f"{_recorded_as(named)}; only recordings with the same record_info can be merged"
+            )
+
+
+def _recorded_as(names: Sequence[str]) -> str:
+    return f"record_info={list(names)!r:.200}" if names else "without names (record_info=True or a function)"
 
 
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
