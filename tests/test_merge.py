@@ -425,7 +425,11 @@ class TestMerge:
                 SpaceError,
                 r"t\.mcap: expected the observation_space of .*1\.mcap, Box.*, found Dict",
             ),
-            ([one, named], RecordingError, "expected infos recorded as in .*without names .*found record_info="),
+            (
+                [one, named],
+                RecordingError,
+                "expected infos recorded as in .*without names .*found record_info=",
+            ),
             ([one, benchmark], RecordingError, "expected a recording of benchmark none"),
             ([one, one], RecordingError, r"1\.mcap holds episode 0 of .*1\.mcap again"),
             (one, RecordingError, "expected a list of recordings to merge, found PosixPath"),
