@@ -394,9 +394,9 @@ class TestEnumeration:
         taken: dict[str, list[float]] = {"ann": [], "nobody": []}
         for _ in range(7):
             for name, seconds in taken.items():
-                begun = time.perf_counter()
+                begun = time.process_time()  # of the server, which runs in this process, too
                 answer = httpx.post(f"{lab.url}/v1/tokens", json={"username": name, "password": "wrong"})
-                seconds.append(time.perf_counter() - begun)
+                seconds.append(time.process_time() - begun)
                 assert answer.status_code == 401
         there, not_there = (min(seconds) for seconds in taken.values())
         assert 0.5 < there / not_there < 2, statistics.median(taken["ann"])
