@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
@@ -55,7 +55,8 @@ class Columns(GymnasiumNames):
     def __repr__(self) -> str:
         columns = [(field, getattr(self, field)) for field in FIELDS]
         told = [f"{field}: {_described(column)}" for field, column in columns if column is not None]
-        return f"<Columns of {len(self)} steps of {len(self.episode_lengths)} episodes: {'; '.join(told)}>"
+        counts = f"{plural(len(self), 'step')} of {plural(len(self.episode_lengths), 'episode')}"
+        return f"<Columns of {counts}: {'; '.join(told)}>"
 
 
 def _described(column: Any) -> str:

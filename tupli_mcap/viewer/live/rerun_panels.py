@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.errors import plural
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.recording.description import nan_text, spread_of
 from tupli_mcap.viewer.blueprints import blueprint_of
@@ -128,7 +129,9 @@ class LivePanels:
                 odd = nan_text(spread.nan, len(self._returns))
                 text = f"mean return {spread.mean:.4g}{f' ({odd})' if odd else ''}"
                 text = f"return {odd}" if spread.nan == len(self._returns) else text
-                lines.append(f"{follower.episodes:,} episodes; the last {len(self._returns):,}: {text}")
+                lines.append(
+                    f"{plural(follower.episodes, 'episode')}; the last {len(self._returns):,}: {text}"
+                )
             if self._successes:
                 share = f"{np.mean(self._successes):.0%} of the last {len(self._successes):,} that say it"
                 lines += ["", f"success {share}"]
