@@ -154,6 +154,7 @@ def main() -> None:
                 some = np.sort(np.random.default_rng(seed).choice(len(recording), count, replace=False))
                 cost(f"{count} random episodes", lambda some=some: recording.read(some))
             forget()
+            tupli_mcap.open(path)  # imports what datasets need, which is no cost of reading
             windows = cost("dataset of windows", lambda: tupli_mcap.open(url).windows(16))
             cost(
                 "256 random windows of 16",
