@@ -154,6 +154,23 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     assert f"{url} has no episode '9'; see tupli-mcap episodes {url}" in failed.output
 
 
+def test_a_token_that_expires_during_a_push_is_renewed(admin: TupliAPIClient, tmp_path: Path) -> None:
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap") as env:
+        env.reset(seed=0)
+        while not env.step(0)[2]:
+            pass
+    tokens, expired = admin._session.tokens, []
+
+    def tell(_: int) -> None:  # the upload has begun, and its bytes were not sent yet
+        if not expired:
+            expired.append(True)
+            tokens.put(admin.url, "admin", {**tokens.tokens(admin.url), "access_token": "of yesterday"})
+
+    with admin.open_recording(admin.push(tmp_path / "run.mcap", tell)) as recording:
+        assert len(recording) == 1 and expired
+    assert tokens.tokens(admin.url)["access_token"] != "of yesterday"
+
+
 def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     names = []

@@ -7,7 +7,9 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -153,6 +155,39 @@ def test_lists_come_in_pages(tmp_path: Path) -> None:
         assert page({"cursor": "3", "limit": 2}) == ([3, 4], "5")
         assert page({"cursor": "6", "limit": 1000}) == ([6], None)
         assert page({"offset": 2, "limit": 0}) == ([], None)
+
+
+# --- the disk ---
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 4 MiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = shutil.which("mount")
+    options = ["-t", "tmpfs", "-o", "size=4m", "none", place]
+    if mount is None or subprocess.run([mount, *options], capture_output=True).returncode:
+        pytest.skip("mounting is not allowed here, so there is no small disk")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+
+
+def test_an_upload_that_fills_the_disk_is_deleted(small_disk: Path, tmp_path: Path) -> None:
+    """Else it would keep the disk full for everybody until it expires."""
+    large = tmp_path / "large.mcap"
+    large.write_bytes(os.urandom(8 << 20))
+    with server_with(small_disk) as admin:
+        benchmark = admin.store_benchmark(query()).id
+        with pytest.raises(
+            StorageError, match=r"^the server's disk is full; send it again when there is room \("
+        ):
+            admin.push(large)
+        assert [path.stat().st_size for path in (small_disk / "server/uploads").iterdir()] == [0]
+        admin.record_episodes([episode(benchmark)])
+        assert len(admin.list_episodes()) == 1
 
 
 # --- users ---

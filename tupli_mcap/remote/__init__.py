@@ -9,6 +9,7 @@ patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
 names:    recognises URLs, and removes secrets from them.
 """
 
+from tupli_mcap.remote.failures import why
 from tupli_mcap.remote.names import is_server, is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
@@ -28,4 +29,5 @@ __all__ = [
     "open_url",
     "shown",
     "watching",
+    "why",
 ]

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.names import shown
 
-__all__ = ["SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked"]
+__all__ = ["SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked", "why"]
 
 SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
 _T = TypeVar("_T")
@@ -70,14 +70,16 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
             raise RecordingError(
                 f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
             ) from None
-        raise BrokenOffError(f"{shown(url)} cannot be read: {_why(str(err))}") from None
+        raise BrokenOffError(f"{shown(url)} cannot be read: {why(str(err))}") from None
 
 
-def _why(told: str) -> str:
-    """Why a request failed, and what to do, from an error's text with its debug text."""
+def why(told: str) -> str:
+    """Why a request failed, and what to do, from the text of obstore's error."""
     said = told.partition("\n")[0]
     if status := _STATUS.search(said):
-        return f"its server answers {status[1]}; {_AGAIN}"
+        denied = status[1][:3] in ("401", "403")
+        advice = "check the credentials in the environment, and their rights" if denied else _AGAIN
+        return f"its server answers {status[1]}; {advice}"
     for sign, cause, advice in _CAUSES:
         if sign in told:
             where = _ASKED.search(said)

@@ -14,7 +14,7 @@ from typing import Final, Protocol
 
 from tupli_mcap import files
 from tupli_mcap.errors import StorageError
-from tupli_mcap.remote import open_store, shown
+from tupli_mcap.remote import open_store, shown, why
 from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.storage.atomic import os_errors
 
@@ -183,5 +183,4 @@ class BucketBlobs:
         except (NotFoundError, FileNotFoundError) as err:
             raise LostError(f"the server has lost {name}; restore it from a backup") from err
         except (BaseError, OSError, ValueError) as err:
-            said = shown(str(err).partition("\n")[0])
-            raise UnavailableError(f"{shown(self.place(name))} cannot be used: {said:.300}") from err
+            raise UnavailableError(f"{shown(self.place(name))} cannot be used: {why(str(err))}") from err

@@ -7,6 +7,7 @@ upload; it holds a lock on the file meanwhile.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -20,6 +21,7 @@ from sqlalchemy import Connection, Row, delete, func, insert, select
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.people.quotas import FullError
 from tupli_mcap.server.tables import UPLOAD
 from tupli_mcap.storage.atomic import os_errors
 
@@ -83,11 +85,21 @@ class Incoming:
         self._hash = hashlib.sha256() if self.offset == 0 else None
 
     def write(self, data: bytes | bytearray) -> None:
-        """Appends bytes."""
+        """Appends bytes.
+
+        Raises:
+            FullError: the disk is full. All bytes of the upload are deleted: they would keep it full for everybody.
+        """
         left = memoryview(data)
         with os_errors("cannot write", self.upload.path):
-            while left:
-                left = left[self._file.write(left) :]
+            try:
+                while left:
+                    left = left[self._file.write(left) :]
+            except OSError as err:
+                if err.errno not in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                self._file.truncate(0)
+                raise FullError("the server's disk is full; send it again when there is room") from err
         self.offset += len(data)
         if self._hash is not None:
             self._hash.update(data)

@@ -13,7 +13,7 @@ __all__ = ["FullError", "demand_room", "quota_of", "set_quota", "used_by"]
 
 
 class FullError(StorageError):
-    """A user's quota is used up."""
+    """A user's quota is used up, or the server's disk is full."""
 
 
 def used_by(connection: Connection, user: str) -> int:

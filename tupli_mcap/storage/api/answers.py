@@ -27,6 +27,7 @@ __all__ = [
 
 LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
+_LATER: Final = "try again later"
 _ANEW: Final = (410, 460)  # an upload that expired or got wrong bytes: begin it again
 _NO_ROUTE: Final = ("Not Found", "Method Not Allowed")  # as Starlette says it
 _WHICH: Final = "is it a tupli-mcap server, of a version like this one?"
@@ -89,7 +90,7 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
     if status == 401 and sign_in:
         return SignInError(f"{message}; {sign_in}")
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
-        return UnreachableError(f"{message}; try again later")
+        return UnreachableError(message if _LATER in detail else f"{message}; {_LATER}")
     if status == 409:
         return ConflictError(message)
     kind = getattr(errors, name, StorageError) if name in errors.__all__ else StorageError

@@ -180,7 +180,8 @@ class Session:
     ) -> httpx.Response:
         """Sends a request, and repeats it if the connection fails and it may be repeated. Raises refusals as errors.
 
-        stream: the caller reads the body and closes the answer; redirections are followed.
+        stream: the caller reads the body and closes the answer; redirections are followed. content: bytes, or a
+            function that returns them in pieces, each time from the beginning.
         """
         token = "" if anonymous else self._token()
         options |= {"headers": headers or {}, "stream": stream}
@@ -233,6 +234,8 @@ class Session:
     def _answered(self, method: str, path: str, stream: bool, **options: Any) -> httpx.Response:
         """The answer to a request. Follows the redirection of a GET to a bucket, without sending the token there."""
         client = self.client
+        if callable(options.get("content")):
+            options["content"] = options["content"]()
         response = client.send(client.build_request(method, path, **options), stream=stream)
         for _ in range(_MOST_REDIRECTIONS):
             further = response.next_request

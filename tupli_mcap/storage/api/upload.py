@@ -7,6 +7,7 @@ import base64
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
@@ -47,6 +48,8 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
 
     def pieces(offset: int) -> Iterator[bytes]:
         nonlocal shown
+        tell(offset - shown)
+        shown = offset
         with path.open("rb") as file:
             file.seek(offset)
             while piece := file.read(_PIECE):
@@ -66,7 +69,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
             done = session.send(
                 "PATCH",
                 _path(begun.get("Location", "")),
-                content=pieces(offset),
+                content=partial(pieces, offset),
                 headers={
                     **_TUS,
                     "Upload-Offset": str(offset),
