@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
+from sqlalchemy import event
 
 from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageError
@@ -320,6 +321,31 @@ class TestOrder:
         ):
             for key, descending in (("", False), ("return", True), ("metadata.score", True)):
                 self.check_pages(mixed, wanted, key, descending, declared=True)
+
+    @pytest.mark.parametrize(
+        ("key", "index"),
+        [
+            ("return", "ix_episode_episode_return"),
+            ("steps", "ix_episode_n_tuples"),
+            ("metadata.score", "ix_value"),
+        ],
+    )
+    def test_a_sorted_page_walks_an_index(
+        self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch, key: str, index: str
+    ) -> None:
+        monkeypatch.setattr(pages, "_FEW_TO_SORT", 0)
+        put(catalog, "a.mcap", [row(i, {"score": i}, episode_return=float(i)) for i in range(500)])
+        catalog.declare_key("metadata.score")
+        with catalog._read() as connection:
+            asked: list[tuple[str, Any]] = []
+            event.listen(connection, "before_cursor_execute", lambda *told: asked.append(told[2:4]))
+            assert next(find_episodes(connection, None, sort=Sort(key, True), limit=1)).n_tuples > 0
+            plans = [
+                " ".join(step[-1] for step in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {sql}", values))
+                for sql, values in list(asked)
+                if "ORDER BY" in sql
+            ]
+        assert any(index in plan and "FOR ORDER BY" not in plan for plan in plans), plans
 
     def test_recordings_of_few_episodes_are_asked_about_together(
         self, any_catalog: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch

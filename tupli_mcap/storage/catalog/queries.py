@@ -282,7 +282,7 @@ def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iter
     ids, size = iter(ids), _FIRST_ROWS
     while some := list(itertools.islice(ids, size)):
         least, largest = min(some), max(some)
-        these = EPISODE.c.id.between(least, largest)
+        these = EPISODE.c.id.between(least, largest)  # cheaper to ask for; it may name some more
         if largest - least >= 2 * len(some):
             these = EPISODE.c.id.in_(some)
         rows = connection.execute(of_them.where(these, found.condition))
