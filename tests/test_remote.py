@@ -224,6 +224,10 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
     }.items():
         with pytest.raises(RecordingError, match=f"x?.mcap cannot be read: {said}"):
             Recording(url)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", server.url(""))
+    server.failures = [403] * 20
+    with pytest.raises(RecordingError, match="lab cannot be read: .* 403 Forbidden; check the credentials"):
+        matching("s3://lab/*.mcap")
 
 
 def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:
