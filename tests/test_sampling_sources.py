@@ -326,7 +326,7 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
     (lambda d: d.transitions(0), f"expected a number of steps {COUNT} 1, found 0"),
     (lambda d: d.transitions(1, 1.5), "expected a discount from 0 to 1, found 1.5"),
     (lambda d: d.transitions(1, float("nan")), "expected a discount from 0 to 1, found nan"),
-    (lambda d: d.transitions(fields=["times"]), f"{FIELD} 'times'"),
+    (lambda d: d.transitions(fields=["speeds"]), f"{FIELD} 'speeds'"),
     (lambda d: d.delta_windows({}), "expected deltas such as .*, found {}"),
     (lambda d: d.delta_windows({"speed": [0]}), "expected deltas of state, .*, found 'speed'"),
     (lambda d: d.delta_windows({"state": []}), r"expected numbers, at least one, .* 'state', found \[\]"),
