@@ -187,6 +187,19 @@ def test_other_files_get_one_clear_error(path: Path) -> None:
         Recording(path)
 
 
+def test_a_damaged_attachment_is_found(path: Path) -> None:
+    with RecordEpisodes(
+        gym.make("CartPole-v1"), path, attachments={"note": ("text/plain", b"as it was")}
+    ) as env:
+        env.reset()
+        env.step(0)
+    data = path.read_bytes()
+    assert data.count(b"as it was") == 1
+    path.write_bytes(data.replace(b"as it was", b"as it is!"))
+    with Recording(path) as recording, pytest.raises(FormatError, match="'note' at offset .* is damaged"):
+        recording.read_attachment("note")
+
+
 def test_a_flipped_bit_is_found(path: Path) -> None:
     record(path)
     data = path.read_bytes()
