@@ -56,7 +56,7 @@ class Sort(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self | None:
-        """`-return` is a falling order; None for an empty text."""
+        """Parses a key; `-return` is a descending order. None for an empty text."""
         return cls(text.removeprefix("-"), text.startswith("-")) if text else None
 
 

@@ -43,10 +43,10 @@ _FETCHED: Final = 500  # ids at once
 
 
 class Asked(NamedTuple):
-    """What is asked: which episodes, and in which order.
+    """A query: which episodes, and in which order.
 
-    filter: bound to headers of episodes. indexed: see `filter_sql.narrowed`. only, of: conditions that hold besides the
-    filter: on rows of EPISODE, and on rows of RECORDING alone. after: where the page begins.
+    filter: bound to headers of episodes. indexed: see `filter_sql.narrowed`. only, of: further conditions, on rows of
+    EPISODE, and on rows of RECORDING alone. after: where the page begins.
     """
 
     filter: BaseFilter | None
