@@ -1,21 +1,14 @@
 """Turns filters into SQL that finds all rows which may match, with the columns and indexes there are.
 
-A database may compare values differently from Python: numbers in metadata are compared as the nearest floats, texts
-that SQL and Python may order differently are not compared. So each comparison becomes a condition that is true for
-all matching rows, and that says whether it is exact: true for no others. Python checks the rows that an inexact
-condition finds again (`tupli_mcap.schema.predicate`), so that a filter means the same everywhere.
+Python checks the rows that an inexact condition finds again (`tupli_mcap.schema.predicate`), so that a filter means the
+same everywhere.
 
 Everything is SQL of any database, but looking into metadata without a declared key is not: see `metadata_sql`.
 """
 
 from __future__ import annotations
 
-import json
-import math
-import operator
-import re
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import (
@@ -23,10 +16,8 @@ from sqlalchemy import (
     Select,
     Subquery,
     and_,
-    case,
     exists,
     false,
-    func,
     not_,
     or_,
     select,
@@ -36,90 +27,29 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.elements import ColumnElement
 
-from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.schema import BaseFilter, FilterIN, FilterType
 from tupli_mcap.schema.facts import comparisons
-from tupli_mcap.schema.filters import COMBINING, ORDERING, path_of
-from tupli_mcap.schema.predicate import scalar_test
-from tupli_mcap.schema.values import Scalar, classify, small_letters
-from tupli_mcap.storage.catalog.metadata_sql import kind_at, text_at, value_at
-from tupli_mcap.storage.catalog.rows import indexed_text, nearest_float
+from tupli_mcap.schema.filters import COMBINING, path_of
+from tupli_mcap.storage.catalog.compare_sql import (
+    ALL,
+    Condition,
+    Narrowed,
+    compared,
+    near_value,
+    of_runs,
+    recorded,
+)
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     EPISODE_BITS,
     INDEXED_FACTS,
-    RECORDING,
-    TALLY,
     VALUE,
-    first_of,
 )
-from tupli_mcap.storage.texts import escape_text
 
-__all__ = [
-    "Condition",
-    "Narrowed",
-    "Source",
-    "in_all",
-    "merged",
-    "narrowed",
-    "recordings_of",
-    "sources",
-]
+__all__ = ["Source", "in_all", "merged", "narrowed", "recordings_of", "sources"]
 
-Condition = ColumnElement[bool]
-
-# Most comparisons in a statement, and most values in each: databases limit both.
-_MOST_COMPARISONS: Final = 64
-_MOST_VALUES: Final = 250
-
-_PLAIN: Final = re.compile(r"[ !#-.0-\[\]-~]{0,1000}")  # printable ASCII without " \ and /
-_SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
-# SQLite reads a decimal number to within a few units in the last place.
-_READ_WITHIN: Final = 1e-12
-_SMALLEST: Final = 1e-300
-_LARGEST: Final = sys.float_info.max
-_LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
-
-_LONGEST_PATTERN: Final = 1000  # databases have limits
+_MOST_COMPARISONS: Final = 64  # in a statement: databases limit them
 _NOT_INDEXED: Final = (FilterType.NE, FilterType.CONTAINS)
-
-_EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
-_OPERATORS: Final[Mapping[FilterType, Callable[[Any, Any], Any]]] = {
-    FilterType.EQ: operator.eq,
-    FilterType.NE: operator.ne,
-    FilterType.GT: operator.gt,
-    FilterType.GEQ: operator.ge,
-    FilterType.LT: operator.lt,
-    FilterType.LEQ: operator.le,
-}
-_TEXTS: Final = {
-    "created_by": EPISODE.c.created_by,
-    "benchmark_id": RECORDING.c.benchmark_id,
-    "recording": RECORDING.c.path,
-}
-_INTEGERS: Final = {name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode")}
-_NUMBERS: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
-_CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
-    "end": {Scalar("text", end): EPISODE.c.end == end for end in END_NAMES},
-    "terminated": {
-        Scalar("bool", True): EPISODE.c.end == "terminal",
-        Scalar("bool", False): EPISODE.c.end != "terminal",
-    },
-    "timeout": {
-        Scalar("bool", True): EPISODE.c.end == "timeout",
-        Scalar("bool", False): EPISODE.c.end != "timeout",
-    },
-}
-
-
-class Narrowed(NamedTuple):
-    """A condition that is true for all rows that match a filter; if `exact`, for no others."""
-
-    condition: Condition
-    exact: bool
-
-
-_ALL: Final = Narrowed(true(), exact=False)
 
 
 def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
@@ -147,11 +77,11 @@ def recordings_of(filter: BaseFilter) -> Condition:
         return true()
     path = path_of(filter)
     if path[0] in ("recording", "benchmark_id"):
-        return _compared(filter).condition
+        return compared(filter).condition
     if path == ("created_at",):
-        return _recorded(filter)
+        return recorded(filter)
     if path == ("run", "name") and filter.type in (FilterType.EQ, FilterType.IN):
-        return _of_runs(filter)
+        return of_runs(filter)
     return true()
 
 
@@ -200,9 +130,9 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
         if part.type in _NOT_INDEXED:
             continue
         if path[0] in INDEXED_FACTS:
-            facts.setdefault(path[0], []).append(_compared(part).condition)
+            facts.setdefault(path[0], []).append(compared(part).condition)
         elif path in indexed:
-            values.setdefault(indexed[path], []).append(_near_value(part))
+            values.setdefault(indexed[path], []).append(near_value(part))
     row_id = EPISODE.c.id
     of_facts = (Source(row_id, found, [true()], (EPISODE.c[name], row_id)) for name, found in facts.items())
     return [*of_facts, *(_of_values(key, values[key]) for key in values)]
@@ -278,12 +208,12 @@ def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], 
         if part.type in COMBINING:
             parts.append(_narrow(part, indexed, negated))
             continue
-        path, narrow = path_of(part), _compared(part)
+        path, narrow = path_of(part), compared(part)
         if negated:
-            narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else _ALL
+            narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else ALL
         elif path in indexed and part.type not in _NOT_INDEXED and not few:
-            values.setdefault(indexed[path], []).append(_near_value(part))
-            narrow = _ALL if path[0] == "metadata" else narrow
+            values.setdefault(indexed[path], []).append(near_value(part))
+            narrow = ALL if path[0] == "metadata" else narrow
         parts.append(narrow)
     conditions = [part.condition for part in parts]
     if values:
@@ -296,193 +226,3 @@ def _names_few(filter: BaseFilter) -> bool:
     """Whether a filter names episodes or recordings: checking each is quicker than finding others by a value."""
     is_equal = filter.type in (FilterType.EQ, FilterType.IN)
     return is_equal and path_of(filter)[0] in ("id", "recording")
-
-
-def _compared(filter: BaseFilter) -> Narrowed:
-    """A comparison by the columns of the two tables."""
-    name = path_of(filter)[0]
-    if name in _CHOICES:
-        test = scalar_test(filter)
-        chosen = (condition for choice, condition in _CHOICES[name].items() if test(choice))
-        return Narrowed(or_(false(), *chosen), exact=True)
-    if name in _TEXTS:
-        return _of_texts(filter, _TEXTS[name])
-    if name in _INTEGERS:
-        return _of_integers(filter, _INTEGERS[name])
-    if name == "id":
-        return _of_ids(filter)
-    if name == "published_in":
-        return _of_groups(filter)
-    if filter.type is FilterType.NE or name == "run":  # few runs have many episodes
-        return _ALL
-    if name in _NUMBERS:
-        return Narrowed(_near(filter, _NUMBERS[name]), exact=False)
-    return Narrowed(_in_metadata(filter), exact=False)
-
-
-def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
-    if filter.type is FilterType.IN:
-        return _one_of(column, [escape_text(value) for value in filter.value])
-    if filter.type is FilterType.CONTAINS:
-        return Narrowed(_occurs(filter.value, column), exact=False)
-    return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)), exact=True)
-
-
-def _occurs(wanted: str, column: ColumnElement[Any]) -> Condition:
-    """The condition that a text occurs in a column, as far as SQL can tell; `lower` handles at least A to Z."""
-    if not wanted.isprintable() or len(wanted) > _LONGEST_PATTERN:
-        return column.is_not(None)
-    return func.lower(column).contains(small_letters(wanted), autoescape=True)
-
-
-def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
-    """A comparison of 64-bit integers with a number of any size; it may have a fraction only if it is an order."""
-    if filter.type is FilterType.IN:
-        return _one_of(column, [int(v) for v in filter.value if _LEAST_INTEGER <= v <= _MOST_INTEGER])
-    kind, wanted = filter.type, filter.value
-    if not _LEAST_INTEGER <= wanted <= _MOST_INTEGER:
-        below = wanted < 0
-        of_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
-        return Narrowed(true() if of_all or kind is FilterType.NE else false(), exact=True)
-    rounded = math.ceil if kind in (FilterType.GEQ, FilterType.LT) else math.floor
-    return Narrowed(_OPERATORS[kind](column, rounded(wanted)), exact=True)
-
-
-def _one_of(column: ColumnElement[Any], values: Sequence[Any]) -> Narrowed:
-    return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
-
-
-def _recorded(filter: BaseFilter) -> Condition:
-    """Recordings of the time that a filter names."""
-    parts = []
-    if filter.type in (FilterType.GT, FilterType.GEQ, FilterType.EQ):
-        parts.append(_of_integers(filter.model_copy(update={"type": FilterType.GEQ}), TALLY.c.last).condition)
-    if filter.type in (FilterType.LT, FilterType.LEQ, FilterType.EQ):
-        parts.append(
-            _of_integers(filter.model_copy(update={"type": FilterType.LEQ}), TALLY.c.first).condition
-        )
-    return exists().where(TALLY.c.recording_id == RECORDING.c.id, *parts) if parts else true()
-
-
-def _of_runs(filter: BaseFilter) -> Condition:
-    """Recordings whose runs, which are JSON, hold a text that is the same in all JSON."""
-    texts = filter.value if filter.type is FilterType.IN else [filter.value]
-    if len(texts) > _MOST_VALUES or not all(
-        isinstance(text, str) and _PLAIN.fullmatch(text) for text in texts
-    ):
-        return true()
-    return or_(false(), *(RECORDING.c.runs.contains(f'"{text}"', autoescape=True) for text in texts))
-
-
-def _near(filter: BaseFilter, number: ColumnElement[Any]) -> Condition:
-    """A comparison, other than NE, with what is stored as the nearest float."""
-    numbers, _ = _wanted(filter)
-    if filter.type in ORDERING:
-        return _ordered(filter, number, numbers)
-    null = any(value is None for value in (filter.value if filter.type is FilterType.IN else [filter.value]))
-    return or_(_any_of(number, numbers), number.is_(None) if null else false())
-
-
-def _near_value(filter: BaseFilter) -> list[Condition]:
-    """A comparison, other than NE, with what `VALUE` holds, where one of several conditions has to be true: an index
-    leads to each of them, but not to all in one OR."""
-    number, text = VALUE.c.number, VALUE.c.text
-    numbers, texts = _wanted(filter)
-    if filter.type in ORDERING:
-        return [_ordered(filter, number, numbers) if numbers else _ordered(filter, text, texts)]
-    conditions = [and_(number.is_(None), text.is_(None))]  # null, a list, ...
-    conditions += [_any_of(number, numbers)] if numbers else []
-    conditions += [and_(number.is_(None), _any_of(text, texts))] if texts else []
-    return conditions
-
-
-def _wanted(filter: BaseFilter) -> tuple[list[float], list[str]]:
-    """The values that are compared, as they are stored: the nearest floats, and the beginnings of texts."""
-    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
-    numbers = [nearest_float(scalar.value) for scalar in wanted if scalar.kind in ("number", "bool")]
-    return numbers, [indexed_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
-
-
-def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[Any]) -> Condition:
-    if not wanted:
-        return false()
-    rising = filter.type in (FilterType.GT, FilterType.GEQ)
-    condition: Condition = column >= wanted[0] if rising else column <= wanted[0]
-    return condition
-
-
-def _in_metadata(filter: BaseFilter) -> Condition:
-    """A comparison, other than NE, with a value that SQL finds in metadata."""
-    path = path_of(filter)[1:]
-    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
-    texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
-    ordered_texts = filter.type in ORDERING and texts
-    if ordered_texts or not all(map(_SEARCHABLE.fullmatch, path)) or not all(map(str.isprintable, texts)):
-        return true()
-    if len(wanted) > _MOST_VALUES:
-        return true()
-    value, parts = (
-        value_at(path),
-        [EPISODE.c.metadata.contains('"$', autoescape=True)],
-    )  # tags stand for other values
-    for scalar in wanted:
-        if filter.type is FilterType.CONTAINS:
-            parts.append(_occurs(scalar.value, text_at(path)))
-        elif scalar.kind == "text":
-            parts.append(value == scalar.value)
-        elif scalar.kind == "null":
-            parts.append(kind_at(path) == "null")
-        elif scalar.kind == "bool":
-            parts.append(value == scalar.value)
-        elif scalar.kind != "nan":
-            parts.append(_number_in_metadata(filter.type, value, nearest_float(scalar.value)))
-    if filter.type not in ORDERING:
-        parts.append(kind_at(path) == "array")  # an element may be equal
-    return case((EPISODE.c.readable, or_(*parts)), else_=true())
-
-
-def _number_in_metadata(kind: FilterType, value: ColumnElement[Any], near: float) -> Condition:
-    room = 0.0 if math.isinf(near) else abs(near) * _READ_WITHIN + _SMALLEST
-    low, high = (min(max(bound, -_LARGEST), _LARGEST) for bound in (near - room, near + room))
-    parts: list[Condition] = [value.is_not(None)]
-    if kind not in (FilterType.LT, FilterType.LEQ) and near > -math.inf:
-        parts.append(value >= low)
-    if kind not in (FilterType.GT, FilterType.GEQ) and near < math.inf:
-        parts.append(value <= high)
-    return and_(*parts)
-
-
-def _of_groups(filter: BaseFilter) -> Narrowed:
-    """A comparison with groups; the column has a list of them in JSON."""
-    if filter.type not in (FilterType.EQ, FilterType.IN):
-        return _ALL
-    groups = filter.value if filter.type is FilterType.IN else [filter.value]
-    if len(groups) > _MOST_VALUES:
-        return _ALL
-    held = (EPISODE.c.published_in.contains(json.dumps(group), autoescape=True) for group in groups)
-    return Narrowed(or_(false(), *held), exact=False)
-
-
-def _of_ids(filter: BaseFilter) -> Narrowed:
-    """A comparison with ids of episodes: their recording's uuid, a hyphen and their number."""
-    if filter.type not in (FilterType.EQ, FilterType.NE, FilterType.IN):
-        return _ALL
-    texts = filter.value if filter.type is FilterType.IN else [filter.value]
-    parts = [text.rpartition("-") for text in texts]
-    ids = [(escape_text(uuid), int(number)) for uuid, _, number in parts if _EPISODE_NUMBER.fullmatch(number)]
-    if len(ids) > _MOST_VALUES:
-        return Narrowed(_any_of(RECORDING.c.uuid, [uuid for uuid, _ in ids]), exact=False)
-    if not ids:
-        return Narrowed(false() if filter.type is not FilterType.NE else true(), exact=True)
-    named = RECORDING.alias("named")
-    first = first_of(named.c.id)
-    rows = union_all(*(select(first + number).where(named.c.uuid == uuid) for uuid, number in ids))
-    found = EPISODE.c.id.in_(rows)
-    return Narrowed(not_(found) if filter.type is FilterType.NE else found, exact=True)
-
-
-def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:
-    """The condition that a column holds one of the values; for many values, anything between them."""
-    if len(values) <= _MOST_VALUES:
-        return column.in_(values) if values else false()
-    return column.between(min(values), max(values))

@@ -6,8 +6,9 @@ Use it only on metadata that are `readable`: PostgreSQL raises an error for othe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import JSON, Dialect, Float, Text, literal
 from sqlalchemy.dialects.postgresql import JSONB
@@ -18,7 +19,14 @@ from sqlalchemy.types import NullType, TypeDecorator, TypeEngine
 
 from tupli_mcap.storage.catalog.tables import EPISODE, TEXT
 
-__all__ = ["kind_at", "number_at", "text_at", "value_at"]
+__all__ = ["can_search", "kind_at", "number_at", "text_at", "value_at"]
+
+_SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
+
+
+def can_search(path: Sequence[str]) -> bool:
+    """Whether SQL can look for a path of metadata."""
+    return all(map(_SEARCHABLE.fullmatch, path))
 
 
 class _Scalar(TypeDecorator[Any]):
@@ -30,7 +38,7 @@ class _Scalar(TypeDecorator[Any]):
 
 
 class _At(FunctionElement[Any]):
-    """Something at a path, whose segments are printable ASCII without quotes and backslashes."""
+    """Something at a path that `can_search` allows."""
 
     def __init__(self, path: Sequence[str]) -> None:
         for_sqlite = "$" + "".join(f'."{segment}"' for segment in path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple, Self
 
@@ -11,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, FromClause, and_, case, exists
 from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.schema import EpisodeHeader, join_key
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.catalog.metadata_sql import number_at, text_at
+from tupli_mcap.storage.catalog.metadata_sql import can_search, number_at, text_at
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     INDEXED_FACTS,
@@ -33,7 +32,6 @@ _FACTS: Final = {
 }
 _OF_RECORDING: Final = {"recording": RECORDING.c.path, "benchmark_id": RECORDING.c.benchmark_id}
 _MAYBE: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
-_SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 
 
 class After(NamedTuple):
@@ -181,7 +179,7 @@ def _of_key(sort: Sort, indexed: Mapping[tuple[str, ...], int]) -> list[Range]:
             _of_column(column, column.is_not(None), falling),
             Range(EPISODE, column.is_(None), _by_recording()),
         ]
-    if name != "metadata" or not inside or not all(map(_SEARCHABLE.fullmatch, inside)):
+    if name != "metadata" or not inside or not can_search(inside):
         raise FilterError(
             f"cannot sort by {join_key([name, *inside])!r}; sort by return, steps, ended, end, seed, env, episode, "
             "recording, or a key of the metadata such as metadata.score"

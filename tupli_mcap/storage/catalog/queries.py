@@ -33,7 +33,8 @@ from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
-from tupli_mcap.storage.catalog.filter_sql import Condition, Narrowed, merged, narrowed, recordings_of
+from tupli_mcap.storage.catalog.compare_sql import Condition, Narrowed
+from tupli_mcap.storage.catalog.filter_sql import merged, narrowed, recordings_of
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.pages import Asked, candidates
 from tupli_mcap.storage.catalog.rows import (
