@@ -123,6 +123,14 @@ class TestAReplacedRecording:
         assert numbers(storage) == [0, 1, 2]
         assert not sidecar_path(run).exists()
 
+    def test_what_was_compacted_away_is_not_published(self, storage: FileStorage, run: Path) -> None:
+        (old, *_) = storage.list_episodes()
+        delete(storage, old.episode)
+        storage.compact()
+        with pytest.raises(NotFoundError, match="was deleted by somebody else meanwhile"):
+            storage._recordings.publish(old, "lab")
+        assert not Sidecar.read(run).published_in
+
     def test_is_told_by_verify(self, storage: FileStorage, run: Path) -> None:
         delete(storage, 0)
         (report,) = verify_storage(storage).files

@@ -132,6 +132,8 @@ class RecordingFiles:
             sidecar = Notes.read(path, self._root).about(metadata_at(path))
             if sidecar.uuid != _uuid(header):
                 raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
+            if header.episode not in self._left(path):  # compacted since the catalog was read
+                raise NotFoundError(f"episode {header.id} was deleted by somebody else meanwhile")
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
             sidecar.write(path)  # the next query notices
