@@ -153,11 +153,11 @@ def ls(
 
 def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]:
     """The recordings of one source."""
-    from tupli_mcap.storage.listing import list_recordings, recordings_of
+    from tupli_mcap.storage.listing import list_recordings, listed_of
 
     if is_server(source):
         with any_storage(source) as storage:
-            yield from recordings_of(storage.list_episodes(wanted))
+            yield from listed_of(storage.list_episodes(wanted))
         return
     choose = None
     if wanted is not None:
@@ -173,11 +173,12 @@ def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
     """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has."""
     from tupli_mcap.storage.listing import recordings_at
 
-    if is_server(sources[0]):
-        len(dataset_of(sources[:1]).filter(wanted))
-    files = [str(file) for source in sources if not is_server(source) for file in recordings_at(source)]
-    if files:
-        len(dataset_of(files).filter(wanted))
+    if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
+        return
+    is_one = is_server(sources[0])
+    found = sources if is_one else [str(file) for source in sources for file in recordings_at(source)]
+    if found:
+        len(dataset_of(found).filter(wanted))
 
 
 def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:

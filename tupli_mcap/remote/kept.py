@@ -58,8 +58,8 @@ class KeptBlocks:
         """The ranges of bytes that are kept."""
         found = []
         with contextlib.suppress(OSError):
-            for name in os.listdir(self._folder):  # noqa: PTH208 - names only
-                first, _, last = name.partition("-")
+            for path in self._folder.iterdir():
+                first, _, last = path.name.partition("-")
                 if first.isdecimal() and last.isdecimal():
                     found.append((int(first), int(last)))
         return found

@@ -34,8 +34,8 @@ __all__ = [
     "find_recordings",
     "is_storage",
     "list_recordings",
+    "listed_of",
     "recordings_at",
-    "recordings_of",
     "scan",
     "stamp_of",
     "with_tuples",
@@ -217,7 +217,7 @@ def recordings_at(source: Path | str) -> Sequence[Path | str]:
     return matching(source) if isinstance(source, str) and is_url(source) else find_recordings(Path(source))
 
 
-def recordings_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
+def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
     """The recordings that episodes of a storage are in, as far as their headers tell; size and state are unknown."""
     by_recording: dict[str, list[EpisodeHeader]] = {}
     for header in headers:
