@@ -236,6 +236,7 @@ def test_a_registered_class_is_noted_by_its_name(tmp_path: Path) -> None:
             in CliRunner().invoke(app, ["trust", "--show", str(tmp_path / "r.mcap")]).output
         )
         gym.registry["tests/Class-v0"].entry_point = EzRobot
+        trust.untrust(record.digest)
         with pytest.raises(
             UntrustedError,
             match="the entry point .*:Robot' of 'tests/Class-v0', registered here as .*EzRobot",
@@ -385,6 +386,31 @@ def test_only_a_stored_pickle_is_signed_and_once(tmp_path: Path) -> None:
         trust.untrust(recording.benchmark.record.digest)
         with pytest.raises(UntrustedError, match="pickled Python code"):
             recording.benchmark.make_env()
+
+
+def test_what_this_user_recorded_is_rebuilt_where_nobody_registers_it(tmp_path: Path) -> None:
+    """A shell imports no package of environments."""
+    record_in(gym.make(ID, port=7), tmp_path / "r.mcap")
+    spec = gym.registry.pop(ID)
+    try:
+        with Recording(tmp_path / "r.mcap") as recording:
+            assert recording.benchmark.make_env().unwrapped.port == 7
+            trust.untrust(recording.benchmark.record.digest)
+            with pytest.raises(
+                UntrustedError, match=f"'{__name__}:Robot' of '{ID}', an id that is not registered"
+            ):
+                recording.benchmark.make_env()
+    finally:
+        gym.registry[ID] = spec
+    # what needs trust where it is registered, too, is not signed
+    record_in(gym.make(ID, port="../port"), tmp_path / "telling.mcap")
+    assert signatures(tmp_path) == []
+
+
+def test_a_wrapper_without_arguments_in_the_spec(tmp_path: Path) -> None:
+    record_in(gym.Wrapper(gym.make(ID)), tmp_path / "r.mcap")
+    with pytest.raises(TupliError, match=r"lacks the arguments of .*:Wrapper .*capture_env='pickle'"):
+        build(noted(tmp_path / "r.mcap"))
 
 
 # --- without a storage, in one call, on the command line ---

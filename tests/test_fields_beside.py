@@ -87,6 +87,16 @@ def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None
         dataset.transitions(fields=["inform"])
 
 
+def test_a_filter_on_an_info_that_no_step_has(tmp_path: Path, dataset: tupli_mcap.Dataset) -> None:
+    found = TupliDataset(tmp_path).with_tuple_filter("info.forse > 2 and step > 1")
+    with pytest.warns(
+        UserWarning, match=r"no step has info.forse \(did you mean 'force'\?\); infos have force, "
+    ) as said:
+        assert len(found) == 0
+    assert said[0].filename == __file__  # the line of the caller
+    assert len(TupliDataset(tmp_path).with_tuple_filter("info.force > 1e9")) == 0  # without a warning
+
+
 def test_of_columns(dataset: tupli_mcap.Dataset) -> None:
     columns = dataset.read(["states", "info.step", "infos.force"])
     assert set(columns.infos) == {"step", "force"}

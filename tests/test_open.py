@@ -348,6 +348,13 @@ def test_a_loader_in_one_call(dataset: Dataset) -> None:
     assert (first["states"] == again["states"]).all()
     in_order = next(iter(dataset.loader(batch_size=5, shuffle=False)))
     assert np.array_equal(in_order["states"].numpy(), dataset[0].states[:5])
+    for wrong, length, said in (
+        ("batch", 3, r"'batch' \(did you mean 'batch_size'\?\)"),
+        ("stride", None, "'stride': it needs a length"),
+        ("n_step", 3, "'n_step': it is of single transitions"),
+    ):
+        with pytest.raises(TypeError, match=r"^loader\(\) got an unexpected argument " + said):
+            dataset.loader(length, **{wrong: 3})
 
 
 def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:

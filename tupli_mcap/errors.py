@@ -8,6 +8,10 @@ from __future__ import annotations
 import contextlib
 import difflib
 import errno
+import functools
+import os
+import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -30,6 +34,7 @@ __all__ = [
     "missing_extra",
     "os_reason",
     "plural",
+    "warn",
 ]
 
 _SPACE = "free some space there, or choose another disk"
@@ -68,6 +73,8 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
 }
 """Other libraries' names of columns and of the number of steps, and ours: the error names the first that there is."""
+
+_OURS: Final = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__, functools.__file__)  # no caller's
 
 
 class TupliError(Exception):
@@ -132,6 +139,14 @@ def brief(err: BaseException | None) -> str:
     """An exception in one line: `ValueError: its message`."""
     text = " ".join(str(err).split())[:300]
     return f"{type(err).__name__}: {text}" if text else type(err).__name__
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warns at the line of the caller outside of this package."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OURS):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
 
 
 def plural(count: int, noun: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from pydantic import ValidationError
 from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
-from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
@@ -244,7 +243,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         try:
             self.storage.ingest(path)
         except TupliError as err:
-            warnings.warn(f"{path} will be listed by the next query: {err}", RuntimeWarning, stacklevel=2)
+            warn(f"{path} will be listed by the next query: {err}", RuntimeWarning)
 
     def _begin(self, benchmark_id: str) -> RecordEpisodes:
         callback = self.metadata_callback
@@ -310,7 +309,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         try:
             _trust.trust(content.record.digest)
         except TupliError as err:
-            warnings.warn(f"stored, but loading it will need trust=True: {err}", stacklevel=2)
+            warn(f"stored, but loading it will need trust=True: {err}")
         if self.id is not None and self.id != stored.id:
             self._finish()
             self._path = None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from tupli_mcap.dataset.which import (
     named_positions,
     positions_of,
 )
-from tupli_mcap.errors import FilterError, RecordingError, TupliError
+from tupli_mcap.errors import FilterError, RecordingError, TupliError, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown
 
@@ -298,7 +297,7 @@ def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: Exi
         except FilterError:
             raise
         except TupliError as err:
-            warnings.warn(f"{err}; it is left out", stacklevel=4)
+            warn(f"{err}; it is left out")
     chosen: dict[str, dict[int, None]] = {}
     for item in items:
         for file in _files_of(item, {file: total for file, (total, _) in named[item].items()}):

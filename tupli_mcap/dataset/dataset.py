@@ -375,9 +375,11 @@ class Dataset(RandomAccess):
         Raises:
             MissingExtraError: PyTorch is not installed.
             SamplingError: no episode has that many steps.
+            TypeError: there is no such argument, or it goes with the other kind of item.
         """
-        from tupli_mcap.torch.mapped import loader
+        from tupli_mcap.torch.mapped import check_arguments, loader
 
+        check_arguments(chosen, of_windows=length is not None)
         if fields is not None:
             chosen["fields"] = fields
         items = self.transitions(**chosen) if length is None else self.windows(length, **chosen)

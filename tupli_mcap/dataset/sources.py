@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import glob
 import os
-import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, Protocol, cast
 from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, RecordingError, TupliError
+from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_url, matching, shown
@@ -176,10 +175,7 @@ class FilesSource:
                 seen[name] = recording
             copies = [header for header in headers if header.id in files]
             if copies:
-                warnings.warn(
-                    f"{name} holds {len(copies)} episodes of {files[copies[0].id]} again; they are left out",
-                    stacklevel=2,
-                )
+                warn(f"{name} holds {len(copies)} episodes of {files[copies[0].id]} again; they are left out")
             new = [header for header in headers if header.id not in files]
             files.update((header.id, name) for header in new)
             found += [header for header in new if episode_filter is None or matches(header)]
@@ -193,7 +189,7 @@ class FilesSource:
             except TupliError as err:
                 if not self._of_directory:
                     raise
-                warnings.warn(f"{err}; it is left out", stacklevel=4)
+                warn(f"{err}; it is left out")
                 continue
             with recording:
                 yield recording

@@ -7,7 +7,7 @@ import copy
 import platform
 import sys
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
@@ -21,6 +21,11 @@ from tupli_mcap.errors import TupliError, UntrustedError
 # These render modes open no window.
 _PICTURES = frozenset(
     {"rgb_array", "rgb_array_list", "depth_array", "depth_array_list", "rgbd_tuple", "ansi", "ansi_list"}
+)
+
+_INSTEAD: Final = (
+    "record with capture_env='pickle', or make the environment yourself and pass it on as env=... where that is "
+    "taken"
 )
 
 
@@ -45,9 +50,13 @@ def build(
     if record.spec is None and record.pickle is None:
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt: expected a spec or a pickle, found only the "
-            f"names of its classes ({', '.join(record.classes)[:300]}); record with capture_env='pickle' (a vector "
-            "environment whose class steps all at once has no single one: make it with vectorization_mode='sync'), or "
-            "make the environment yourself and pass it on as env=... where that is taken"
+            f"names of its classes ({', '.join(record.classes)[:300]}); {_INSTEAD} (a vector environment whose class "
+            "steps all at once has no single one: make it with vectorization_mode='sync')"
+        )
+    if silent := _silent_wrappers(record.spec):
+        raise TupliError(
+            f"the environment {record.name[:200]!r} cannot be rebuilt from its spec, which lacks the arguments of "
+            f"{', '.join(silent)[:300]} (no gymnasium.utils.RecordConstructorArgs); {_INSTEAD}"
         )
     reasons = reasons_for_distrust(record)
     window = record.spec is not None and _may_open_a_window(record.spec)
@@ -78,6 +87,16 @@ def build(
         with contextlib.suppress(AttributeError):  # where it cannot be set
             env.unwrapped.render_mode = render_mode
     return env
+
+
+def _silent_wrappers(spec: Mapping[str, Any] | None) -> list[str]:
+    """The wrappers of a spec that do not say how they were made."""
+    wrappers = None if spec is None else spec.get("additional_wrappers")
+    return [
+        str(wrapper.get("entry_point"))
+        for wrapper in (wrappers if isinstance(wrappers, list) else ())
+        if isinstance(wrapper, dict) and wrapper.get("kwargs") is None
+    ]
 
 
 def _may_open_a_window(spec: Mapping[str, Any]) -> bool:
@@ -120,10 +139,11 @@ def foreign_code(spec: Mapping[str, Any]) -> list[str]:
     name = spec.get("id")
     known = gym.registry.get(name) if isinstance(name, str) else None
     if known is None:
-        reason = (
-            f"the environment id {str(name)[:100]!r}, which is not registered here (import its package first)"
-        )
-        return [reason]
+        named = str(spec.get("entry_point"))[:200]
+        return [
+            f"the entry point {named!r} of {str(name)[:100]!r}, an id that is not registered here (in Python, import "
+            "its package first)"
+        ]
     reasons = []
     registered = entry_point_name(known.entry_point)
     if spec.get("entry_point") != registered:

@@ -18,7 +18,6 @@ import mmap
 import os
 import re
 import struct
-import warnings
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -28,7 +27,7 @@ from uuid import uuid4
 import numpy as np
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, RecordingError, os_reason
+from tupli_mcap.errors import FormatError, RecordingError, os_reason, warn
 from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
 
@@ -222,10 +221,9 @@ class Journal:
             except FileNotFoundError:
                 pass
             except OSError as err:
-                warnings.warn(
+                warn(
                     f"{place}: the recording is finished, but its journal cannot be removed "
-                    f"({err.strerror}); delete it",
-                    stacklevel=2,
+                    f"({err.strerror}); delete it"
                 )
 
 
@@ -249,10 +247,9 @@ def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
     path.rename(kept)
     if found == replaced:
         return
-    warnings.warn(
+    warn(
         f"{path} {whose} and is kept as {kept.name}: if that recording was renamed, "
-        "rename its journal accordingly; if it was deleted, delete this too",
-        stacklevel=2,
+        "rename its journal accordingly; if it was deleted, delete this too"
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 import threading
-import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import IO, BinaryIO, Final
 from urllib.parse import urlsplit
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, warn
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.kept import kept_blocks
 from tupli_mcap.remote.names import shown
@@ -256,10 +255,9 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
     try:
         return RemoteSource(url, remote, remote.tail(_TAIL))
     except NoRangesError:
-        warnings.warn(
+        warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
-            "a server that supports range requests avoids this",
-            stacklevel=2,
+            "a server that supports range requests avoids this"
         )
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import DType
-from tupli_mcap.errors import StepError
+from tupli_mcap.errors import StepError, warn
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
 
 _LONGEST = 120  # characters of a value in an error
@@ -42,11 +41,9 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
             f"{leaf.path}: expected values of dtype {leaf.dtype.name}, found {dtype.name}, which no message holds"
         )
     if dtype != leaf.dtype:
-        warnings.warn(
+        warn(
             f"{leaf.path} is declared {leaf.dtype.name}, but the values are {dtype.name}; "
-            f"they are recorded as {dtype.name}, exactly as given; cast them if {leaf.dtype.name} is meant",
-            UserWarning,
-            stacklevel=2,
+            f"they are recorded as {dtype.name}, exactly as given; cast them if {leaf.dtype.name} is meant"
         )
     return dtype
 

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
 
 import numpy as np
 from torch import Generator
 from torch.utils.data import DataLoader, Dataset
 
 from tupli_mcap.dataset.items import Items, Samples
+from tupli_mcap.errors import did_you_mean
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import collate
+
+_OF_ITEMS: Final = {
+    True: ("stride", "pad", "history"),
+    False: ("n_step", "discount"),
+}  # of windows, of transitions
+_OF_LOADER: Final = ("length", "batch_size", "shuffle", "num_workers", "fields", "seed", "drop_last")
 
 
 class MapDataset(Dataset[dict[str, Any]]):
@@ -53,6 +60,23 @@ class MapDataset(Dataset[dict[str, Any]]):
             SamplingError: it is of other items.
         """
         check_state(state_dict, self._reader.items.identity, {})
+
+
+def check_arguments(names: Iterable[str], *, of_windows: bool) -> None:
+    """Checks what `Dataset.loader` passes on to `windows`, or else to `transitions`.
+
+    Raises:
+        TypeError: it takes no such argument.
+    """
+    for name in names:
+        if name in _OF_ITEMS[of_windows]:
+            continue
+        hint = did_you_mean(name, (*_OF_LOADER, *_OF_ITEMS[of_windows]))
+        if name in _OF_ITEMS[not of_windows]:
+            hint = (
+                ": it is of single transitions; leave out the length" if of_windows else ": it needs a length"
+            )
+        raise TypeError(f"loader() got an unexpected argument {name!r}{hint}")
 
 
 def loader(

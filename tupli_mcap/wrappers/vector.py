@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from gymnasium.vector.utils import iterate
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import SpaceError, StepError
+from tupli_mcap.errors import SpaceError, StepError, warn
 from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
@@ -154,7 +153,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         work.finish()
         if self._autoreset.doubt:
             doubt, self._autoreset.doubt = self._autoreset.doubt, ""
-            warnings.warn(doubt, UserWarning, stacklevel=2)
+            warn(doubt)
         if refusal is not None:
             raise refusal
         return result

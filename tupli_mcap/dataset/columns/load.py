@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import Source
-from tupli_mcap.errors import FilterError, SpaceError, memory_for
+from tupli_mcap.errors import FilterError, SpaceError, did_you_mean, memory_for, warn
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
@@ -23,7 +23,8 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 from tupli_mcap.recording.columns.fields import FIELDS
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
-from tupli_mcap.schema.facts import with_times
+from tupli_mcap.schema.facts import comparisons, with_times
+from tupli_mcap.schema.filters import path_of
 
 __all__ = [
     "Selected",
@@ -101,6 +102,7 @@ class _Reader:
         self._capacity = total if known is None else known.steps
         self._total = total
         self._done = 0  # listed steps read so far
+        self._info_keys: set[str] = set()
         self._builders: dict[str, _FieldBuilder] = {}
         self._layout: StepLayout | None = None
         self._first_name = ""
@@ -132,6 +134,7 @@ class _Reader:
         if self._selector is None or self._mask is None:
             return None
         self._mask[block] = self._selector.mask(columns, layout)
+        self._info_keys.update(*columns.get("infos", ()))
         return self._mask[block]
 
     def finish(self, headers: Sequence[EpisodeHeader]) -> tuple[dict[str, Any], Selected, StepLayout | None]:
@@ -143,6 +146,8 @@ class _Reader:
                 wanted = np.concatenate([[0], np.cumsum(self._mask)])
                 lengths = np.diff(wanted[ends])
             selected = Selected(lengths, self._mask)
+            if self._selector is not None and self._done and not selected.steps:
+                _warn_of_unseen(self._selector.filter, self._info_keys)
         columns = {field: builder.finish() for field, builder in self._builders.items()}
         if self._layout is None:
             columns = {field: _empty_column(field) for field in self._fields}
@@ -313,6 +318,15 @@ class TupleSelector:
             return evaluate_columns(self.filter, steps)
         tuples = Tuples(columns, layout)
         return np.fromiter((_flag(self.filter(item)) for item in tuples), np.bool_, len(tuples))
+
+
+def _warn_of_unseen(filter: TupleFilter, keys: Collection[str]) -> None:
+    """Warns of infos that an expression names and that no step has; `keys` are those that steps have."""
+    for comparison in comparisons(filter) if isinstance(filter, BaseFilter) else ():
+        name, *inside = path_of(comparison)
+        if name == "info" and inside and inside[0] not in keys:
+            known = f"infos have {', '.join(sorted(keys))}" if keys else "no infos are recorded"
+            warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
 
 
 def selector_of(filter: TupleFilter) -> TupleSelector:

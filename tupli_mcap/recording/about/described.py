@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import warnings
 from functools import cached_property
 from pathlib import PurePosixPath
 from typing import Any, Final
@@ -12,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, TupliError
+from tupli_mcap.errors import FormatError, TupliError, warn
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
 from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.opened import OpenedRecording
@@ -111,7 +110,7 @@ class DescribedRecording(OpenedRecording):
         try:
             return self.runs
         except FormatError as err:
-            warnings.warn(f"{err}; the run is not known", UserWarning, stacklevel=3)
+            warn(f"{err}; the run is not known")
             name = PurePosixPath(file_name(self.name)).stem
             return [Run().known_as(name, "", self.created_ns, 0)]
 

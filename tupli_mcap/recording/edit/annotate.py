@@ -6,14 +6,13 @@ import getpass
 import operator
 import os
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, warn
 from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
     ANNOTATIONS_NAME,
@@ -160,7 +159,7 @@ def _changing(
             if SIGNATURE_NAME in recording.attachments:
                 left_out = "would be left out" if dry_run else "is left out"
                 message = f"{path}: its signature covers what was said before, and {left_out}"
-                warnings.warn(message, UserWarning, stacklevel=4)
+                warn(message)
             if not dry_run:
                 attach(Path(recording.name), {name: (media_type, data)}, without=[SIGNATURE_NAME])
 

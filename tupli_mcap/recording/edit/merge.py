@@ -6,7 +6,6 @@ import contextlib
 import heapq
 import os
 import time
-import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from operator import itemgetter
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.environment import EnvironmentRecord
-from tupli_mcap.errors import RecordingError, SpaceError
+from tupli_mcap.errors import RecordingError, SpaceError, warn
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import png_leaves
@@ -170,10 +169,8 @@ def merge_excerpts(
                 target.add_messages(channel.id, heapq.merge(*infos, key=itemgetter(0)))
     target.finish(now)
     if target.held:
-        warnings.warn(
-            f"the times of {target.held:,} merged rows were raised to that of the row ahead, which was later",
-            UserWarning,
-            stacklevel=3,
+        warn(
+            f"the times of {target.held:,} merged rows were raised to that of the row ahead, which was later"
         )
     return target
 
@@ -352,11 +349,9 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     carried = [recording for recording in sources if _ENVIRONMENT[0] in recording.attachments]
     other = next((r for r in carried if not _is_same(carried[0].benchmark.record, r.benchmark.record)), None)
     if other is not None:
-        warnings.warn(
+        warn(
             f"{other.name} carries another environment than {carried[0].name}, or another version of it; the first one "
-            "is kept",
-            UserWarning,
-            stacklevel=3,
+            "is kept"
         )
     with_environment = carried[0] if carried else None
     for recording in sources:

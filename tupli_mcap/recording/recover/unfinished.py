@@ -5,14 +5,13 @@ Nothing is written, and to do it again gives the same.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, warn
 from tupli_mcap.journal.committed import size_behind
 from tupli_mcap.journal.file import JournalContents, recorded_journal
 from tupli_mcap.journal.logs import group_records
@@ -51,11 +50,11 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     if isinstance(journal, Exception):
         if defined:  # without channels there is no step, and no journal
             _check_unchanged(source)
-            warnings.warn(_missing(source, metadata, journal), UserWarning, stacklevel=6)
+            warn(_missing(source, metadata, journal))
         journal = None
     elif journal is not None and not belongs(journal.info, metadata):
         if defined:
-            warnings.warn(_foreign_journal(source, metadata), UserWarning, stacklevel=6)
+            warn(_foreign_journal(source, metadata))
         journal = None  # stale: of another recording with this name
     if journal is not None:
         take_journal(evidence, journal)
@@ -76,7 +75,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         _complete(evidence, layout, channels, contents)
         if journal is not None:
             for text in _left_out(evidence, journal, channels):
-                warnings.warn(text, UserWarning, stacklevel=6)
+                warn(text)
     return contents
 
 

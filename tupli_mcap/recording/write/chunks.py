@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import threading
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, warn
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container, Rows
 from tupli_mcap.mcap.lock import FileLock
@@ -128,11 +127,10 @@ class ChunkWriter:
         """Once: what is written to a file without a name is lost when it is closed."""
         if self._lock.is_deleted and not self._told_deleted:
             self._told_deleted = True
-            warnings.warn(
+            warn(
                 f"{self._path} was deleted while it is being recorded, and nothing of it will remain; "
                 "record to another file",
                 RuntimeWarning,
-                stacklevel=2,
             )
 
     def _check_room(self, rows: Rows) -> None:

@@ -21,7 +21,6 @@ import os
 import secrets
 import threading
 import time
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ from typing import Final, NamedTuple
 import platformdirs
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, warn
 from tupli_mcap.mcap.lock import LockedError, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.storage.api.answers import ConflictError, SignInError, UnreachableError
@@ -198,7 +197,7 @@ class Outbox:
             except TupliError as err:
                 if self._is_ours(path):
                     self._refused[path] = err
-                warnings.warn(f"{path} was not sent, and is kept: {err}", RuntimeWarning, stacklevel=2)
+                warn(f"{path} was not sent, and is kept: {err}", RuntimeWarning)
             pause = 1.0
             with self._turn:
                 self._behind.pop(path, None)
@@ -241,7 +240,7 @@ class Outbox:
             for gone in (path, journal_path(path), note(path)):
                 gone.unlink(missing_ok=True)
         except OSError as err:
-            warnings.warn(f"{path} was sent, and cannot be deleted here: {err}", RuntimeWarning, stacklevel=2)
+            warn(f"{path} was sent, and cannot be deleted here: {err}", RuntimeWarning)
 
     def _send_ended(self, path: Path) -> None:
         """Sends the ended episodes that were not sent yet, up to the first running one."""
@@ -271,7 +270,7 @@ class Outbox:
         except (TupliError, KeyboardInterrupt) as err:
             why = "interrupted" if isinstance(err, KeyboardInterrupt) else err
             left = f"what was recorded waits in {self.directory} ({why}); tupli-mcap push sends it"
-            warnings.warn(left, RuntimeWarning, stacklevel=2)
+            warn(left, RuntimeWarning)
 
 
 def _digest(text: str) -> str:

@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import warnings
 from pathlib import Path
 
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, warn
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.summary import has_summary
@@ -56,7 +55,7 @@ def finished(path: Path) -> Path:
         with contextlib.suppress(FileNotFoundError):
             each.replace(goal)
     told = f"{path} was damaged: what could be saved of it is sent, the original is kept in {damaged}"
-    warnings.warn(told, RuntimeWarning, stacklevel=2)
+    warn(told, RuntimeWarning)
     return saved
 
 

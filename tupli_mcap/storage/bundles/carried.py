@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment import EnvironmentRecord, sha256
-from tupli_mcap.errors import FormatError, SignatureError, StorageError
+from tupli_mcap.errors import FormatError, SignatureError, StorageError, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.signature import Signature, verify_signature
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -115,7 +114,7 @@ def checked_signature(recording: Recording, required: bool, signers: Sequence[st
         try:
             return verify_signature(recording) if known else None
         except SignatureError as err:
-            warnings.warn(f"imported as if it were not signed: {err}", stacklevel=3)
+            warn(f"imported as if it were not signed: {err}")
             return None
     signature = verify_signature(recording)
     if signature.public_key not in signers if signers else not signature.trusted:

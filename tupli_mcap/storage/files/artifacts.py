@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from tupli_mcap.environment import sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
 from tupli_mcap.schema.times import time_ns
@@ -65,7 +64,7 @@ class ArtifactFiles:
             try:
                 items.append(self._read(sidecar))
             except (FormatError, StorageError) as err:
-                warnings.warn(f"skipped an artifact: {err}", stacklevel=3)
+                warn(f"skipped an artifact: {err}")
         return sorted(
             (item for item in items if matches(item)),
             key=lambda item: (time_ns(item.created_at) or 0, item.id),

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,7 +12,7 @@ from typing import Any, TypeAlias
 from pydantic import ValidationError
 
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.schema.times import iso_utc, time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
@@ -83,7 +82,7 @@ class BenchmarkFiles:
             except NotFoundError:
                 pass  # deleted since, or not a benchmark's name
             except (FormatError, StorageError) as err:
-                warnings.warn(f"skipped a benchmark: {err}", stacklevel=3)
+                warn(f"skipped a benchmark: {err}")
         return sorted((h for h in headers if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
 
     def delete(self, uri: str) -> None:

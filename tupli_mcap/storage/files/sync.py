@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +12,7 @@ from typing import TypeVar
 from sqlalchemy import Connection
 
 from tupli_mcap.cache import cache_dir
-from tupli_mcap.errors import FormatError, RecordingError, StorageError
+from tupli_mcap.errors import FormatError, RecordingError, StorageError, warn
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.progress import progress
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
@@ -166,7 +165,7 @@ class SyncedCatalog:
     def _use_memory(self, err: StorageError) -> Catalog:
         """Go on with a catalog in memory, so that recordings can be listed even if nothing can be written."""
         advice = "TUPLI_MCAP_CACHE_DIR names another place; meanwhile the catalog is made in memory"
-        warnings.warn(f"{err}; {advice}", stacklevel=7)
+        warn(f"{err}; {advice}")
         self.close()
         self._opened = Catalog(None)
         return self._opened
@@ -259,7 +258,7 @@ class SyncedCatalog:
         self.skipped[relative] = why
         if (relative, stamp) not in self._warned:
             self._warned.add((relative, stamp))
-            warnings.warn(f"skipped a recording: {why}", stacklevel=6)
+            warn(f"skipped a recording: {why}")
 
     def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue a recording unless it is a copy; returns its number of episodes."""

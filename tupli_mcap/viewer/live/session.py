@@ -12,9 +12,8 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 
-from tupli_mcap.errors import missing_extra
+from tupli_mcap.errors import missing_extra, warn
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.viewer.live.target import parse_target
 
@@ -71,6 +70,6 @@ def open_session(writer: RecordingWriter, live: str, title: str) -> LiveSession 
             start_new_session=True,  # Ctrl-C reaches the recorder only
         )
     except OSError as err:
-        warnings.warn(f"live={live!r} cannot show the rollout ({err}); the recording goes on", stacklevel=4)
+        warn(f"live={live!r} cannot show the rollout ({err}); the recording goes on")
         return None
     return LiveSession(process, writer)

@@ -7,14 +7,13 @@ These are a dict as Gymnasium's environments return it, in which a mask `_<key>`
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError, StepError, did_you_mean
+from tupli_mcap.errors import RecordingError, StepError, did_you_mean, warn
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.recording.write.options import RecordInfo
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -81,7 +80,7 @@ class InfoRecorder:
         unseen, self._unseen = sorted(self._unseen), set()
         if unseen and self._last is not None:
             said = ", ".join(f"{name!r}{did_you_mean(name, map(str, self._last))}" for name in unseen)
-            warnings.warn(f"{path}: record_info: no step's info had {said}", stacklevel=3)
+            warn(f"{path}: record_info: no step's info had {said}")
 
     def put(self, writer: RecordingWriter, episode: int, step: int, info: Mapping[str, Any]) -> None:
         """Appends the entries of one step to the journal."""
