@@ -131,63 +131,54 @@ class StepClaims:
     Args:
         index: EPISODE_ROWS; no two episodes share a row.
         env: the sub-environment whose channel it is.
-        chunks: CHUNK_ROWS of the channel, in the order of their rows, without gaps.
     """
 
-    def __init__(self, index: Array, env: int, chunks: Array) -> None:
-        self._index, self._env, self._chunks = index, env, chunks
+    def __init__(self, index: Array, env: int) -> None:
+        self._index, self._env = index, env
 
     @cached_property
-    def _claims(self) -> tuple[Array, Array, dict[int, slice]]:
-        """The rows to compare, counted within their chunk; the `episode` and `step` that each must have, as one number;
-        and, by the first row of a chunk, the slice of them that belongs to the chunk.
-        """
+    def _episodes(self) -> tuple[Array, Array, Array]:
+        """The first and the last row of each episode, in the order of their rows; and the `episode` and `step` that the
+        last one must have, as one number."""
         index = self._index
         mine = index["env"] == self._env
         if not mine.all():
             index = index[mine]
         # field by field: NumPy is slow with rows of many fields
         firsts, lengths = index["first_row"].astype(np.int64), index["length"].astype(np.int64)
-        episodes = index["episode"].astype(np.int64)
+        numbers = index["episode"].astype("<u8") + (lengths - 1 << 32).astype("<u8")
         if (firsts[1:] < firsts[:-1]).any():
             order = np.argsort(firsts, kind="stable")
-            firsts, lengths, episodes = firsts[order], lengths[order], episodes[order]
-        rows, numbers = firsts + lengths - 1, episodes + (lengths - 1 << 32)
+            firsts, lengths, numbers = firsts[order], lengths[order], numbers[order]
+        return firsts, firsts + lengths - 1, numbers
 
-        chunks = self._chunks[self._chunks["rows"] > 0]
-        starts, counts = chunks["first"].astype(np.int64), chunks["rows"].astype(np.int64)
-        last = starts + counts - 1
-        at = rows.searchsorted(last)  # the episode that goes on after a chunk, if one does
-        goes_on = at < len(rows)
-        goes_on[goes_on] = (firsts[at[goes_on]] <= last[goes_on]) & (rows[at[goes_on]] != last[goes_on])
-        at, last = at[goes_on], last[goes_on]
-        numbers = np.insert(numbers, at, episodes[at] + (last - firsts[at] << 32)).astype("<u8")
-        rows = np.insert(rows, at, last)
-
-        bounds = rows.searchsorted(np.append(starts, starts[-1:] + counts[-1:]))
-        rows -= np.repeat(starts, np.diff(bounds))
-        of_chunk = map(slice, bounds[:-1].tolist(), bounds[1:].tolist())
-        return rows, numbers, dict(zip(starts.tolist(), of_chunk, strict=True))
-
-    def check(self, first: int, numbers_at: Callable[[Array], Array], where: str) -> None:
+    def check(self, first: int, count: int, numbers_at: Callable[[Array], Array], where: str) -> None:
         """Compares the rows of a chunk with the index.
 
         Args:
             first: the number of its first row.
+            count: how many rows it has, at least 1.
             numbers_at: returns `episode` and `step` of some of its rows as one number (`<u8`); row 0 is the first one.
             where: the file and the channel, for errors.
 
         Raises:
             FormatError: a row belongs to another episode or step.
         """
-        rows, numbers, of_chunk = self._claims
-        mine = of_chunk[first]
-        expected = numbers[mine]
-        found = numbers_at(rows[mine])
+        firsts, lasts, numbers = self._episodes
+        begin, end = int(lasts.searchsorted(first)), int(lasts.searchsorted(first + count))
+        goes_on = end < len(firsts) and bool(firsts[end] < first + count)  # an episode, in the next chunk
+        rows = lasts[begin : end + goes_on] - first
+        expected = numbers[begin : end + goes_on]
+        if goes_on:
+            later = int(rows[-1]) - (count - 1)
+            rows[-1] -= later
+            expected = expected.copy()
+            expected[-1] -= np.uint64(later << 32)
+        found = numbers_at(rows)
         if found.tobytes() != expected.tobytes():
             i = int(np.argmax(found != expected))
             one, other = int(found[i]), int(expected[i])
             raise FormatError(
-                f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + rows[mine][i]} as "
+                f"{where}: expected step {other >> 32} of episode {other & _U32} in row {first + rows[i]} as "
                 f"the episode index says, found step {one >> 32} of episode {one & _U32}; recover it into a new file"
             )

@@ -161,8 +161,7 @@ class OpenedRecording:
             if contents.complete:
                 self._check_sizes(self._layout, rows)
             self._store.claims = {
-                channel: StepClaims(self.index, env, self._store.table_of(channel))
-                for env, channel in enumerate(self._step_channels)
+                channel: StepClaims(self.index, env) for env, channel in enumerate(self._step_channels)
             }
             self._columns = ColumnReader(self._layout, self._store, self._images)
 

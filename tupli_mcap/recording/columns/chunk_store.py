@@ -374,7 +374,7 @@ class ChunkStore:
         if claims is None or not n:
             _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
         else:
-            claims.check(first, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
+            claims.check(first, n, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
         self._held[i] = True  # once is enough: the CRC shows later changes
 
     def _hold_records(self, i: int, data: Any, records: Array) -> None:
@@ -386,7 +386,7 @@ class ChunkStore:
             if int((records[:, 1] - starts).min()) < _LEAST_STEP:
                 raise FormatError(f"{where} holds messages that are not steps")
             numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))
-            claims.check(first, lambda places: numbers[starts[places] + BODY], where)
+            claims.check(first, len(records), lambda places: numbers[starts[places] + BODY], where)
         self._held[i] = True
 
     def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
