@@ -12,7 +12,7 @@ import tupli_mcap
 
 PACKAGE = Path(tupli_mcap.__file__).parent
 FOLDERS = sorted({path.parent for path in PACKAGE.rglob("*.py")})
-LAZY_DOORS = [PACKAGE / folder / "__init__.py" for folder in ("", "recording", "dataset")]
+LAZY_DOORS = [PACKAGE / folder / "__init__.py" for folder in ("", "recording", "dataset", "storage")]
 
 
 def name_of(path: Path) -> str:

@@ -45,6 +45,8 @@ def run(*arguments: str) -> str:
         ("from tupli_mcap import F, FilterEQ", (*EXTRAS, *DATABASE, "gymnasium", "mcap")),
         ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.write.writer")),
         ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
+        ("from tupli_mcap import open, merge_recordings", (*EXTRAS, *DATABASE)),
+        (run("ls", "none.mcap"), (*EXTRAS, *DATABASE)),
         (
             "from tupli_mcap import RecordEpisodes; from tupli_mcap.vector import RecordEpisodes",
             (*EXTRAS, *DATABASE, "tupli_mcap.viewer", "tupli_mcap.recording.edit.repair"),

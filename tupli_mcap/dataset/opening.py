@@ -16,7 +16,7 @@ from tupli_mcap.dataset.sources import (
 )
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url
-from tupli_mcap.storage import FileStorage, TupliStorage, storage_at
+from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings, is_storage
 
 __all__ = ["open"]
@@ -51,11 +51,15 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         name = os.fspath(source)
         folder = Path(name).expanduser()
         if is_server(name):
-            return Dataset(StorageSource(storage_at(name)))
+            from tupli_mcap.storage import TupliAPIClient
+
+            return Dataset(StorageSource(TupliAPIClient(name)))
         if is_url(name) or not folder.is_dir():
             return Dataset(FilesSource(source))
         files = _files_in(folder)
         if is_storage(folder) or not files:
+            from tupli_mcap.storage import FileStorage  # and with it a database, which files do not need
+
             return Dataset(StorageSource(FileStorage(folder)))
         return Dataset(FilesSource(files, of_directory=True))
     if not isinstance(source, Iterable):

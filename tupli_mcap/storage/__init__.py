@@ -14,9 +14,32 @@ verify           verifies a storage
 atomic, texts    atomic writes, the lock between processes, and the texts in files
 """
 
-from tupli_mcap.storage.api import TupliAPIClient
-from tupli_mcap.storage.at import storage_at
-from tupli_mcap.storage.base import TupliStorage, TupliStorageError
-from tupli_mcap.storage.files import FileStorage
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tupli_mcap.storage.api import TupliAPIClient
+    from tupli_mcap.storage.at import storage_at
+    from tupli_mcap.storage.base import TupliStorage, TupliStorageError
+    from tupli_mcap.storage.files import FileStorage
+
+# Imported on first use: what reads files needs no database and no client.
+_HOMES = {
+    "FileStorage": "files",
+    "TupliAPIClient": "api",
+    "TupliStorage": "base",
+    "TupliStorageError": "base",
+    "storage_at": "at",
+}
 
 __all__ = ["FileStorage", "TupliAPIClient", "TupliStorage", "TupliStorageError", "storage_at"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
