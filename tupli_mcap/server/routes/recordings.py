@@ -33,7 +33,7 @@ _FOR_VIEWERS = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
 }
-_PIECE = 1 << 20  # bytes that are written at a time
+_AT_ONCE = 2 << 20  # bytes that are written at a time
 
 
 class Named(BaseModel):
@@ -139,18 +139,19 @@ def _find(library: Library, caller: Caller, upload_id: str) -> Upload:
 async def _append(incoming: Incoming, pieces: AsyncIterator[bytes]) -> None:
     """Writes bytes as they arrive. If the client disconnects, the bytes until then are kept."""
     room = incoming.upload.length - incoming.offset
-    coming, written = bytearray(), None
+    coming, size, written = list[bytes](), 0, None
     try:
         async for piece in pieces:
             room -= len(piece)
             if room < 0:
                 raise TooLargeError(f"expected {incoming.upload.length} bytes in all, found more")
-            coming += piece
-            if len(coming) >= _PIECE:
+            coming.append(piece)
+            size += len(piece)
+            if size >= _AT_ONCE:
                 if written is not None:
                     await written
                 written = asyncio.ensure_future(run_in_threadpool(incoming.write, coming))
-                coming = bytearray()
+                coming, size = [], 0
     finally:
         if written is not None:
             await written
