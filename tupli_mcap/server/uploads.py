@@ -100,7 +100,8 @@ class Incoming:
                     raise
                 self._file.truncate(0)
                 raise FullError("the server's disk is full; send it again when there is room") from err
-        if hasattr(os, "posix_fadvise"):  # Linux begins to write them to the disk, so that `verify` waits less
+        # Linux then begins to write them to the disk, so that `verify` waits less.
+        if hasattr(os, "posix_fadvise"):
             os.posix_fadvise(self._file.fileno(), begun, self.offset - begun, os.POSIX_FADV_DONTNEED)
 
     def _append(self, piece: bytes) -> None:
