@@ -14,6 +14,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
@@ -77,6 +78,7 @@ class EpisodeCopier:
         values: new values of steps, in place of the source's.
         trims: by number, the steps that stay of an episode.
         layout: of the target, if it differs: the source's `without` some fields.
+        infos: the codecs of the source's infos and of the target's, if they differ.
     """
 
     def __init__(
@@ -92,7 +94,9 @@ class EpisodeCopier:
         values: NewValues | None = None,
         trims: Mapping[int, Trim] | None = None,
         layout: StepLayout | None = None,
+        infos: tuple[InfoCodec, InfoCodec] | None = None,
     ) -> None:
+        self._info_codecs = infos
         self._layout = source.layout if layout is None else layout
         self._is_whole = layout is None
         self._first_env = first_env
@@ -131,8 +135,10 @@ class EpisodeCopier:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
         self._frames(rows)
-        if infos and self._first_env is None:
+        if infos and self._first_env is None and self._info_codecs is None:
             self._copy_places(self._topics[INFO], self._infos(rows), numbered=True)
+        elif infos and self._first_env is None:
+            self._target.add_messages(self._to(self._topics[INFO]), self.infos(rows))
         return self._episodes(rows, firsts)
 
     def _trimmed(self, rows: Array) -> Array:
@@ -379,7 +385,11 @@ class EpisodeCopier:
         if INFO in self._topics:
             for first, count in _merged([(place, 1) for place in self._infos(rows).tolist()]):
                 for time_ns, body in self._messages(self._topics[INFO], first, count):
-                    yield time_ns, self._renumbered(body)
+                    new = self._renumbered(body)
+                    if self._info_codecs is not None:
+                        own, target = self._info_codecs
+                        new = target.encode(*own.decode(memoryview(new)))
+                    yield time_ns, new
 
 
 def _narrowed(rows: Array, dtype: np.dtype[Any]) -> Array:

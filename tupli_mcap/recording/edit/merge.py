@@ -81,9 +81,10 @@ def merge_recordings(
     """Writes one recording, with a new UUID, of the episodes of several, in the order of their times.
 
     It keeps infos, frames, images, final states, metadata, runs and attachments, but no signature and no certificate,
-    which would not fit. Episodes get new numbers, times stay. Recordings that were made at the same time, or that have
-    different numbers of sub-environments, become different sub-environments; their episodes are numbered one recording
-    after the other, and their runs tell them apart. The environment and the labels are those of the first recording.
+    which would not fit. Each step has the infos that were recorded of it. Episodes get new numbers, times stay.
+    Recordings that were made at the same time, or that have different numbers of sub-environments, become different
+    sub-environments; their episodes are numbered one recording after the other, and their runs tell them apart. The
+    environment and the labels are those of the first recording.
 
     Args:
         positions: returns the positions of the episodes to merge; by default of all.
@@ -135,17 +136,18 @@ def merge_excerpts(
     if lanes is not None:
         turns = [(i, np.arange(len(source.rows))) for i, source in enumerate(sources)]
     numbered, next_episode = _numbered(sources, turns)
+    codec = None if "infos" in without else _common_infos(sources)
     target = Assembler(container)
     facts = {"without": sorted(without)} if without else {}
     said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), "merge", **facts)}
     target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
-    if lanes is None and not without:
+    if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
     envs = first.num_envs if first.is_vector else None
     if lanes is not None:
         envs = max(lane + source.recording.num_envs for lane, source in zip(lanes, sources, strict=True))
     for source in sources:
-        _define_missing(source.recording, container, envs, without)
+        _define_missing(source.recording, container, envs, codec, without)
     container.define_channels()
     episodes, infos = [], []
     for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
@@ -158,8 +160,9 @@ def merge_excerpts(
         }
         layout = recording.layout.without(without) if without else None
         copier = EpisodeCopier(
-            recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout
-        )
+            recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout,
+            infos=_new_infos(recording, codec),
+        )  # fmt: skip
         episodes += copier.copy(rows)
         infos.append(copier.infos(rows))
     target.add_episodes(episodes)
@@ -181,8 +184,6 @@ def check_mergeable(
     """The excerpts with episodes, in the order of their times, and the attachments. Raises as `merge_excerpts` does."""
     sources = sorted((e for e in excerpts if len(e.rows)), key=lambda e: int(e.rows["start_time"].min()))
     _check_alike(sources, without)
-    if "infos" not in without:
-        _check_infos(sources)
     return sources, _attachments([source.recording for source in sources])
 
 
@@ -262,16 +263,15 @@ def _numbered(
 
 
 def _define_missing(
-    source: Recording, container: Container, envs: int | None, without: Collection[str]
+    source: Recording,
+    container: Container,
+    envs: int | None,
+    infos: InfoCodec | None,
+    without: Collection[str],
 ) -> None:
     """Adds the channels that earlier sources do not have; `envs` is None for a single environment."""
-    info = None
-    contents, topics = source.file.contents, source.file.topics
-    if INFO in topics and "infos" not in without:
-        channel = contents.channels[topics[INFO]]
-        text = contents.schemas[channel.schema_id].data.decode()
-        info = text, {key: value for key, value in channel.metadata.items() if key != "crc"}
-    png = png_leaves(container.channels or contents.channels)  # the first recording decides
+    info = None if infos is None or INFO not in source.file.topics else infos.schema()
+    png = png_leaves(container.channels or source.file.contents.channels)  # the first recording decides
     cameras = () if "frames" in without else source.cameras
     try:
         register_channels(container, source.name, source.layout.without(without), envs, info, cameras, png)
@@ -323,24 +323,26 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
                 )
 
 
-def _check_infos(sources: Sequence[Excerpt]) -> None:
-    """Raises UnmergeableError if the infos of two recordings have different fields: one channel holds them all."""
-    first: tuple[str, list[str]] | None = None
-    for recording, _ in sources:
-        channel = recording.file.topics.get(INFO)
-        if channel is None:
-            continue
-        named = InfoCodec.from_metadata(recording.file.contents.channels[channel].metadata).names
-        first = first or (recording.name, named)
-        if named != first[1]:
-            raise UnmergeableError(
-                f"{recording.name}: expected infos recorded as in {first[0]}, {_recorded_as(first[1])}, found "
-                f"{_recorded_as(named)}; only recordings with the same record_info can be merged"
-            )
+def _infos_of(recording: Recording) -> InfoCodec | None:
+    """The codec of a recording's infos; None if it has none."""
+    channel = recording.file.topics.get(INFO)
+    return (
+        None
+        if channel is None
+        else InfoCodec.from_metadata(recording.file.contents.channels[channel].metadata)
+    )
 
 
-def _recorded_as(names: Sequence[str]) -> str:
-    return f"record_info={list(names)!r:.200}" if names else "without names (record_info=True or a function)"
+def _new_infos(recording: Recording, codec: InfoCodec | None) -> tuple[InfoCodec, InfoCodec] | None:
+    """A recording's codec of infos, and the merged one's, if they differ."""
+    own = _infos_of(recording)
+    return None if own is None or codec is None or own.names == codec.names else (own, codec)
+
+
+def _common_infos(sources: Sequence[Excerpt]) -> InfoCodec | None:
+    """The codec of all infos: with a typed field for each entry that has one in a recording."""
+    found = [codec for source in sources if (codec := _infos_of(source.recording)) is not None]
+    return InfoCodec(list(dict.fromkeys(name for codec in found for name in codec.names))) if found else None
 
 
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
