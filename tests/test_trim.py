@@ -97,9 +97,13 @@ def test_of_a_part_of_several_recordings(tmp_path: Path) -> None:
     ds = tupli_mcap.open(paths).filter("seed == 1")
     new = tupli_mcap.open(ds.trim(slice(3, -3), tmp_path / "deep" / "n.mcap"))
     assert [len(episode) for episode in new] == [len(episode) - 6 for episode in ds]
-    said = made_of(Recording(tmp_path / "deep" / "n.mcap"))
-    assert said is not None
+    assert same([steps_of(episode) for episode in new], [steps_of(episode)[3:-3] for episode in ds])
+    merged = Recording(tmp_path / "deep" / "n.mcap")
+    assert verify_recording(merged.path).ok
+    said = merged.made_of
+    jsonschema.validate(said, json.loads((ROOT / "schemas" / "made_of.schema.json").read_text()))
     assert [one["name"] for one in said["sources"]] == ["0.mcap", "1.mcap"]
+    assert said["steps"] == {str(e.number): [3, len(e) + 3] for e in merged}
 
 
 def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
@@ -107,7 +111,7 @@ def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
     for steps in (slice(600, None), slice(0, 0), slice(None, None, 2)):
         with pytest.raises(RecordingError):
             Recording(source).trim(steps, tmp_path / "n.mcap")
-    with pytest.raises(DatasetError, match="exists"):
+    with pytest.raises(DatasetError, match="one of the recordings themselves"):
         Recording(source).trim(slice(1, None), source)
     with pytest.raises(RecordingError, match="the recording itself"):
         tupli_mcap.recording.trim_recording(Recording(source), source, {0: slice(1, None)}, overwrite=True)
@@ -142,8 +146,8 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
             assert Recording(target).num_steps == sum(n_steps) - 8
             said = tupli_mcap.open(target).made_of[str(target)]
             assert said == Recording(target).made_of
-            earlier = said["earlier"]
-            assert [one["sources"][0]["name"] for one in earlier] == ["a.mcap", "b.mcap"]
+            assert [one["name"] for one in said["sources"]] == ["a.mcap", "b.mcap"]
+            assert list(said["steps"].values()) == [[2, len(episode)] for episode in tupli_mcap.open(first)]
             words = ["filter", *map(str, sources), "seed == 1", "-o", str(target), "--force"]
             assert CliRunner().invoke(app, words).exit_code == 0
             assert [episode.seed for episode in Recording(target)] == [1, 1]

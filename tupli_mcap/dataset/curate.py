@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
-from pathlib import Path, PurePath
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.dataset.sources import DatasetError, FilesSource
+from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
@@ -24,10 +23,10 @@ from tupli_mcap.recording import (
     trim_recording,
 )
 from tupli_mcap.recording.edit import merge, split
-from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, merge_excerpts
+from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.edit.split import Part
-from tupli_mcap.recording.edit.trim import TrimReport
+from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
@@ -157,6 +156,17 @@ def filter_dataset(
     return report._replace(size=save(kept, target, overwrite=overwrite, query=query).stat().st_size)
 
 
+def trim(
+    dataset: Dataset, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
+) -> Path:
+    """See `Dataset.trim`."""
+    _check_new(dataset, target, overwrite=overwrite)
+    kept: dict[str, dict[int, slice]] = {name: {} for name in dataset._chosen}
+    for header, episode in zip(dataset.headers, dataset, strict=True):
+        kept[header.recording][header.episode] = steps if isinstance(steps, slice) else steps(episode)
+    return _save_trimmed(dataset, kept, target)
+
+
 def trim_dataset(
     dataset: Dataset,
     steps: slice,
@@ -172,36 +182,45 @@ def trim_dataset(
     """
     target = file_path(target)
     _check_new(dataset, target, overwrite=overwrite)
-    headers = dataset.headers
-    lengths = [
-        len(range(*steps.indices(header.n_tuples))) if header.id in chosen else header.n_tuples
-        for header in headers
-    ]
-    report = TrimReport(target, len(headers), sum(lengths), dataset.n_steps - sum(lengths))
-    if short := next((header for header, length in zip(headers, lengths, strict=True) if not length), None):
-        raise RecordingError(
-            f"{short.recording}: expected steps of episode {short.episode} that stay, found {short.n_tuples} in all; "
-            "choose other steps, or other episodes"
-        )
+    lengths: list[int] = []
+    kept: dict[str, dict[int, slice]] = {name: {} for name in dataset._chosen}
+    for header in dataset.headers:
+        lengths.append(header.n_tuples)
+        if header.id in chosen:
+            kept[header.recording][header.episode] = steps
+            lengths[-1] = len(range(*steps.indices(header.n_tuples)))
+        if not lengths[-1]:
+            raise RecordingError(
+                f"{header.recording}: expected steps of episode {header.episode} that stay, found {header.n_tuples} in "
+                "all; choose other steps, or other episodes"
+            )
+    report = TrimReport(target, len(lengths), sum(lengths), dataset.n_steps - sum(lengths))
     if dry_run:
+        check_mergeable(_excerpts(dataset))
         return report
+    return report._replace(size=_save_trimmed(dataset, kept, target).stat().st_size)
+
+
+def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
+    """Writes the episodes of a dataset; `kept`: by recording and number, the steps that stay."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
-        parts: list[Path] = []
-        for name in dataset._chosen:
-            part = dataset[[header.recording == name for header in headers]]
-            numbers = {header.episode for header in part.headers if header.id in chosen}
-            parts.append(Path(folder) / str(len(parts)) / PurePath(name).name)
-            part.trim(partial(_kept_of, steps=steps, numbers=numbers), parts[-1])
-        if len(parts) == 1:
-            parts[0].replace(target)
-        else:
-            save(type(dataset)(FilesSource(parts)), target, overwrite=overwrite)
-    return report._replace(size=target.stat().st_size)
+    if len(dataset._chosen) == 1:
+        ((name, numbers),) = dataset._chosen.items()
+        trim_recording(dataset._open(name), target, kept[name], episodes=sorted(numbers), overwrite=True)
+        return target
+    excerpts = [
+        excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
+        for name, excerpt in zip(dataset._chosen, _excerpts(dataset), strict=True)
+    ]
+    with replacing(target) as (fd, _):
+        merge_excerpts(excerpts, Container(fd, str(target), "zstd"))
+    return target
 
 
-def _kept_of(episode: Episode, *, steps: slice, numbers: Collection[int]) -> slice:
-    return steps if episode.number in numbers else slice(None)
+def _excerpts(dataset: Dataset) -> list[Excerpt]:
+    """The episodes of a dataset, by recording."""
+    opened = [(dataset._open(name), numbers) for name, numbers in dataset._chosen.items()]
+    return [Excerpt(one, one.index[np.isin(one.index["episode"], numbers)]) for one, numbers in opened]
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
@@ -237,12 +256,8 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, qu
         said = say_made_of([source], "filter", **({"query": known} if known else {}))
         rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
-    excerpts = []
-    for name, numbers in chosen.items():
-        source = dataset._open(name)
-        excerpts.append(Excerpt(source, source.index[np.isin(source.index["episode"], numbers)]))
     with replacing(target) as (fd, _):
-        merge_excerpts(excerpts, Container(fd, str(target), "zstd"))
+        merge_excerpts(_excerpts(dataset), Container(fd, str(target), "zstd"))
     return target
 
 
@@ -254,28 +269,7 @@ def relabel(
     *,
     overwrite: bool,
 ) -> Path:
-    """See `Dataset.map`."""
-    make = partial(relabel_recording, function=function, fields=fields)
-    return _made_anew(dataset, target, make, overwrite=overwrite)
-
-
-def trim(
-    dataset: Dataset, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
-) -> Path:
-    """See `Dataset.trim`."""
-
-    def make(recording: Recording, target: Path, **options: Any) -> None:
-        kept = {
-            episode.number: steps if isinstance(steps, slice) else steps(episode)
-            for episode in recording.episodes
-        }
-        trim_recording(recording, target, kept, overwrite=True, **options)
-
-    return _made_anew(dataset, target, make, overwrite=overwrite)
-
-
-def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, overwrite: bool) -> Path:
-    """Makes `target` of one recording with all episodes of a dataset; several recordings are merged first."""
+    """See `Dataset.map`. Several recordings are merged first."""
     if target.exists() and not overwrite:
         raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -283,5 +277,5 @@ def _made_anew(dataset: Dataset, target: Path, make: Callable[..., None], *, ove
         chosen = save(dataset, Path(folder) / target.name, overwrite=False)
         with Recording(chosen) as recording:
             sources = [dataset._open(name) for name in dataset._chosen]
-            make(recording, target, sources=sources)
+            relabel_recording(recording, target, function=function, fields=fields, sources=sources)
     return target

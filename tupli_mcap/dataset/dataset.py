@@ -485,7 +485,7 @@ class Dataset(RandomAccess):
         loses its beginning has no seed, because no reset leads to its first state.
 
         Raises:
-            DatasetError: there is no episode, or the target exists (without `overwrite`).
+            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
         return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)

@@ -6,9 +6,10 @@ import contextlib
 import heapq
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, Trim
 from tupli_mcap.recording.edit.made_of import say_made_of
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
@@ -63,10 +64,11 @@ class UnmergeableError(RecordingError):
 
 
 class Excerpt(NamedTuple):
-    """Some episodes of a recording: rows of its index, in order."""
+    """Some episodes of a recording: rows of its index, in order; and by number, the steps that stay of an episode."""
 
     recording: Recording
     rows: Array
+    trims: Mapping[int, Trim] = MappingProxyType({})
 
 
 def merge_recordings(
@@ -136,10 +138,17 @@ def merge_excerpts(
     if lanes is not None:
         turns = [(i, np.arange(len(source.rows))) for i, source in enumerate(sources)]
     numbered, next_episode = _numbered(sources, turns)
+    trims = {
+        str(number + shift): [trim.start, trim.stop]
+        for (i, _), (_, rows, shift) in zip(turns, numbered, strict=True)
+        for number in rows["episode"].tolist()
+        if (trim := sources[i].trims.get(number)) is not None
+    }
     codec = None if "infos" in without else _common_infos(sources)
     target = Assembler(container)
-    facts = {"without": sorted(without)} if without else {}
-    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), "merge", **facts)}
+    how = "trim" if trims else "merge"
+    facts = {"without": sorted(without)} if without else {"steps": trims} if trims else {}
+    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), how, **facts)}
     target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
     if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
@@ -161,7 +170,7 @@ def merge_excerpts(
         layout = recording.layout.without(without) if without else None
         copier = EpisodeCopier(
             recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout,
-            infos=_new_infos(recording, codec),
+            infos=_new_infos(recording, codec), trims=sources[i].trims,
         )  # fmt: skip
         episodes += copier.copy(rows)
         infos.append(copier.infos(rows))
@@ -195,12 +204,12 @@ def _lanes(sources: Sequence[Excerpt], turns: int) -> list[int] | None:
     when another one has ended takes its place. So do recordings that alternate too often: each turn of a recording
     ends a chunk and reads all of its infos.
     """
-    alike = len({(recording.is_vector, recording.num_envs) for recording, _ in sources}) == 1
+    alike = len({(recording.is_vector, recording.num_envs) for recording, _, _ in sources}) == 1
     if alike and turns < max(_MOST_TURNS, len(sources) + 1) and not _overlap(sources):
         return None
     free: list[int] = []  # by sub-environment, when its last episode ends
     lanes = []
-    for recording, rows in sources:  # in the order in which they begin
+    for recording, rows, _ in sources:  # in the order in which they begin
         begin, n = int(rows["start_time"].min()), recording.num_envs
         at = 0
         while any(end > begin for end in free[at : at + n]):
@@ -296,7 +305,7 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
         raise UnmergeableError(
             f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer"
         )
-    for other, rows in sources[1:]:
+    for other, rows, _ in sources[1:]:
         description = other.layout.without(without).to_metadata()
         for name in _SPACES:
             if description[name] != expected[name]:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.copy_episodes import Trim
@@ -33,7 +35,7 @@ def trim_recording(
     target: Path,
     steps: Mapping[int, slice],
     *,
-    sources: Sequence[Recording] = (),
+    episodes: Sequence[int] | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> TrimReport:
@@ -48,7 +50,7 @@ def trim_recording(
         source: the recording to read.
         target: path of the new one.
         steps: by number of the episode, the steps that stay; other episodes stay whole.
-        sources: the recordings that `made_of.json` names, if that is not `source`.
+        episodes: numbers of the episodes to keep (all by default).
 
     Raises:
         RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
@@ -58,26 +60,31 @@ def trim_recording(
         raise RecordingError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
     if target.exists() and source.path is not None and target.samefile(source.path):
         raise RecordingError(f"{target} is the recording itself; write to another path")
-    by_number = {episode.number: episode for episode in source.episodes}
-    unknown = sorted(set(steps) - set(by_number))
-    if unknown:
-        raise RecordingError(f"{source.name}: there is no episode {unknown[0]}")
-    trims: dict[int, Trim] = {}
-    for number, kept in steps.items():
-        trim = _trim(source, by_number[number], kept)
-        if trim is not None:
-            trims[number] = trim
-    left_out = sum(len(by_number[number]) - (trim.stop - trim.start) for number, trim in trims.items())
-    counts = {str(number): [trim.start, trim.stop] for number, trim in trims.items()}
-    report = TrimReport(target, len(source), source.num_steps - left_out, left_out)
+    trims = trims_of(source, steps)
+    rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
+    total, lengths = (
+        int(rows["length"].sum()),
+        dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True)),
+    )
+    left_out = sum(lengths[number] - (trim.stop - trim.start) for number, trim in trims.items())
+    report = TrimReport(target, len(rows), total - left_out, left_out)
     if dry_run:
         return report
-    said = say_made_of(sources or [source], "trim", steps=counts)
+    said = say_made_of([source], "trim", steps={str(n): [trim.start, trim.stop] for n, trim in trims.items()})
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), "zstd")
         metadata = new_metadata(source)
-        write(source, container, metadata, None, said, trims=trims, signed=False, left_out=STATEMENTS)
+        write(source, container, metadata, episodes, said, trims=trims, signed=False, left_out=STATEMENTS)
     return report._replace(size=target.stat().st_size)
+
+
+def trims_of(source: Recording, steps: Mapping[int, slice]) -> dict[int, Trim]:
+    """The trims of those episodes of which not all steps stay. Raises RecordingError as `trim_recording` does."""
+    by_number = {episode.number: episode for episode in source.episodes} if steps else {}
+    if unknown := sorted(set(steps) - set(by_number)):
+        raise RecordingError(f"{source.name}: there is no episode {unknown[0]}")
+    found = {number: _trim(source, by_number[number], kept) for number, kept in steps.items()}
+    return {number: trim for number, trim in found.items() if trim is not None}
 
 
 def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
