@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
+import buckets
 import pytest
 from acknowledged import Thing, User
 from persons import Person
@@ -18,14 +20,19 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))  # where its proces
 import server_faults
 
 
-@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # of boto3
 @pytest.mark.parametrize(("engine", "kills"), [("sqlite", 1), ("postgresql", 3)])
 def test_nothing_acknowledged_is_lost_and_nothing_half_there(
     engine: str, kills: int, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     if engine == "postgresql":
         request.getfixturevalue("postgres")  # skips where it is not installed
-    rounds = list(server_faults.campaign(engine, kills, 7, tmp_path))
+    try:
+        rounds = list(server_faults.campaign(engine, kills, 7, tmp_path))
+    except buckets.NoStoreError as err:
+        if os.environ.get("CI"):
+            raise
+        pytest.skip(str(err))
     assert [wrong for _, _, wrong in rounds if wrong] == []
 
 

@@ -4,9 +4,8 @@
 
 Three users store, fetch, publish and delete recordings and artifacts at the same time, through a proxy that refuses,
 resets, stalls, answers 503 and flips bits. At a random moment, the server is killed, its PostgreSQL crashes, or its
-bucket is cut off; a while later it is back. A bucket that is back resets some connections, and answers some with 503.
-(The bucket's stand-in keeps objects in memory, so a proxy before it goes away instead.) Every tenth kill hits a server
-that upgrades the tables of the first version. After each:
+object store (SeaweedFS) is killed; a while later it is back. A store that is back resets some connections, and answers
+some with 503. Every tenth kill hits a server that upgrades the tables of the first version. After each:
 
 - everything acknowledged is there, whole and exact, and nothing that was deleted;
 - a request without an answer has happened completely, or not at all, and not twice;
@@ -21,7 +20,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import logging
 import multiprocessing
 import os
 import random
@@ -119,13 +117,13 @@ class Campaign:
         self._folder, self._stack, self._seed = folder, stack, seed
         self.cluster: postgres.Cluster | None = None
         self.store: Between | None = None
-        self._bucket: buckets.Bucket | None = None
+        self._bucket: buckets.StoredBucket | None = None
         # What waits to be deleted is deleted at the next start, instead of a day later: nobody else is at work then.
         settings = Settings(folder / "served", pending_seconds=0, access_seconds=1 << 20)
         environment = {"TUPLI_MCAP_ADMIN_PASSWORD": PASSWORD}
         if engine == "postgresql":
             self.cluster = stack.enter_context(postgres.cluster())
-            self._bucket = stack.enter_context(buckets.bucket())
+            self._bucket = stack.enter_context(buckets.stored_bucket())
             self.store = stack.enter_context(between(self._bucket.address))
             environment |= {key: value for key, value in os.environ.items() if key.startswith("AWS_")}
             environment["AWS_ENDPOINT_URL"] = self.store.url
@@ -185,11 +183,11 @@ class Campaign:
         for _ in range(rng.choice((0, 0, 3, 8))):
             self._proxy.faults.append(Fault(rng.choice(_FAULTS), int(10 ** rng.uniform(1, 5.5))))
         time.sleep(rng.uniform(0.05, 0.8))
-        if victim == "bucket" and self.store is not None:
-            for _ in range(rng.choice((0, 4, 12))):  # once it is back
-                self.store.faults.append(Fault(rng.choice(("5xx", "reset")), int(10 ** rng.uniform(1, 5.5))))
         self.counts[victim] += 1
         getattr(self, f"_kill_{victim}")(rng.choice((0, rng.uniform(0, 0.5))))
+        if victim == "bucket" and self.store is not None:
+            for _ in range(rng.choice((0, 4, 12))):
+                self.store.faults.append(Fault(rng.choice(("5xx", "reset")), int(10 ** rng.uniform(1, 5.5))))
         time.sleep(rng.uniform(0, 0.2))
 
     # --- what is killed ---
@@ -206,10 +204,10 @@ class Campaign:
         self.cluster.start()
 
     def _kill_bucket(self, seconds: float) -> None:
-        assert self.store is not None
-        self.store.go_away()
+        assert self._bucket is not None
+        self._bucket.stop()
         time.sleep(seconds)
-        self.store.come_back()
+        self._bucket.start()
 
     # --- what must hold ---
 
@@ -303,7 +301,6 @@ class Campaign:
 
 def campaign(engine: str, kills: int, seed: int, folder: Path) -> Iterator[tuple[int, str, list[str]]]:
     """Runs kills; yields the number of each, what was killed, and what was wrong then."""
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # the bucket's log
     with contextlib.ExitStack() as stack:
         made = Campaign(engine, folder, seed, stack)
         yield from made.run(kills)
