@@ -15,7 +15,7 @@ bodies: oversized, of no length, half, too deep     test_server_limits
     uploads that are longer than announced          test_server.test_what_is_no_recording_is_not_kept
     heads without an end, compressed bombs          TestSizes
 user enumeration by text and by time                TestEnumeration
-names in uploads, which make no links               TestFiles
+names in uploads and in files, which lead nowhere   TestFiles
 SSRF: addresses that a file or a request gives      TestFiles
 """
 
@@ -44,6 +44,9 @@ from persons import Person, announced
 from served import served
 from serving import ENGINES, serving, settings_of
 
+from tupli_mcap import Recording
+from tupli_mcap.recording import rewrite_recording
+from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
@@ -437,6 +440,24 @@ class TestFiles:
             path for path in (tmp_path / "served").rglob("*") if path.is_symlink() or "evil" in path.name
         ]
         assert written == []
+
+    def test_the_benchmark_that_a_recording_names_leads_nowhere(self, tmp_path: Path) -> None:
+        """Its id is part of the name under which a file is kept."""
+        record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=20, seed=5)
+        settings = Settings(tmp_path / "lab" / "served", pending_seconds=0)
+        with serving(settings) as url, Recording(tmp_path / "run.mcap") as run:
+            (eve,) = people(Person(url, "admin"), "eve")
+            for uri in ("../../../outside", "x\0y", "a" * 300, f"{tmp_path}/outside"):
+                path = tmp_path / "evil.mcap"
+                rewrite_recording(run, path, benchmark_id=uri)
+                data = path.read_bytes()
+                begun, headers = eve.begin(data), {"Upload-Offset": "0"}
+                sent = eve.call("PATCH", begun.headers["Location"], headers=headers, content=data)
+                assert (sent.status_code, sent.json()["error"]) == (404, "NotFoundError"), uri
+                path.unlink()
+        assert {path.name for path in tmp_path.iterdir()} == {"lab", "run.mcap"}
+        assert not (settings.directory / "recordings").exists()
+        Library(settings).close()  # which cleans up
 
     def test_addresses_that_are_given_to_it_are_not_asked(self, lab: Lab, tmp_path: Path) -> None:
         """A listener nobody connects to, though its address stands wherever a request or a file can carry one."""

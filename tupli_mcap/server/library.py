@@ -244,8 +244,11 @@ class Library:
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
-            place = arrivals.new_name(recording.benchmark_id)
             with self.database.writing() as connection:
+                arrivals.demand_benchmark(
+                    connection, caller, recording.benchmark_id
+                )  # it is part of the name
+                place = arrivals.new_name(recording.benchmark_id)
                 pend(connection, place)
             try:
                 self.blobs.keep(place, path)

@@ -26,13 +26,25 @@ from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = ["new_name", "register", "stored_already"]
+__all__ = ["demand_benchmark", "new_name", "register", "stored_already"]
 
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
 
+def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
+    """Raises NotFoundError unless a benchmark of this id is stored, and the caller may read it; an empty id is none."""
+    if not benchmark_id:
+        return
+    seen = readable(caller, Right.BENCHMARK_READ, ITEM.c.created_by, ITEM.c.published_in)
+    there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
+    if not is_hash(benchmark_id) or not connection.execute(there).first():
+        raise NotFoundError(
+            f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
+        )
+
+
 def new_name(benchmark_id: str) -> str:
-    """A new name for a recording, of time (UTC) and random digits."""
+    """A new name for a recording of a stored benchmark, or of none: of time (UTC) and random digits."""
     now = datetime.datetime.now(datetime.UTC)
     return f"recordings/{benchmark_id or _PLAIN}/{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
 
@@ -70,7 +82,7 @@ def register(
     numbers = {int(number) for number in recording.index["episode"]}
     if not numbers:
         raise StorageError("expected a recording with episodes, found one without any")
-    _demand_benchmark(connection, caller, recording.benchmark_id)
+    demand_benchmark(connection, caller, recording.benchmark_id)
     earlier = _parts(connection, caller, recording.uuid)
     replaced = [part for part in earlier if part.seen_by.keys() <= numbers]
     sidecar = Sidecar(uuid=recording.uuid)
@@ -142,14 +154,3 @@ def _put(connection: Connection, caller: Caller, recording: Recording, name: str
         rows=rows_of(recording, sidecar, created_by=caller.name),
         runs=runs_of(recording),
     )
-
-
-def _demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
-    if not benchmark_id:
-        return
-    seen = readable(caller, Right.BENCHMARK_READ, ITEM.c.created_by, ITEM.c.published_in)
-    there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
-    if not is_hash(benchmark_id) or not connection.execute(there).first():
-        raise NotFoundError(
-            f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
-        )
