@@ -350,7 +350,7 @@ class TestMerge:
         infos: list[Any] = [["height"], True, ["left", "height"], False]
         paths = [record(tmp_path / f"{i}.mcap", record_info=one, seed=i) for i, one in enumerate(infos)]
         venv = SyncVectorEnv([lambda: Sampled("box")] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
-        with RecordVector(venv, tmp_path / "v.mcap", attachments={}, record_info=["note"]) as vector:
+        with RecordVector(venv, tmp_path / "v.mcap", attachments={}, record_info=True) as vector:
             vector.reset(seed=1)
             for _ in range(20):
                 vector.step(vector.action_space.sample())

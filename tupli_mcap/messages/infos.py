@@ -46,13 +46,15 @@ class InfoCodec:
         lines += [f"float64 {field}\nbool has_{field}\nuint8[7] pad_{field}\n" for field in self._fields]
         return "".join([*lines, "string json\n"]), {"fields": jsonvalue.dumps(self.names)}
 
-    def encode(self, episode: int, step: int, info: Mapping[str, Any]) -> bytes:
-        """The CDR body of a step's info."""
+    def encode(
+        self, episode: int, step: int, info: Mapping[str, Any], kinds: Sequence[type] = (float, np.float64)
+    ) -> bytes:
+        """The CDR body of a step's info. Values of `kinds` go into typed fields, which are read as `float`."""
         rest = dict(info)
         parts = [_HEAD.pack(episode, step)]
         for name in self.names:
             value = rest.get(name)
-            if type(value) in (float, np.float64):
+            if type(value) in kinds:
                 del rest[name]
                 parts.append(_FIELD.pack(value, True))
             else:

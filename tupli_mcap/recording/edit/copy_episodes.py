@@ -388,7 +388,7 @@ class EpisodeCopier:
                     new = self._renumbered(body)
                     if self._info_codecs is not None:
                         own, target = self._info_codecs
-                        new = target.encode(*own.decode(memoryview(new)))
+                        new = target.encode(*own.decode(memoryview(new)), kinds=(float,))
                     yield time_ns, new
 
 
