@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
-from tupli_mcap.cli.output import begin_json, print_json_error
+from tupli_mcap.cli.output import begin_json, print_json_error, with_options
 from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust, upkeep
 from tupli_mcap.cli.terminal import (
     fail,
@@ -30,7 +30,7 @@ from tupli_mcap.cli.terminal import (
     stop_writing,
     warnings_in_one_line,
 )
-from tupli_mcap.errors import FilterError, RecordingError, TupliError, UntrustedError, did_you_mean
+from tupli_mcap.errors import FilterError, TupliError, did_you_mean
 
 __all__ = ["app", "main"]
 
@@ -137,10 +137,8 @@ def _report(err: BaseException, *, as_json: bool) -> int:
         return INTERRUPTED
     if isinstance(err, FilterError):
         code = USAGE  # filters come from the command line only
-    elif isinstance(err, UntrustedError):  # each command that may raise it has --trust
-        message = message.replace("pass trust=True", "pass --trust")
-    elif isinstance(err, RecordingError):  # only `record` has modes
-        message = message.replace('mode="a"', "--mode a").replace('"w" to replace', "w to replace")
+    elif isinstance(err, TupliError):
+        message = with_options(err)
     elif isinstance(err, MemoryError):
         message = f"not enough memory ({message or 'out of memory'}); --debug shows where"
     elif isinstance(err, OSError):
@@ -151,7 +149,7 @@ def _report(err: BaseException, *, as_json: bool) -> int:
         context = getattr(err, "ctx", None)
         if context is not None:
             message = f"{message.rstrip('.')}; see {context.command_path} --help"
-    elif not isinstance(err, TupliError):
+    else:
         if as_json and isinstance(err, Exception):
             print_json_error(kind, message, FAILED)
         raise err
