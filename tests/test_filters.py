@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
+from sqlalchemy import Connection, false, not_, or_, select
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.jsonvalue import dumps_plain
@@ -41,8 +42,11 @@ from tupli_mcap.schema import (
     parse_filter,
     split_key,
 )
+from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.times import local_text, span_of, time_ns
 from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.filter_sql import narrowed
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
 
 STAMP = RecordingStamp(1, 2, 3)
 UUID = "0123456789abcdef0123456789abcdef"
@@ -383,6 +387,63 @@ class TestOneMeaning:
                     asked = operation(key=key, value=value)
                     expected = [h.episode for h in headers if compile_predicate(asked)(h)]
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
+                    assert catalog.count(asked) == len(expected), asked
+
+    @pytest.mark.parametrize("of", ["sqlite", "postgresql"])
+    def test_sql_is_sure_of_no_episode_that_does_not_match(self, of: str, postgres: Cluster) -> None:
+        long = "x" * 499
+        held = [
+            *NUMBERS,
+            True,
+            False,
+            None,
+            [1],
+            {"y": 1},
+            "",
+            "1",
+            long,
+            long + "x",
+            long + "xy",
+            long + "xz",
+        ]
+        compared = [
+            0,
+            1,
+            True,
+            None,
+            0.1,
+            2**53,
+            2**53 + 1,
+            2**63 - 1,
+            math.inf,
+            math.nan,
+            10**400,
+            *held[-6:],
+        ]
+        with postgres.database() as url, Catalog(None) if of == "sqlite" else ServerCatalog(url) as catalog:
+            rows = [base_row({"x": value}, 0.5) for value in held]
+            fill(catalog, [header_of(i, row) for i, row in enumerate([*rows, base_row({}, 0)])])
+            catalog.declare_key("metadata.x")
+            headers = catalog.episodes()
+            for value, operation in itertools.product(compared, (*ORDERED, FilterIN)):
+                if operation in ORDERED[2:] and not isinstance(value, int | float | str):
+                    continue
+                if operation in ORDERED[2:] and isinstance(value, bool):
+                    continue
+                asked = operation(key="metadata.x", value=[value, 7] if operation is FilterIN else value)
+                for each in (asked, ~asked, ~asked | (F("episode") < 5)):
+                    matches = compile_predicate(each, EpisodeHeader)
+                    expected = {h.episode for h in headers if matches(h)}
+                    assert catalog.count(each) == len(expected), each
+                    with catalog._read() as connection:
+                        assert surely(connection, each) <= expected, each
+
+
+def surely(connection: Connection, filter: BaseFilter) -> set[int]:
+    """The episodes that match according to SQL alone."""
+    found = narrowed(bound(filter, EpisodeHeader), {("metadata", "x"): 0})
+    rows = select(EPISODE.c.episode).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
+    return set(connection.execute(rows.where(found.may, not_(or_(false(), *found.unsure)))).scalars())
 
 
 class TestTimes:

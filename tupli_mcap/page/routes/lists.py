@@ -27,7 +27,7 @@ __all__ = ["Table", "router", "table_of"]
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _DATASETS: Final = 50  # on a page
 _ROWS: Final = 50
-_COUNTED: Final = 10_000  # beyond so many episodes, a page says "More than"
+_COUNTED: Final = 1_000  # beyond so many episodes, a page says "More than"
 _KEYS: Final = 4  # most keys of metadata that get a column
 
 

@@ -1,8 +1,8 @@
 """Turns one comparison of a filter into SQL: of columns, of the values of declared keys, or of metadata.
 
 A database may compare values differently from Python: numbers in metadata are compared as the nearest floats, texts
-that SQL and Python may order differently are not compared. So each comparison becomes a condition that is true for
-all matching rows, and that says whether it is exact: true for no others.
+that SQL and Python may order differently are not compared. So each comparison becomes two conditions: one for all
+rows that may match, and one for those of them that Python has to look at.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import (
+    Select,
     and_,
     case,
     exists,
@@ -30,12 +31,12 @@ from sqlalchemy import (
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.messages.episodes import END_NAMES
-from tupli_mcap.schema import BaseFilter, FilterType
+from tupli_mcap.schema import BaseFilter, FilterEQ, FilterType
 from tupli_mcap.schema.filters import ORDERING, path_of
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import can_search, kind_at, text_at, value_at
-from tupli_mcap.storage.catalog.rows import indexed_text, nearest_float
+from tupli_mcap.storage.catalog.rows import indexed_text, is_whole, nearest_float
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     RECORDING,
@@ -45,7 +46,7 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["ALL", "Condition", "Narrowed", "compared", "near_value", "of_runs", "recorded"]
+__all__ = ["ALL", "Condition", "Narrowed", "compared", "near_value", "of_runs", "recorded", "unsure_value"]
 
 Condition = ColumnElement[bool]
 
@@ -58,6 +59,7 @@ _SMALLEST: Final = 1e-300
 _LARGEST: Final = sys.float_info.max
 _LEAST_INTEGER, _MOST_INTEGER = -(2**63), 2**63 - 1
 
+_FLAGS: Final = frozenset((0.0, 1.0))  # as which `VALUE` has flags, too
 _LONGEST_PATTERN: Final = 1000  # databases have limits
 
 _EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
@@ -90,13 +92,25 @@ _CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
 
 
 class Narrowed(NamedTuple):
-    """A condition that is true for all rows that match a filter; if `exact`, for no others."""
+    """What SQL can tell of a filter.
 
-    condition: Condition
-    exact: bool
+    Attributes:
+        may: a condition that is true for all rows that match.
+        unsure: where one of these conditions is true, SQL cannot tell whether a row matches. Without any, `may` is true
+            for no other rows. Unless one of them is simply true, neither they nor `may` are ever NULL.
+        ids: a query of ids of episodes, and of their recordings, that an index finds: all that match are among them.
+    """
+
+    may: Condition
+    unsure: Sequence[Condition] = ()
+    ids: Select[Any] | None = None
+
+    def negated(self) -> Narrowed:
+        """The same of the opposite filter."""
+        return self._replace(may=or_(not_(self.may), *self.unsure))
 
 
-ALL: Final = Narrowed(true(), exact=False)
+ALL: Final = Narrowed(true(), unsure=[true()])
 
 
 def compared(filter: BaseFilter) -> Narrowed:
@@ -105,7 +119,7 @@ def compared(filter: BaseFilter) -> Narrowed:
     if name in _CHOICES:
         test = scalar_test(filter)
         chosen = (condition for choice, condition in _CHOICES[name].items() if test(choice))
-        return Narrowed(or_(false(), *chosen), exact=True)
+        return Narrowed(or_(false(), *chosen))
     if name in _TEXTS:
         return _of_texts(filter, _TEXTS[name])
     if name in _INTEGERS:
@@ -114,19 +128,19 @@ def compared(filter: BaseFilter) -> Narrowed:
         return _of_ids(filter)
     if name == "published_in":
         return _of_groups(filter)
+    if name in _NUMBERS:
+        return _of_numbers(filter, _NUMBERS[name])
     if filter.type is FilterType.NE or name == "run":  # few runs have many episodes
         return ALL
-    if name in _NUMBERS:
-        return Narrowed(_near(filter, _NUMBERS[name]), exact=False)
-    return Narrowed(_in_metadata(filter), exact=False)
+    return ALL._replace(may=_in_metadata(filter))
 
 
 def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
     if filter.type is FilterType.IN:
         return _one_of(column, [escape_text(value) for value in filter.value])
     if filter.type is FilterType.CONTAINS:
-        return Narrowed(_occurs(filter.value, column), exact=False)
-    return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)), exact=True)
+        return ALL._replace(may=_occurs(filter.value, column))
+    return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)))
 
 
 def _occurs(wanted: str, column: ColumnElement[Any]) -> Condition:
@@ -144,30 +158,28 @@ def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
     if not _LEAST_INTEGER <= wanted <= _MOST_INTEGER:
         below = wanted < 0
         of_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
-        return Narrowed(true() if of_all or kind is FilterType.NE else false(), exact=True)
+        return Narrowed(true() if of_all or kind is FilterType.NE else false())
     rounded = math.ceil if kind in (FilterType.GEQ, FilterType.LT) else math.floor
-    return Narrowed(_OPERATORS[kind](column, rounded(wanted)), exact=True)
+    return Narrowed(_OPERATORS[kind](column, rounded(wanted)))
 
 
 def _one_of(column: ColumnElement[Any], values: Sequence[Any]) -> Narrowed:
-    return Narrowed(_any_of(column, values), exact=len(values) <= _MOST_VALUES)
+    return Narrowed(_any_of(column, values), [] if len(values) <= _MOST_VALUES else ALL.unsure)
 
 
 def recorded(filter: BaseFilter) -> Condition:
     """Recordings of the time that a filter names."""
     parts = []
     if filter.type in (FilterType.GT, FilterType.GEQ, FilterType.EQ):
-        parts.append(_of_integers(filter.model_copy(update={"type": FilterType.GEQ}), TALLY.c.last).condition)
+        parts.append(_of_integers(filter.model_copy(update={"type": FilterType.GEQ}), TALLY.c.last).may)
     if filter.type in (FilterType.LT, FilterType.LEQ, FilterType.EQ):
-        parts.append(
-            _of_integers(filter.model_copy(update={"type": FilterType.LEQ}), TALLY.c.first).condition
-        )
+        parts.append(_of_integers(filter.model_copy(update={"type": FilterType.LEQ}), TALLY.c.first).may)
     return exists().where(TALLY.c.recording_id == RECORDING.c.id, *parts) if parts else true()
 
 
 def of_runs(filter: BaseFilter) -> Condition:
     """Recordings whose runs, which are JSON, hold a text that is the same in all JSON."""
-    texts = filter.value if filter.type is FilterType.IN else [filter.value]
+    texts = _values(filter)
     if len(texts) > _MOST_VALUES or not all(
         isinstance(text, str) and _PLAIN.fullmatch(text) for text in texts
     ):
@@ -175,13 +187,19 @@ def of_runs(filter: BaseFilter) -> Condition:
     return or_(false(), *(RECORDING.c.runs.contains(f'"{text}"', autoescape=True) for text in texts))
 
 
-def _near(filter: BaseFilter, number: ColumnElement[Any]) -> Condition:
-    """A comparison, other than NE, with what is stored as the nearest float."""
+def _of_numbers(filter: BaseFilter, column: ColumnElement[Any]) -> Narrowed:
+    """A comparison with a column that has the nearest floats, and NULL for NaN, too."""
+    if filter.type is FilterType.NE:
+        return _of_numbers(FilterEQ(key=filter.key, value=filter.value), column).negated()
     numbers, _ = _wanted(filter)
+    known = column.is_not(None)
     if filter.type in ORDERING:
-        return _ordered(filter, number, numbers)
-    null = any(value is None for value in (filter.value if filter.type is FilterType.IN else [filter.value]))
-    return or_(_any_of(number, numbers), number.is_(None) if null else false())
+        found = _ordered(filter, column, numbers)
+    else:
+        found = _equal(column, numbers)
+    null = [column.is_(None)] if None in _values(filter) else []
+    unsure = [and_(known, condition) for condition in found.unsure]
+    return Narrowed(or_(and_(known, found.may), *null), [*unsure, *null])
 
 
 def near_value(filter: BaseFilter) -> list[Condition]:
@@ -190,32 +208,66 @@ def near_value(filter: BaseFilter) -> list[Condition]:
     number, text = VALUE.c.number, VALUE.c.text
     numbers, texts = _wanted(filter)
     if filter.type in ORDERING:
-        return [_ordered(filter, number, numbers) if numbers else _ordered(filter, text, texts)]
-    conditions = [and_(number.is_(None), text.is_(None))]  # null, a list, ...
-    conditions += [_any_of(number, numbers)] if numbers else []
-    conditions += [and_(number.is_(None), _any_of(text, texts))] if texts else []
+        return [(_ordered(filter, number, numbers) if numbers else _ordered(filter, text, texts)).may]
+    conditions = [_neither()]
+    conditions += [_equal(number, numbers).may] if numbers else []
+    conditions += [and_(number.is_(None), _equal(text, texts).may)] if texts else []
     return conditions
+
+
+def unsure_value(filter: BaseFilter, key: int) -> Sequence[Condition]:
+    """Where what `VALUE` holds at a key does not tell whether a comparison, other than NE, is true: see `Narrowed`."""
+    number, text = VALUE.c.number, VALUE.c.text
+    numbers, texts = _wanted(filter)
+    if filter.type in ORDERING:
+        unsure = [*_ordered(filter, number, numbers).unsure, *_ordered(filter, text, texts).unsure]
+        unsure += [number.in_(_FLAGS)] if numbers else []
+    elif not _FLAGS.isdisjoint(numbers):
+        return ALL.unsure
+    else:
+        unsure = [*_equal(number, numbers).unsure, *_equal(text, texts).unsure, _neither()]
+    own = VALUE.c.episode_id == EPISODE.c.id, VALUE.c.key == key
+    return [exists().where(*own, or_(*unsure)).correlate(EPISODE)] if unsure else []
+
+
+def _neither() -> Condition:
+    """Whether a value is no number, flag or text: null, a list, ..."""
+    return and_(VALUE.c.number.is_(None), VALUE.c.text.is_(None))
+
+
+def _values(filter: BaseFilter) -> Sequence[Any]:
+    return filter.value if filter.type is FilterType.IN else [filter.value]
 
 
 def _wanted(filter: BaseFilter) -> tuple[list[float], list[str]]:
     """The values that are compared, as they are stored: the nearest floats, and the beginnings of texts."""
-    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
+    wanted = [classify(value) for value in _values(filter)]
     numbers = [nearest_float(scalar.value) for scalar in wanted if scalar.kind in ("number", "bool")]
     return numbers, [indexed_text(scalar.value) for scalar in wanted if scalar.kind == "text"]
 
 
-def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[Any]) -> Condition:
+def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[Any]) -> Narrowed:
+    """A comparison of order with at most one stored value: of unequal ones, the order tells that of the values."""
     if not wanted:
-        return false()
+        return Narrowed(false())
+    if is_whole(wanted[0]):
+        return Narrowed(_OPERATORS[filter.type](column, wanted[0]))
     rising = filter.type in (FilterType.GT, FilterType.GEQ)
-    condition: Condition = column >= wanted[0] if rising else column <= wanted[0]
-    return condition
+    return Narrowed(column >= wanted[0] if rising else column <= wanted[0], [column == wanted[0]])
+
+
+def _equal(column: ColumnElement[Any], wanted: Sequence[Any]) -> Narrowed:
+    """Whether a column has one of some stored values."""
+    if len(wanted) > _MOST_VALUES:
+        return ALL._replace(may=_any_of(column, wanted))
+    parts = [value for value in wanted if not is_whole(value)]
+    return Narrowed(_any_of(column, wanted), [column.in_(parts)] if parts else [])
 
 
 def _in_metadata(filter: BaseFilter) -> Condition:
     """A comparison, other than NE, with a value that SQL finds in metadata."""
     path = path_of(filter)[1:]
-    wanted = [classify(value) for value in (filter.value if filter.type is FilterType.IN else [filter.value])]
+    wanted = [classify(value) for value in _values(filter)]
     texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
     ordered_texts = filter.type in ORDERING and texts
     if ordered_texts or not can_search(path) or not all(map(str.isprintable, texts)):
@@ -257,29 +309,29 @@ def _of_groups(filter: BaseFilter) -> Narrowed:
     """A comparison with groups; the column has a list of them in JSON."""
     if filter.type not in (FilterType.EQ, FilterType.IN):
         return ALL
-    groups = filter.value if filter.type is FilterType.IN else [filter.value]
+    groups = _values(filter)
     if len(groups) > _MOST_VALUES:
         return ALL
     held = (EPISODE.c.published_in.contains(json.dumps(group), autoescape=True) for group in groups)
-    return Narrowed(or_(false(), *held), exact=False)
+    return ALL._replace(may=or_(false(), *held))
 
 
 def _of_ids(filter: BaseFilter) -> Narrowed:
     """A comparison with ids of episodes: their recording's uuid, a hyphen and their number."""
     if filter.type not in (FilterType.EQ, FilterType.NE, FilterType.IN):
         return ALL
-    texts = filter.value if filter.type is FilterType.IN else [filter.value]
+    texts = _values(filter)
     parts = [text.rpartition("-") for text in texts]
     ids = [(escape_text(uuid), int(number)) for uuid, _, number in parts if _EPISODE_NUMBER.fullmatch(number)]
     if len(ids) > _MOST_VALUES:
-        return Narrowed(_any_of(RECORDING.c.uuid, [uuid for uuid, _ in ids]), exact=False)
+        return ALL._replace(may=_any_of(RECORDING.c.uuid, [uuid for uuid, _ in ids]))
     if not ids:
-        return Narrowed(false() if filter.type is not FilterType.NE else true(), exact=True)
+        return Narrowed(false() if filter.type is not FilterType.NE else true())
     named = RECORDING.alias("named")
     first = first_of(named.c.id)
     rows = union_all(*(select(first + number).where(named.c.uuid == uuid) for uuid, number in ids))
     found = EPISODE.c.id.in_(rows)
-    return Narrowed(not_(found) if filter.type is FilterType.NE else found, exact=True)
+    return Narrowed(not_(found) if filter.type is FilterType.NE else found)
 
 
 def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:

@@ -1,7 +1,7 @@
 """Turns filters into SQL that finds all rows which may match, with the columns and indexes there are.
 
-Python checks the rows that an inexact condition finds again (`tupli_mcap.schema.predicate`), so that a filter means the
-same everywhere.
+Python looks again at rows of which SQL is not sure (`tupli_mcap.schema.predicate`), so that a filter means the same
+everywhere.
 
 Everything is SQL of any database, but looking into metadata without a declared key is not: see `metadata_sql`.
 """
@@ -18,7 +18,6 @@ from sqlalchemy import (
     and_,
     exists,
     false,
-    not_,
     or_,
     select,
     true,
@@ -38,6 +37,7 @@ from tupli_mcap.storage.catalog.compare_sql import (
     near_value,
     of_runs,
     recorded,
+    unsure_value,
 )
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
@@ -64,8 +64,8 @@ def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narr
         if size <= room:
             kept.append(part)
             room -= size
-    found = _all(kept, indexed, negated=False)
-    return found if len(kept) == len(parts) else found._replace(exact=False)
+    found = _all(kept, indexed)
+    return found if len(kept) == len(parts) else found._replace(unsure=ALL.unsure)
 
 
 def recordings_of(filter: BaseFilter) -> Condition:
@@ -77,7 +77,7 @@ def recordings_of(filter: BaseFilter) -> Condition:
         return true()
     path = path_of(filter)
     if path[0] in ("recording", "benchmark_id"):
-        return compared(filter).condition
+        return compared(filter).may
     if path == ("created_at",):
         return recorded(filter)
     if path == ("run", "name") and filter.type in (FilterType.EQ, FilterType.IN):
@@ -130,7 +130,7 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
         if part.type in _NOT_INDEXED:
             continue
         if path[0] in INDEXED_FACTS:
-            facts.setdefault(path[0], []).append(compared(part).condition)
+            facts.setdefault(path[0], []).append(compared(part).may)
         elif path in indexed:
             values.setdefault(indexed[path], []).append(near_value(part))
     row_id = EPISODE.c.id
@@ -189,37 +189,41 @@ def merged(filter: BaseFilter) -> BaseFilter:
     return filter.model_copy(update={"filters": tuple(parts)})
 
 
-def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
+def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
     if filter.type is FilterType.NOT:
-        return _narrow(filter.filters[0], indexed, not negated)
-    if filter.type is (FilterType.AND if negated else FilterType.OR):
-        parts = [_narrow(part, indexed, negated) for part in filter.filters]
-        either = or_(false(), *(part.condition for part in parts))
-        return Narrowed(either, all(part.exact for part in parts))
-    return _all(filter.filters if filter.type in COMBINING else [filter], indexed, negated)
+        return _narrow(filter.filters[0], {}).negated()  # of all others, an index finds none
+    if filter.type is FilterType.OR:
+        parts = [_narrow(part, indexed) for part in filter.filters]
+        either = or_(false(), *(part.may for part in parts))
+        return Narrowed(either, _unsure(parts))
+    found = _all(filter.filters if filter.type is FilterType.AND else [filter], indexed)
+    if found.ids is None:
+        return found
+    both = tuple_(EPISODE.c.id, EPISODE.c.recording_id)
+    return Narrowed(and_(found.may, both.in_(found.ids)), found.unsure)
 
 
-def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], negated: bool) -> Narrowed:
+def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
     """The condition that all filters are true; comparisons of one key in `VALUE` are joined."""
     parts: list[Narrowed] = []
     values: dict[int, list[list[Condition]]] = {}
-    few = not negated and any(_names_few(part) for part in filters)
+    few = any(_names_few(part) for part in filters)
     for part in filters:
         if part.type in COMBINING:
-            parts.append(_narrow(part, indexed, negated))
+            parts.append(_narrow(part, indexed))
             continue
         path, narrow = path_of(part), compared(part)
-        if negated:
-            narrow = Narrowed(not_(narrow.condition), exact=True) if narrow.exact else ALL
-        elif path in indexed and part.type not in _NOT_INDEXED and not few:
+        if path in indexed and part.type not in _NOT_INDEXED and not few:
             values.setdefault(indexed[path], []).append(near_value(part))
-            narrow = ALL if path[0] == "metadata" else narrow
+            if path[0] == "metadata":
+                narrow = Narrowed(true(), unsure_value(part, indexed[path]))
         parts.append(narrow)
-    conditions = [part.condition for part in parts]
-    if values:
-        both = tuple_(EPISODE.c.id, EPISODE.c.recording_id)
-        conditions.append(both.in_(in_all([_of_values(key, values[key]) for key in values])))
-    return Narrowed(and_(true(), *conditions), all(part.exact for part in parts))
+    ids = in_all([_of_values(key, values[key]) for key in values]) if values else None
+    return Narrowed(and_(true(), *(part.may for part in parts)), _unsure(parts), ids)
+
+
+def _unsure(parts: Sequence[Narrowed]) -> list[Condition]:
+    return [condition for part in parts for condition in part.unsure]
 
 
 def _names_few(filter: BaseFilter) -> bool:

@@ -21,8 +21,11 @@ from sqlalchemy import (
     Table,
     and_,
     delete,
+    false,
     func,
     insert,
+    not_,
+    or_,
     select,
     true,
 )
@@ -165,13 +168,15 @@ def count_episodes(
     """How many episodes match a filter, counted up to `most`. Raises as `find_episodes` does."""
     asked = _asked(connection, filter, only, of)
     found = _narrowed(asked)
-    if found.exact and most is None:
-        return int(connection.execute(_query(asked, found, func.count())).scalar_one())
-    if found.exact:
-        some = _query(asked, found, EPISODE.c.id).limit(most).subquery()
-        return int(connection.execute(select(func.count()).select_from(some)).scalar_one())
-    rows = connection.execute(_query(asked, found, *_COLUMNS, *_OF_RECORDING), execution_options=_STREAMED)
-    return sum(1 for _ in itertools.islice(_in_pages(connection, asked, found, rows), most))
+    unsure = or_(false(), *found.unsure)
+    sure = _query(asked, found, EPISODE.c.id).where(not_(unsure)).limit(most).subquery()
+    count = int(connection.execute(select(func.count()).select_from(sure)).scalar_one())
+    if not found.unsure or count == most:
+        return count
+    others = _query(asked, found, *_COLUMNS, *_OF_RECORDING).where(unsure)
+    rows = connection.execute(others, execution_options=_STREAMED)
+    left = None if most is None else most - count
+    return count + sum(1 for _ in itertools.islice(_in_pages(connection, asked, found, rows), left))
 
 
 def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
@@ -187,7 +192,7 @@ def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
         values = tuple(compiled.params[name] for name in compiled.positiontup or ())
     explain = "EXPLAIN QUERY PLAN" if connection.dialect.name == "sqlite" else "EXPLAIN"
     steps = [f"  {row[-1]}" for row in connection.exec_driver_sql(f"{explain} {compiled}", values)]
-    last = [] if found.exact else ["then each episode that was found is compared exactly"]
+    last = ["then each episode that was found is compared exactly"] if found.unsure else []
     return "\n".join([str(compiled), f"parameters: {values!r}", "plan:", *steps, *last])
 
 
@@ -251,16 +256,24 @@ def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
     rows."""
     also = and_(asked.only, asked.of)
     if asked.filter is None:
-        return Narrowed(also, exact=True)
+        return Narrowed(also)
     found = narrowed(asked.filter, asked.indexed if by_index else {})
-    return found._replace(condition=and_(found.condition, recordings_of(asked.filter), also))
+    return found._replace(may=and_(found.may, recordings_of(asked.filter), also))
 
 
 def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None = None) -> Select[Any]:
     """rows: EPISODE and RECORDING, and maybe more."""
+    query = select(*columns).where(found.may)
+    if found.ids is None:
+        both = EPISODE.join(RECORDING, of_one_recording() if asked.filter is not None else in_order())
+        return query.select_from(both if rows is None else rows)
+    row_id, recording_id = (
+        ids := found.ids.limit(sys.maxsize).subquery()
+    ).c  # the limit makes databases begin here
     if rows is None:
-        rows = EPISODE.join(RECORDING, of_one_recording() if asked.filter is not None else in_order())
-    return select(*columns).select_from(rows).where(found.condition)
+        joined = ids.join(RECORDING, RECORDING.c.id == recording_id)
+        return query.select_from(joined.join(EPISODE, EPISODE.c.id == row_id))
+    return query.select_from(rows.join(ids, and_(row_id == EPISODE.c.id, recording_id == RECORDING.c.id)))
 
 
 class _Counted:
@@ -286,7 +299,7 @@ def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iter
         these = EPISODE.c.id.between(least, largest)  # cheaper to ask for; it may name some more
         if largest - least >= 2 * len(some):
             these = EPISODE.c.id.in_(some)
-        rows = connection.execute(of_them.where(these, found.condition))
+        rows = connection.execute(of_them.where(these, found.may))
         known = {row.id: row for row in rows}
         yield from _headers(connection, asked, found, [known[number] for number in some if number in known])
         size = _ROWS_OF_ANSWER
@@ -297,16 +310,16 @@ def _all_of_them(
 ) -> Iterator[EpisodeHeader]:
     """The matching episodes, all found by one statement for each range of the order."""
     found, parts = _narrowed(asked), asked.order(connection, few=asked.filter is not None)
-    skipped = offset if found.exact and len(parts) == 1 else 0  # by the database
+    skipped = offset if not found.unsure and len(parts) == 1 else 0  # by the database
     first, last = offset - skipped, None if limit is None else min(offset - skipped + limit, sys.maxsize)
 
     def queries(*columns: Any) -> Iterator[Select[Any]]:
         for part in parts:
             of = None if asked.sort is None else part.rows
             query = _query(asked, found, *columns, rows=of).where(part.having).order_by(*part.order)
-            yield query.limit(last if found.exact else None).offset(skipped or None)
+            yield query.limit(None if found.unsure else last).offset(skipped or None)
 
-    if limit is not None and found.exact:  # a database puts ids in order quicker than whole rows
+    if limit is not None and not found.unsure:  # a database puts ids in order quicker than whole rows
         each = (connection.execute(query).scalars() for query in queries(EPISODE.c.id))
         return _looked_at(
             connection, asked, itertools.islice(itertools.chain.from_iterable(each), first, last)
@@ -336,7 +349,7 @@ def _headers(
     """
     if time.monotonic() > connection.get_execution_options().get("tupli_deadline", math.inf):
         raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
-    matches = None if asked.filter is None or found.exact else bound_predicate(asked.filter)
+    matches = None if asked.filter is None or not found.unsure else bound_predicate(asked.filter)
     width, rows = len(_COLUMNS), list(rows)
     runs = _runs(connection, {row.recording_id for row in rows})
     for row in rows:

@@ -27,12 +27,14 @@ __all__ = [
     "indexed_text",
     "indexed_value",
     "is_indexed",
+    "is_whole",
     "nearest_float",
     "store_row",
 ]
 
 _INT64_MIN: Final = -(2**63)
 _INDEXED_CHARACTERS: Final = 500
+_MOST_EXACT: Final = 2.0**53  # below, integers have floats of their own
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
 # What PostgreSQL does not read: NUL in a text, and numbers that may be beyond its floats.
 _UNREADABLE: Final = re.compile(r"\\u0000|[eE][+-]?[0-9]{3}|[0-9]{100}")
@@ -177,6 +179,13 @@ def nearest_float(number: float) -> float:
         return float(number)
     except OverflowError:
         return math.inf if number > 0 else -math.inf
+
+
+def is_whole(stored: float | str) -> bool:
+    """Whether no two numbers have this nearest float, or no two texts this beginning."""
+    if isinstance(stored, str):
+        return len(stored) < _INDEXED_CHARACTERS
+    return abs(stored) < _MOST_EXACT
 
 
 def load_metadata(text: str) -> Any:
