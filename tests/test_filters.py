@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
-from sqlalchemy import Connection, false, not_, or_, select
+from sqlalchemy import Connection, false, not_, or_
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.jsonvalue import dumps_plain
@@ -42,11 +42,10 @@ from tupli_mcap.schema import (
     parse_filter,
     split_key,
 )
-from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.times import local_text, span_of, time_ns
+from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
-from tupli_mcap.storage.catalog.filter_sql import narrowed
-from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
+from tupli_mcap.storage.catalog.tables import EPISODE
 
 STAMP = RecordingStamp(1, 2, 3)
 UUID = "0123456789abcdef0123456789abcdef"
@@ -441,9 +440,10 @@ class TestOneMeaning:
 
 def surely(connection: Connection, filter: BaseFilter) -> set[int]:
     """The episodes that match according to SQL alone."""
-    found = narrowed(bound(filter, EpisodeHeader), {("metadata", "x"): 0})
-    rows = select(EPISODE.c.episode).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
-    return set(connection.execute(rows.where(found.may, not_(or_(false(), *found.unsure)))).scalars())
+    asked = queries._asked(connection, filter, None, None)
+    found = queries._narrowed(asked)
+    sure = queries._query(asked, found, EPISODE.c.episode).where(not_(or_(false(), *found.unsure)))
+    return set(connection.execute(sure).scalars())
 
 
 class TestTimes:

@@ -16,7 +16,13 @@ from tupli_mcap.page.shelf import Shelf, seen_episodes
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, episodes_of, of_one_recording
+from tupli_mcap.storage.catalog.tables import (
+    EPISODE,
+    RECORDING,
+    episodes_of,
+    in_order,
+    of_one_recording,
+)
 from tupli_mcap.storage.catalog.tallies import Tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -164,24 +170,20 @@ def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
 def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
     """The row ids of about a `share` of the episodes of some recordings, at even distances in each."""
     counts = {escape_text(item.recording): item.episodes for item in recordings}
+    own = seen_episodes(shelf, in_order())
+    # Of one of them alone, SQLite reads an end of the index; of both in one query, all between them.
+    ends = (select(of(EPISODE.c.id)).where(own).scalar_subquery() for of in (func.min, func.max))
+    query = select(RECORDING.c.id, RECORDING.c.path, *ends)
     for paths in _batches(counts):
-        found = connection.execute(
-            select(RECORDING.c.id, RECORDING.c.path).where(RECORDING.c.path.in_(paths))
-        )
-        for recording_id, path in found.all():
-            own = seen_episodes(shelf, episodes_of(recording_id, EPISODE.c.id))
-            low, high = connection.execute(
-                select(func.min(EPISODE.c.id), func.max(EPISODE.c.id)).where(own)
-            ).one()
+        found = connection.execute(query.where(RECORDING.c.path.in_(paths)))
+        for recording_id, path, low, high in found.all():
             if low is None:
                 continue
             there: Any = range(low, high + 1)
-            if (
-                len(there) != counts[path]
-            ):  # ids have gaps: episodes that are deleted, or that the reader may not see
-                there = (
-                    connection.execute(select(EPISODE.c.id).where(own).order_by(EPISODE.c.id)).scalars().all()
-                )
+            if len(there) != counts[path]:  # some are deleted, or the reader may not see them
+                these = seen_episodes(shelf, episodes_of(recording_id, EPISODE.c.id))
+                ids = connection.execute(select(EPISODE.c.id).where(these).order_by(EPISODE.c.id))
+                there = ids.scalars().all()
             count = max(1, round(len(there) * share))
             yield from (
                 there[i] for i in np.unique(np.linspace(0, len(there) - 1, count).round().astype(int))
