@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-_LINE, _WIDTH = 30, 720
+_LINE, _WIDTH = 30, 800
 
 
 def layers() -> str:
