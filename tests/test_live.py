@@ -30,6 +30,7 @@ from environments import Sampler
 from gymnasium import spaces
 from mcap_ros2._dynamic import generate_dynamic
 from typer.testing import CliRunner
+from viewing import VIEWER
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.cli.app import app
@@ -90,7 +91,7 @@ def used(pid: int) -> float:
 @contextlib.contextmanager
 def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Rerun's own receiver, without a window: what it is sent goes to a file."""
-    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", str(port), "--save", str(out)]
+    command = [str(VIEWER), "--bind", "127.0.0.1", "--port", str(port), "--save", str(out)]
     quiet = subprocess.DEVNULL
     process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
     try:
