@@ -119,11 +119,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Of a test that is marked as sampled(n, keep=[…]), n of its cases run, and those whose ids are in `keep`.
 
     Which ones depends on nothing but the test's own name and the ids of its cases. A test that is named runs whole."""
-    if config.getoption("all_cases") or any("::" in argument for argument in config.args):
+    if config.getoption("all_cases"):
         return
+    named = tuple(argument.partition("::")[2] for argument in config.args if "::" in argument)
     cases: dict[str, list[pytest.Item]] = {}
     for item in items:
-        if item.get_closest_marker("sampled"):
+        if item.get_closest_marker("sampled") and not item.nodeid.partition("::")[2].startswith(named):
             cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
     left_out: set[pytest.Item] = set()
     for name, all_of_it in cases.items():
