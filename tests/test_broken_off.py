@@ -55,6 +55,7 @@ def scripted(kind: str) -> gym.Env[Any, Any]:
 
 # a file whose opening is interrupted twice is closed with its last reference
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_anywhere(tmp_path: Path, name: str) -> None:
     """A sample of `python tools/interruptions.py`: once, and again while that is handled."""

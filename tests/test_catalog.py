@@ -254,7 +254,7 @@ class TestOrder:
             put(any_catalog, path, rows, uuid=path, runs=json.dumps([{"name": f"run 1% {path}"}]))
         return any_catalog
 
-    @pytest.mark.sampled(3)
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("text", ["", "steps > 1", "metadata.score != 3"])
     def test_pages_forth_and_back_are_the_whole(self, mixed: Catalog | ServerCatalog, text: str) -> None:
         wanted = parse_filter(text) if text else None
@@ -287,7 +287,7 @@ class TestOrder:
                     after = After(page[-1].recording, page[-1].episode)
                 assert paged == (whole[::-1] if backwards else whole)
 
-    @pytest.mark.sampled(3)
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("few", [0, 5, 1000])
     def test_each_way_to_a_page_leads_to_the_same_episodes(
         self, mixed: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch, few: int

@@ -67,7 +67,7 @@ def env(storage: FileStorage) -> TupliEnvWrapper:
 
 class TestMany:
     def test_lose_nothing(self, tmp_path: Path) -> None:
-        figures = tool().run(tmp_path, seconds=7, seed=3, writers=8, others=3)
+        figures = tool().run(tmp_path, seconds=4, seed=3, writers=8, others=3)
         assert figures["killed writers"] + figures["killed others"] > 0
         assert figures["steps acknowledged"] > 100
         assert figures["episodes in the end"] > 10

@@ -143,7 +143,7 @@ def test_episodes_are_as_they_were_told(tmp_path: Path, name: str, num_envs: int
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("call", ["step", "begin", "end", "discard", "flush"])
 @pytest.mark.parametrize(
     ("name", "num_envs"), [("box", None), ("text", 2), ("camera", 2), ("camera and text", None)]

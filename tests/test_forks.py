@@ -213,6 +213,7 @@ class Samples:
 
 
 class TestDataLoader:
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("context", "kind"),
         [

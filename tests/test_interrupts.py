@@ -104,7 +104,7 @@ def check_interrupted(name: str, made: Lab, directory: Path, line: int) -> bool:
     return True
 
 
-@pytest.mark.sampled(8)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_any_command_at_any_line(tmp_path: Path, lab: Lab, name: str) -> None:
     lines = lines_of(name, lab, tmp_path / "whole")

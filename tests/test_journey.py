@@ -58,6 +58,7 @@ def port() -> int:
         return int(listener.getsockname()[1])
 
 
+@pytest.mark.sampled(0)  # the page of the tutorials runs the same commands
 def test_from_one_to_another(tmp_path: Path, port: int) -> None:
     kinds, (begin, script, look, fetch) = zip(*BLOCKS, strict=True)
     assert kinds == ("console", "python", "console", "console")

@@ -221,6 +221,7 @@ class TestReadAhead:
         done = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60)
         assert (done.stdout.split(), done.stderr) == (expected, "")
 
+    @pytest.mark.sampled(0)  # a short run of tools/concurrency.py has some
     def test_several_processes_at_once(self, root: Path) -> None:
         code = (
             f"import sys\nfrom tupli_mcap import FileStorage\n{_AT_ONCE}"

@@ -375,7 +375,7 @@ def check_formats(made: Report, directory: Path, *, page: bool = True) -> None:
         assert made.save(directory / "report.html").read_text().count("<svg") == 1
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2, keep=["nested"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_space_is_drawn_without_a_warning(tmp_path: Path, kind: str) -> None:
     observation, action = KINDS[kind]
@@ -383,6 +383,7 @@ def test_every_kind_of_space_is_drawn_without_a_warning(tmp_path: Path, kind: st
     check_formats(report(path), tmp_path, page=kind in ("nested", "discrete", "pixels"))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "Blackjack-v1"])
 def test_real_environments_are_drawn(tmp_path: Path, env_id: str) -> None:
     check_formats(report(record(tmp_path / "r.mcap", gym.make(env_id), 300)), tmp_path)

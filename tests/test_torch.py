@@ -270,6 +270,7 @@ def test_a_seed_of_none_draws_from_pytorch(dataset: TupliDataset) -> None:
     assert numbers(stream) == first
 
 
+@pytest.mark.sampled(0, keep=["spawn"])
 @pytest.mark.parametrize("start", ["fork", "spawn", "forkserver"])
 def test_workers_of_every_kind(dataset: TupliDataset, start: str) -> None:
     windows = dataset.windows(2, fields=["states", "rewards"])
