@@ -8,13 +8,17 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import gymnasium as gym
+import httpx
 import numpy as np
 import pytest
 import web_server
 from between import Between, Fault
 from malicious import MODULE, _store as store, pickles, specs
+from persons import Person
+from serving import PASSWORD, serving
 from typer.testing import CliRunner
 
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
@@ -22,6 +26,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import FormatError, StorageError, UntrustedError
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, F
+from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.exchange import copy_episodes
@@ -251,3 +256,42 @@ def test_threads_fetch_a_file_once() -> None:
     for thread in threads:
         thread.join()
     assert asked == [0]
+
+
+NAMES = (
+    "line\nbreak.mcap", "tab\t.mcap", "back\\slash.mcap", "%2e%2e.mcap", "a%2Fb.mcap", "\U0001f916.mcap", "é/run.mcap",
+    "e/run.mcap", "q?x=1#y&z.mcap", "\"'<b>.mcap", "\r\nX-Evil: 1.mcap", f"{'d' * 200}/{'e' * 200}.mcap", "\u202e.mcap",
+)  # fmt: skip
+
+
+@pytest.mark.filterwarnings("ignore:not served")
+def test_a_served_directory_may_have_files_of_any_names(tmp_path: Path) -> None:
+    """They are listed, sent with harmless headers, shown, and fetched; but for a name that is no text."""
+    files = {}
+    for seed, name in enumerate((*NAMES, os.fsdecode(b"\xff.mcap"))):
+        path = tmp_path / "lab" / "recordings" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=20, seed=seed)
+        files[f"recordings/{name}"] = (tmp_path / "run.mcap").rename(path).read_bytes()
+    files.popitem()
+    with serving(Settings(tmp_path / "lab")) as url, TupliAPIClient(url) as admin:
+        admin.login("admin", PASSWORD)
+        listed = {header.recording: header for header in admin.list_episodes()}
+        assert listed.keys() == files.keys()
+        person = Person(url, "admin")
+        with httpx.Client(base_url=url, headers={"Accept": "text/html"}, timeout=60) as browser:
+            browser.post("/sign-in", data={"username": "admin", "password": PASSWORD})
+            for name, data in files.items():
+                answer = httpx.get(url + person.ask("POST", "/v1/tickets", {"recording": name})["path"])
+                assert (answer.status_code, answer.content) == (200, data), name
+                told = f"attachment; filename*=utf-8''{quote(name.rpartition('/')[2])}"
+                assert answer.headers["Content-Disposition"] == told
+                assert "X-Evil" not in answer.headers
+                assert browser.get(f"/episode/{listed[name].id}").status_code == 200
+        with FileStorage(tmp_path / "mine") as mine:
+            copy_episodes(admin, mine)
+            assert {header.id for header in mine.list_episodes()} == {
+                header.id for header in admin.list_episodes()
+            }
+    fetched = {path.read_bytes() for path in (tmp_path / "mine").rglob("*.mcap")}
+    assert fetched == set(files.values())

@@ -63,7 +63,7 @@ def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) 
     assert sum(line["received"] for line in patched) == len(recording)
     assert {line["route"] for line in patched} == {"/v1/uploads/{upload_id}"}
     assert len({line["id"] for line in requests}) == len(requests)
-    (fetched,) = [line for line in requests if line["route"] == "/v1/files/{name:path}"]
+    (fetched,) = [line for line in requests if line["route"] == "/v1/files/{name:file_name}"]
     assert (fetched["status"], fetched["sent"], fetched["user"]) == (200, len(recording), "admin")
 
 

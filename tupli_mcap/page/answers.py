@@ -13,6 +13,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from starlette.convertors import PathConvertor, register_url_convertor
 from starlette.exceptions import HTTPException
 
 import tupli_mcap
@@ -23,7 +24,7 @@ from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
-__all__ = ["POLICY", "PageRoute", "Shown", "SignInNeededError", "address", "error_page", "page"]
+__all__ = ["FILE_NAME", "POLICY", "PageRoute", "Shown", "SignInNeededError", "address", "error_page", "page"]
 
 POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
@@ -37,6 +38,15 @@ _HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "private, no-cache",
 }
+
+
+class _FileName(PathConvertor):
+    regex = "(?s:.+)"
+
+
+register_url_convertor("file_name", _FileName())
+FILE_NAME: Final = "{name:file_name}"
+"""The part of a route's path for the name of a file, which may have slashes and line breaks."""
 
 
 def _shelf(request: Request) -> Shelf:

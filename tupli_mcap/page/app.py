@@ -12,12 +12,11 @@ from pathlib import Path
 import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse
-from starlette.convertors import PathConvertor, register_url_convertor
 from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.page.answers import error_page
+from tupli_mcap.page.answers import FILE_NAME, error_page
 from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
 from tupli_mcap.viewer.process import has_display
@@ -30,13 +29,6 @@ _FOR_VIEWERS = {
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
     "X-Content-Type-Options": "nosniff",
 }
-
-
-class _FileName(PathConvertor):
-    regex = "(?s:.+)"  # a file's name may have line breaks
-
-
-register_url_convertor("file_name", _FileName())
 
 
 def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
@@ -54,7 +46,7 @@ def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
     app.state.shelf_of = lambda request: shelf
     for router in PAGES:
         app.include_router(router)
-    app.get("/file/{ticket}/{name:file_name}")(read_recording)
+    app.get("/file/{ticket}/" + FILE_NAME)(read_recording)
     app.add_exception_handler(HTTPException, error_page)  # for addresses of no route
     # Against DNS rebinding: a foreign page whose host name resolves to this machine must not read our pages.
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[_HOST, "localhost"])

@@ -134,6 +134,7 @@ class Library:
         """Catalogs a recording of the directory; returns whether it could. Unfinished ones are skipped."""
         path = self.settings.directory / name
         try:
+            name.encode()  # addresses and JSON are in UTF-8
             with Recording(path) as recording, path.open("rb") as file:
                 if not recording.complete or not len(recording):
                     return False
@@ -143,6 +144,9 @@ class Library:
                     arrivals.register(connection, admin, recording, name, digest, deleted=deleted)
         except (TupliError, OSError) as err:
             warnings.warn(f"not served: {err}", stacklevel=3)
+            return False
+        except UnicodeEncodeError:
+            warnings.warn(f"not served: {name!r}: expected a name in UTF-8; rename it", stacklevel=3)
             return False
         return True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -143,10 +144,16 @@ def _copy_recording(
         if uri or not isinstance(target, FileStorage):
             goal = target.new_recording_path(uri)
         else:
-            goal = target.root / "recordings" / name.rpartition("/")[2]
+            goal = _unused(target.root / "recordings" / name.rpartition("/")[2])
         with os_errors("cannot write", goal), fill(goal) as new:
             shutil.copyfile(path, new)
         target.ingest(goal)
+
+
+def _unused(path: Path) -> Path:
+    """A path like this one, at which there is nothing: `run.mcap`, `run-2.mcap`, …"""
+    others = (path.with_name(f"{path.stem}-{number}.mcap") for number in itertools.count(2))
+    return next(each for each in itertools.chain([path], others) if not os.path.lexists(each))
 
 
 @contextlib.contextmanager

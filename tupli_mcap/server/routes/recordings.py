@@ -15,6 +15,7 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
+from tupli_mcap.page.answers import FILE_NAME
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, Right
 from tupli_mcap.server.routes.bodies import BODY, body_of
@@ -187,8 +188,8 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
     return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
 
 
-@router.get("/files/{name:path}", response_class=Response, responses=BODY)
-@router.head("/files/{name:path}", response_class=Response)
+@router.get("/files/" + FILE_NAME, response_class=Response, responses=BODY)
+@router.head("/files/" + FILE_NAME, response_class=Response)
 def read_recording(library: Served, holder: TicketHolder, name: str, request: Request) -> Response:
     """The bytes of a recording, or ranges of them. Their SHA-256 is the `ETag`; `If-Match` is supported.
 
