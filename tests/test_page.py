@@ -23,6 +23,7 @@ import tupli_mcap
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.directory import FileShelf
+from tupli_mcap.page.routes import lists
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import EpisodeRow, RecordingStamp
@@ -164,6 +165,18 @@ class TestTables:
                 back.append(told(client, "/episodes", sort="steps", before=back[-1]["before"]))
             ids = [[episode["id"] for episode in page["episodes"]] for page in pages]
             assert [[episode["id"] for episode in page["episodes"]] for page in back] == ids[::-1]
+
+    def test_what_no_index_leads_to(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        carts(tmp_path, seeds=1, episodes=3)
+        asked = {"filter": "metadata.score > 1 and steps > 0", "sort": "-metadata.score"}
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            assert "No index" not in client.get("/episodes", params=asked).text
+            monkeypatch.setattr(lists, "_MANY", 2)
+            (code,) = re.findall(
+                "This makes one: <code>(.*?)</code>", client.get("/episodes", params=asked).text
+            )
+            exec(html.unescape(code), {"tupli_mcap": tupli_mcap})
+            assert "No index" not in client.get("/episodes", params=asked).text
 
     def test_filters(self, web: httpx.Client) -> None:
         found = told(web, "/episodes", filter='run.name == "ppo-seed1" and steps > 20')["episodes"]

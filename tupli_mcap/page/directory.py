@@ -94,6 +94,7 @@ class DirectoryShelf(_OpenToAll):
         self._opened = OpenedRecordings()
         self.title = self._storage.root.name or str(self._storage.root)
         self.opened_by = str(self._storage.root)
+        self.storage = f"tupli_mcap.FileStorage({self.opened_by!r})"
 
     @property
     def skipped(self) -> Mapping[str, str]:
@@ -127,6 +128,7 @@ class FileShelf(_OpenToAll):
         self.skipped: Mapping[str, str] = {}
         self.title = self._path.name
         self.opened_by = str(self._path)
+        self.storage = ""
 
     def ask(self, question: Callable[[Connection], T]) -> T:
         with self._turn:

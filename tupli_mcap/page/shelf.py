@@ -25,6 +25,7 @@ class Shelf(Protocol):
     Attributes:
         title: a name for the whole.
         opened_by: the argument with which `tupli_mcap.open` opens it.
+        storage: Python code that makes the `TupliStorage` of it; empty for a single file.
         user: the reader; empty if nobody is signed in.
         places: further pages for the reader: address and title.
         skipped: files that cannot be shown, and why, as of the last call of `ask`.
@@ -32,6 +33,7 @@ class Shelf(Protocol):
 
     title: str
     opened_by: str
+    storage: str
     user: str
 
     @property

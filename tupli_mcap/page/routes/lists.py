@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from markupsafe import Markup
-from sqlalchemy import Connection
+from sqlalchemy import Connection, func, select
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.page import charts
@@ -19,8 +19,10 @@ from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
 from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
-from tupli_mcap.schema import EpisodeHeader, parse_bound
-from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
+from tupli_mcap.schema.facts import comparisons, path_in
+from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, declared_keys, find_episodes
+from tupli_mcap.storage.catalog.tables import TALLY
 
 __all__ = ["Table", "router", "table_of"]
 
@@ -29,6 +31,7 @@ _DATASETS: Final = 50  # on a page
 _ROWS: Final = 50
 _COUNTED: Final = 1_000  # beyond so many episodes, a page says "More than"
 _KEYS: Final = 4  # most keys of metadata that get a column
+_MANY: Final = 50_000  # episodes, all of whose metadata take a while to read
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class Table:
 
     error: what is wrong with the filter. position: the character (from 0) at which it is wrong, if known. count: None
     for more than `most`. keys: the metadata keys that have a column. before, after: the ids between which this page
-    lies; None for no further page.
+    lies; None for no further page. slow: the keys that no index leads to, and Python code that makes one.
     """
 
     rows: Sequence[EpisodeHeader]
@@ -48,6 +51,7 @@ class Table:
     keys: Sequence[str] = ()
     before: str | None = None
     after: str | None = None
+    slow: Sequence[tuple[str, str]] = ()
 
     def bar(self, row: EpisodeHeader) -> Markup:
         """A bar: where the return of a row lies between the smallest and the largest of the page."""
@@ -159,7 +163,23 @@ def table_of(
         keys=_common_keys(rows),
         before=rows[0].id if rows and (after or (before and more)) else None,
         after=rows[-1].id if rows and (before or more) else None,
+        slow=_slow(shelf, connection, wanted, order) if shelf.storage else (),
     )
+
+
+def _slow(
+    shelf: Shelf, connection: Connection, filter: BaseFilter | None, sort: Sort | None
+) -> list[tuple[str, str]]:
+    """The keys of metadata that are not declared, if there are many episodes, and code that declares them."""
+    named = [part.key or "" for part in comparisons(filter)] if filter is not None else []
+    paths = {path_in(key, EpisodeHeader) for key in [*named, *([sort.key] if sort else [])]}
+    paths -= {path_in(key, EpisodeHeader) for key in declared_keys(connection)}
+    keys = sorted(join_key(path) for path in paths if path[0] == "metadata" and len(path) > 1)
+    seen = shelf.seen(TALLY.c.created_by, TALLY.c.published_in)
+    episodes = select(func.sum(TALLY.c.episodes)).where(seen)
+    if not keys or (connection.execute(episodes).scalar() or 0) <= _MANY:
+        return []
+    return [(key, f"{shelf.storage}.declare_key({key!r})") for key in keys]
 
 
 def _both(a: str, b: str) -> str:
