@@ -43,11 +43,6 @@ def program() -> str:
     return found
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
-
-
 def shipped(server: str, exchanged: Mapping[str, str]) -> str:
     """The shipped configuration for a server, with the ports and paths of this machine."""
     text = Template(TEMPLATE.read_text()).safe_substitute(TUPLI_MCAP_SERVER=server)

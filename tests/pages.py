@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import uvicorn
 from fastapi import FastAPI
+from serving import running
 
 import tupli_mcap
 from tupli_mcap.page.app import create_app
@@ -32,18 +31,8 @@ def browsing(path: Path) -> Iterator[str]:
 @contextlib.contextmanager
 def serving_app(app: FastAPI) -> Iterator[str]:
     """Serves an application in a thread; yields its address."""
-    server = uvicorn.Server(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        assert thread.is_alive()
-        time.sleep(0.01)
-    sockets: Any = server.servers[0].sockets
-    try:
-        yield f"http://127.0.0.1:{sockets[0].getsockname()[1]}"
-    finally:
-        server.should_exit = True
-        thread.join(30)
+    with running(uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning")) as address:
+        yield address
 
 
 def carts(root: Path, seeds: int = 2, episodes: int = 12) -> None:

@@ -29,6 +29,13 @@ def serving(settings: Settings, listening: Listening | None = None) -> Iterator[
         library.adopt()
     config = configured(lambda: create_app(library), settings, listening or Listening())
     config.port = 0
+    with running(config) as url:
+        yield url
+
+
+@contextlib.contextmanager
+def running(config: uvicorn.Config) -> Iterator[str]:
+    """Serves in a thread; yields the address."""
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

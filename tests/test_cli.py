@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from mcap.writer import Writer
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
+from waiting import wait_for
 
 import tupli_mcap
 from tupli_mcap import (
@@ -388,10 +388,7 @@ class TestRecord:
     def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
         args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]
         with subprocess.Popen(args, stderr=subprocess.PIPE, text=True, cwd=here) as process:
-            deadline = time.monotonic() + 120
-            while not (here / "a.mcap").exists() or (here / "a.mcap").stat().st_size < 100_000:
-                assert time.monotonic() < deadline
-                time.sleep(0.01)
+            wait_for(lambda: (here / "a.mcap").exists() and (here / "a.mcap").stat().st_size >= 100_000)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=120)
         with Recording("a.mcap") as recording:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from waiting import free_port
 
 PAGE = (Path(__file__).parents[1] / "docs" / "howto" / "server.md").read_text()
 SECTION = PAGE.split("\n## From one user to another\n")[1].split("\n## ")[0]
@@ -52,14 +52,9 @@ def commands(block: str) -> Iterator[str]:
         yield line[2:].split("  #")[0].strip()
 
 
-@pytest.fixture
-def port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
-
-
 @pytest.mark.sampled(0)  # the page of the tutorials runs the same commands
-def test_from_one_to_another(tmp_path: Path, port: int) -> None:
+def test_from_one_to_another(tmp_path: Path) -> None:
+    port = free_port()
     kinds, (begin, script, look, fetch) = zip(*BLOCKS, strict=True)
     assert kinds == ("console", "python", "console", "console")
     admin, ann = Person(tmp_path / "admin", port), Person(tmp_path / "ann", port)

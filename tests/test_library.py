@@ -8,15 +8,15 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from waiting import wait_for
 
 from tupli_mcap import EpisodeData, F, FileStorage, Recording, write_recording
 from tupli_mcap.storage.catalog import entries
@@ -182,7 +182,7 @@ class TestReadAhead:
         )
         pids = [int(pid) for pid in done.stdout.split()]
         assert len(pids) == 2
-        wait_until(lambda: not any(is_running(pid) for pid in pids))
+        wait_for(lambda: not any(is_running(pid) for pid in pids))
 
     def test_ctrl_c_is_one_interrupt(self, root: Path) -> None:
         code = (
@@ -206,7 +206,7 @@ class TestReadAhead:
         output, errors = process.communicate(timeout=120)
         assert errors.count("Traceback") == 1
         assert errors.rstrip().endswith("KeyboardInterrupt")
-        wait_until(lambda: not any(is_running(int(pid)) for pid in output.split()))
+        wait_for(lambda: not any(is_running(int(pid)) for pid in output.split()))
         with FileStorage(root) as storage:
             assert storage.count_episodes() == RECORDINGS * EPISODES
 
@@ -243,13 +243,6 @@ def is_running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def test_headers_are_like_any_other_model(root: Path) -> None:

@@ -31,6 +31,7 @@ from gymnasium import spaces
 from mcap_ros2._dynamic import generate_dynamic
 from typer.testing import CliRunner
 from viewing import VIEWER
+from waiting import free_port, wait_for
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.cli.app import app
@@ -51,19 +52,6 @@ MIXED = spaces.Dict(
         "mode": spaces.Discrete(3),
     }
 )
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.02)
 
 
 def answers(port: int) -> bool:

@@ -8,7 +8,7 @@ import socket
 import ssl
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ import nginx
 import pytest
 from served import COMMAND, Process, begin, certificate, served, sign_in
 from serving import PASSWORD
+from waiting import free_port, wait_for
 
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -50,7 +51,7 @@ def behind(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Behind]:
     folder = tmp_path_factory.mktemp("nginx")
     cert, key = certificate(folder)
     directory = folder / "served"
-    port, plain = nginx.free_port(), nginx.free_port()
+    port, plain = free_port(), free_port()
     with served(directory, "--trusted-proxy", "127.0.0.1", "--accel", "/files") as server:
         exchanged = {
             "listen 443 ssl": f"listen 127.0.0.1:{port} ssl",
@@ -88,19 +89,14 @@ def stored(behind: Behind, recording: bytes) -> str:
         return str(sent.headers["Recording"])
 
 
+def addresses(server: Process) -> set[str | None]:
+    """The clients' addresses in its log."""
+    return {line.get("address") for line in server.log()}
+
+
 def ticket_of(client: httpx.Client, token: dict[str, str], name: str) -> str:
     answer = client.post("/v1/tickets", json={"recording": name}, headers=token)
     return str(answer.json()["path"])
-
-
-def waited(happened: Callable[[], bool]) -> bool:
-    """Whether something happens within a minute."""
-    end = time.monotonic() + 60
-    while not happened():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def test_files_are_sent_by_nginx(behind: Behind, recording: bytes, stored: str) -> None:
@@ -137,7 +133,7 @@ def test_files_are_sent_by_nginx(behind: Behind, recording: bytes, stored: str) 
         asked = whole.headers["X-Request-Id"]
     (line,) = [line for line in behind.server.log() if line.get("id") == asked]
     assert (line["status"], line["sent"]) == (200, 0)
-    assert waited(lambda: asked in (behind.logs / "access.log").read_text())
+    wait_for(lambda: asked in (behind.logs / "access.log").read_text())
     (line,) = [line for line in (behind.logs / "access.log").read_text().splitlines() if line.endswith(asked)]
     assert int(line.split()[5]) > len(recording)
 
@@ -158,7 +154,7 @@ def test_uploads_arrive_while_they_are_sent(behind: Behind, tmp_path: Path) -> N
             told = {"Host": f"127.0.0.1:{port}", "Content-Length": len(data), "Upload-Offset": 0, **token}
             head = "".join(f"{name}: {value}\r\n" for name, value in told.items())
             connection.sendall(f"PATCH {place} HTTP/1.1\r\n{head}\r\n".encode() + data[:half])
-            assert waited(lambda: file.exists() and file.stat().st_size >= half - (1 << 20))
+            wait_for(lambda: file.exists() and file.stat().st_size >= half - (1 << 20))
             assert not list((behind.logs / "bodies").iterdir())
         # Here it is broken off, and gone on with from what has come, once the server has noticed.
 
@@ -184,12 +180,9 @@ def test_who_asks_is_known_by_what_nginx_says(behind: Behind) -> None:
     direct = httpx.HTTPTransport(local_address="127.0.0.4")
     with httpx.Client(base_url=behind.server.url, transport=direct) as client:
         client.post("/v1/tokens", json=told, headers=lie)
-    addresses: set[str | None] = set()
-    end = time.monotonic() + 60
-    while not {"127.0.0.2", "127.0.0.3", "127.0.0.4"} <= addresses:  # a line follows its answer
-        assert time.monotonic() < end, addresses
-        addresses = {line.get("address") for line in behind.server.log()}
-    assert "9.9.9.9" not in addresses
+    expected = {"127.0.0.2", "127.0.0.3", "127.0.0.4"}
+    wait_for(lambda: expected <= addresses(behind.server))  # a line follows its answer
+    assert "9.9.9.9" not in addresses(behind.server)
 
 
 def test_the_page_is_behind_tls(behind: Behind) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
 from between import Between
+from waiting import wait_for
 
 from tupli_mcap import TupliEnvWrapper
 from tupli_mcap.errors import StorageError
@@ -34,13 +34,6 @@ def roll(env: TupliEnvWrapper, episodes: int, first_seed: int = 0) -> None:
         env.action_space.seed(seed)
         while not env.step(env.action_space.sample())[2]:
             pass
-
-
-def wait_for(done: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 120
-    while not done():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 def waiting(client: TupliAPIClient) -> int:

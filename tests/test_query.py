@@ -7,7 +7,6 @@ import gc
 import pickle
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import pytest
 from gymnasium import spaces
 from test_schemas import validator
 from test_server import Things, Users, things, token_of, users
+from waiting import wait_for
 
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, TupliDataset, verify_recording, write_recording
@@ -154,10 +154,7 @@ def test_who_goes_away_is_not_sent_to(users: Users, tmp_path: Path) -> None:
     with httpx.stream("POST", url, json={"recordings": [name]}, headers=headers) as answer:
         assert len(next(answer.iter_raw(1 << 16))) == 1 << 16
         assert any(thread.name == "tupli-stream" for thread in threading.enumerate())
-    end = time.monotonic() + 60
-    while any(thread.name == "tupli-stream" for thread in threading.enumerate()):
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    wait_for(lambda: not any(thread.name == "tupli-stream" for thread in threading.enumerate()))
 
 
 def test_a_stream_tells_what_goes_wrong(tmp_path: Path) -> None:
