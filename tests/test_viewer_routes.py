@@ -15,8 +15,8 @@ import httpx
 import numpy as np
 import pytest
 from rrd import Rrd
-from test_query import filtered, short_episodes
 from test_server import Things, Users, things, token_of, users
+from test_server_query import filtered, short_episodes
 from test_storage import episode
 from viewed import Courier, rollout
 

@@ -45,7 +45,7 @@ from acknowledged import User
 from between import Between, Fault, between
 from persons import Person
 from serving import PASSWORD
-from test_migrations import fill_first
+from test_server_migrations import fill_first
 
 from tupli_mcap.schema import F
 from tupli_mcap.server import run

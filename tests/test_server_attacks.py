@@ -3,7 +3,7 @@
 tokens: forged, expired, of the wrong type          test_server.test_forged_tokens
     swapped, and those of before a new password     TestTokens
     used twice, guessed                             test_server (refresh tokens; passwords are throttled)
-every id of somebody else                           test_server.test_what_may_not_be_read_is_not_there, test_access
+every id of somebody else                           test_server_access, test_server (what_may_not_be_read_is_not_there)
 rights that one has not: given, taken, taken over   TestRights, test_server.test_nobody_gives_rights_that_they_lack
 injection: SQL by ids, keys, filters, names, orders TestInjection
     paths, headers, log lines, terminal escapes     TestInjection
