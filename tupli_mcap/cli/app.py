@@ -35,6 +35,7 @@ from tupli_mcap.errors import FilterError, TupliError, did_you_mean
 __all__ = ["app", "main"]
 
 FAILED, USAGE, INTERRUPTED = 1, 2, 130  # 128 + SIGINT, as shells have it
+_VALUES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH", "file": "FILE"}  # in helps
 
 
 class _Group(TyperGroup):
@@ -98,7 +99,17 @@ class _Group(TyperGroup):
 
 
 class _Command(TyperCommand):
-    """A command whose help ends with examples."""
+    """A command whose help names values in plain words, and ends with examples."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        for title, kind in (("Arguments", "argument"), ("Options", "option")):
+            records = [
+                param.get_help_record(ctx) for param in self.get_params(ctx) if param.param_type_name == kind
+            ]
+            lines = [(_plain(record[0], kind), record[1]) for record in records if record is not None]
+            if lines:
+                with formatter.section(title):
+                    formatter.write_dl(lines)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         lines = _EXAMPLES.get("view" if self.name == "replay" else self.name or "", ())
@@ -106,6 +117,15 @@ class _Command(TyperCommand):
             with formatter.section("Examples"):
                 for line in lines:
                     formatter.write(f"  tupli-mcap {line}\n")
+
+
+def _plain(name: str, kind: str) -> str:
+    """The name of a parameter in a help, with `N` or `TEXT` in place of Python's types, which typer adds."""
+    given, _, told = name.partition(" <")
+    if not told or kind == "argument":
+        return given
+    python_type = told.removesuffix(">")
+    return f"{given} {_VALUES.get(python_type.removesuffix(' range'), python_type)}"
 
 
 class _InterruptedError(TupliError):
