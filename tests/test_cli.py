@@ -1172,6 +1172,7 @@ class TestProgram:
             assert re.search(rf"^  {command} +\S.*[^.]\.$", listed, re.MULTILINE)  # not cut to "..."
             out = help_of(command)
             assert max(map(len, out.splitlines())) <= 80
+            assert not re.search(r"<(str|int|float|list|path|file)\b", out), command  # values in plain words
             assert not re.search(r"\.\.\.[]}]|\.{4}", out.splitlines()[0])  # the dots of several are typer's
 
     def test_everything_that_prints_has_json(self) -> None:
