@@ -190,7 +190,7 @@ def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
         limits = f"-c lock_timeout={_BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
-        # Compiling a statement would take longer than all that is asked here.
+        # To compile a statement (JIT) takes longer than to run it.
         kwargs["options"] = f"{kwargs.get('options', '')} {limits} -c jit=off"
 
 

@@ -156,7 +156,9 @@ def table_of(
     more, rows = len(found) > most, found[:most]
     if before:
         rows.reverse()
-    count = count_episodes(connection, wanted, only=only, of=of_some, most=_COUNTED + 1)
+    count = len(rows)
+    if more or at is not None:  # there are others
+        count = count_episodes(connection, wanted, only=only, of=of_some, most=_COUNTED + 1)
     return Table(
         rows,
         count=count if count <= _COUNTED else None,

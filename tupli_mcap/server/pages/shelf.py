@@ -40,8 +40,8 @@ class LibraryShelf:
         self._kept = kept
         self.title = library.settings.directory.name or "tupli-mcap"
         self.opened_by = address
-        self.storage = f"tupli_mcap.TupliAPIClient({address!r})"
         self.user = "" if caller.is_guest else caller.name
+        self.storage = "" if caller.is_guest else f"tupli_mcap.TupliAPIClient({address!r})"
         self.skipped: Mapping[str, str] = {}
 
     @property

@@ -191,7 +191,7 @@ def merged(filter: BaseFilter) -> BaseFilter:
 
 def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
     if filter.type is FilterType.NOT:
-        return _narrow(filter.filters[0], {}).negated()  # of all others, an index finds none
+        return _narrow(filter.filters[0], {}).negated()  # no index leads to what does not match
     if filter.type is FilterType.OR:
         parts = [_narrow(part, indexed) for part in filter.filters]
         either = or_(false(), *(part.may for part in parts))

@@ -267,9 +267,8 @@ def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None
     if found.ids is None:
         both = EPISODE.join(RECORDING, of_one_recording() if asked.filter is not None else in_order())
         return query.select_from(both if rows is None else rows)
-    row_id, recording_id = (
-        ids := found.ids.limit(sys.maxsize).subquery()
-    ).c  # the limit makes databases begin here
+    ids = found.ids.limit(sys.maxsize).subquery()  # the limit makes a database begin with them
+    row_id, recording_id = ids.c
     if rows is None:
         joined = ids.join(RECORDING, RECORDING.c.id == recording_id)
         return query.select_from(joined.join(EPISODE, EPISODE.c.id == row_id))
