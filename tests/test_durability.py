@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
 import shutil
 import warnings
@@ -110,6 +112,22 @@ def test_on_the_same_boot_every_row_counts(tmp_path: Path) -> None:
     shutil.copy(journal_path(path), journal_path(copy))
     env.close()
     assert Recording(copy).num_steps == 5
+
+
+def test_a_disk_that_does_not_sync_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(fd: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    env = RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", durability="chunk")
+    env.reset(seed=1)
+    env.step(0)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fdatasync", refuse)
+        with pytest.raises(
+            RecordingError, match=r"r\.mcap.*: could not be synced to the disk: Input/output error"
+        ):
+            env.close()
+    assert Recording(tmp_path / "r.mcap").num_steps == 1
 
 
 def test_durability_costs_syncs_where_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

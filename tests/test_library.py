@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 import uuid
@@ -13,12 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 from waiting import wait_for
 
-from tupli_mcap import EpisodeData, F, FileStorage, Recording, write_recording
+from tupli_mcap import EpisodeData, F, FileStorage, RecordEpisodes, Recording, write_recording
 from tupli_mcap.storage.catalog import entries
 from tupli_mcap.storage.listing import scan
 
@@ -144,6 +146,15 @@ class TestReadAhead:
             assert any("r000.mcap" in text for text in texts)
             assert any("z.mcap holds episodes of recordings/b1/r001.mcap again" in text for text in texts)
             assert len(found) == (RECORDINGS - 1) * EPISODES
+
+    def test_what_warns_warns_here(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with RecordEpisodes(gym.make("CartPole-v1"), root.parent / "r.mcap") as env:
+            env.reset(seed=1)
+            env.step(0)
+            shutil.copy(env.path, root / "recordings" / "b0" / "alone.mcap")  # without its journal
+        for workers in (0, 2):
+            with pytest.warns(UserWarning, match=r"alone\.mcap"):
+                self.make(root, monkeypatch, workers)
 
     def test_processes_that_are_killed(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         names = [item.relative for item in scan(root)]

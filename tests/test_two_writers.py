@@ -406,6 +406,30 @@ class TestAFileAndItsJournal:
         assert np.array_equal(found.read().states, kept)
 
 
+def test_the_child_of_a_killed_writer_keeps_no_lock(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    reading, writing = os.pipe()
+    writer = os.fork()
+    if writer == 0:
+        env = cart_pole(path)
+        roll(env, 10)
+        if os.fork() == 0:
+            os.write(writing, b"%d" % os.getpid())
+        signal.pause()
+    child = int(os.read(reading, 20))
+    try:
+        assert is_locked(path)
+        os.kill(writer, signal.SIGKILL)
+        os.waitpid(writer, 0)
+        with cart_pole(path, mode="a") as env:
+            roll(env, 10)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.close(reading)
+        os.close(writing)
+    assert Recording(path).num_steps == 20
+
+
 def test_numbers_of_episodes_are_not_given_twice(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordEpisodes(Sampler(spaces.Discrete(5), spaces.Discrete(2)), path) as env:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import socket
 import time
 from collections.abc import Callable
+
+_PORTS = itertools.count(10_000 + 97 * os.getpid() % 20_000)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
@@ -16,6 +20,11 @@ def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return int(listener.getsockname()[1])
+    """A port of 127.0.0.1. The system gives it to nobody who asks for any port, and no other test process takes it."""
+    for port in _PORTS:
+        try:
+            socket.create_server(("127.0.0.1", port)).close()
+        except OSError:
+            continue
+        return port
+    raise AssertionError
