@@ -375,7 +375,7 @@ def check_formats(made: Report, directory: Path, *, page: bool = True) -> None:
         assert made.save(directory / "report.html").read_text().count("<svg") == 1
 
 
-@pytest.mark.sampled(2, keep=["nested"])
+@pytest.mark.sampled(1, keep=["nested", "many values"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_space_is_drawn_without_a_warning(tmp_path: Path, kind: str) -> None:
     observation, action = KINDS[kind]
