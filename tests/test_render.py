@@ -401,12 +401,12 @@ class TestBadInput:
         with pytest.raises(RecordingError, match="expected every >= 1"):
             render(path, tmp_path / "new.mcap", every=0)
 
-    def test_without_pyav(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_without_pyav_and_without_pillow(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         path = recorded(tmp_path / "r.mcap")
-        real = builtins.__import__
+        real, missing = builtins.__import__, {"av"}
 
         def without(name: str, *args: Any, **kwargs: Any) -> Any:
-            if name == "av":
+            if name in missing:
                 raise ImportError(name)
             return real(name, *args, **kwargs)
 
@@ -414,6 +414,9 @@ class TestBadInput:
         with pytest.raises(MissingExtraError, match=r"pip install .*\[video\]"):
             render(path, tmp_path / "film.mp4")
         assert render(path, tmp_path / "film.gif").ok
+        missing.add("PIL")
+        with pytest.raises(MissingExtraError, match=r"pip install .*\[frames\]"):
+            render(path, tmp_path / "again.gif")
 
 
 class TestCommandLine:

@@ -15,7 +15,14 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.messages.frames import EncodedFrame
-from tupli_mcap.messages.images.pictures import FrameFormat, Picture, decode_picture, encode_picture, resized
+from tupli_mcap.messages.images.pictures import (
+    FrameFormat,
+    Picture,
+    decode_picture,
+    encode_picture,
+    pillow,
+    resized,
+)
 
 _GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
@@ -93,6 +100,8 @@ def check_movie(suffix: str) -> None:
     """Raises MissingExtraError if the package for films of this kind is not installed."""
     if suffix == ".mp4":
         _av()
+    elif suffix == ".gif":
+        pillow()
 
 
 def _av() -> Any:
@@ -171,9 +180,8 @@ class Indexed:
 
     def __call__(self, picture: Picture) -> Any:
         """A Pillow image of mode P."""
-        from PIL import Image
-
-        image = Image.fromarray(picture)
+        library = pillow()
+        image = library.fromarray(picture)
         counts = image.getcolors(_GIF_COLOURS)
         if counts is not None:
             return self._exact(picture, np.array(sorted(colour for _, colour in counts), np.uint8))
@@ -181,17 +189,15 @@ class Indexed:
         if apart < 2:
             return image.quantize(_GIF_COLOURS)
         size = -(-image.width // apart), -(-image.height // apart)
-        palette = image.resize(size, Image.Resampling.NEAREST).quantize(_GIF_COLOURS)
-        return image.quantize(palette=palette, dither=Image.Dither.NONE)
+        palette = image.resize(size, library.Resampling.NEAREST).quantize(_GIF_COLOURS)
+        return image.quantize(palette=palette, dither=library.Dither.NONE)
 
     def _exact(self, picture: Picture, colours: Picture) -> Any:
         """An image of exactly these colours, at most 256. (Pillow's `quantize` may change them.)"""
-        from PIL import Image
-
         if self._places is None:
             self._places = np.zeros(1 << 24, np.uint8)
         self._places[_codes(colours)] = np.arange(len(colours))
-        image = Image.fromarray(self._places[_codes(picture)])
+        image = pillow().fromarray(self._places[_codes(picture)])
         image.putpalette(colours.tobytes())
         return image
 

@@ -28,7 +28,7 @@ def check_format(name: str) -> FrameFormat:
     """
     if name not in ("png", "jpeg"):
         raise RecordingError(f"frame_format: expected 'png' or 'jpeg', found {name!r:.40}")
-    _pillow()
+    pillow()
     return "png" if name == "png" else "jpeg"
 
 
@@ -42,10 +42,11 @@ def check_image_format(name: str) -> None:
     if name not in ("raw", "png"):
         raise RecordingError(f"image_format: expected 'raw' or 'png', found {name!r:.40}")
     if name == "png":
-        _pillow()
+        pillow()
 
 
-def _pillow() -> Any:
+def pillow() -> Any:
+    """The module `PIL.Image`; raises MissingExtraError if Pillow is not installed."""
     try:
         from PIL import Image
     except ImportError as err:
@@ -70,7 +71,7 @@ def check_picture(value: Any, where: str) -> Picture:
 def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
     """A picture as a PNG, which is exact, or as a JPEG, which is not."""
     out = io.BytesIO()
-    image = _pillow().fromarray(picture)
+    image = pillow().fromarray(picture)
     if form == "png":
         image.save(out, "PNG", compress_level=1)
     else:
@@ -85,7 +86,7 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
         FormatError: they are neither, or claim more than 2^26 pixels.
         MissingExtraError: Pillow is not installed.
     """
-    image_module = _pillow()
+    image_module = pillow()
     try:
         with image_module.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
             width, height = image.size
@@ -102,7 +103,7 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
     """uint8 pixels, (height, width, 1 or 3 or 4), as a PNG, which is exact."""
     flat = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
     out = io.BytesIO()
-    _pillow().fromarray(np.ascontiguousarray(flat)).save(out, "PNG", compress_level=1)
+    pillow().fromarray(np.ascontiguousarray(flat)).save(out, "PNG", compress_level=1)
     return out.getvalue()
 
 
@@ -113,7 +114,7 @@ def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np
         FormatError: it is no PNG, or has another size, depth or kind.
         MissingExtraError: Pillow is not installed.
     """
-    image_module = _pillow()
+    image_module = pillow()
     height, width, channels = shape
     sizes = {(width, n * height) for n in range(1, most + 1)}
     mode = {1: "L", 3: "RGB", 4: "RGBA"}[channels]
@@ -145,6 +146,6 @@ def resized(picture: Picture, width: int, height: int | None = None) -> Picture:
         height = max(1, round(picture.shape[0] * width / picture.shape[1]))
     if picture.shape[:2] == (height, width):
         return picture
-    image_module = _pillow()
+    image_module = pillow()
     image = image_module.fromarray(picture).resize((width, height), image_module.Resampling.LANCZOS)
     return np.asarray(image)
