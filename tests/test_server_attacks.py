@@ -14,6 +14,8 @@ scripts in every text that a file can carry         TestPages; in Chromium: test
 bodies: oversized, of no length, half, too deep     test_server_limits
     uploads that are longer than announced          test_server.test_what_is_no_recording_is_not_kept
     heads without an end, compressed bombs          TestSizes
+    metadata and descriptions without an end        TestSizes
+a quota that requests at once would exceed          TestSizes
 user enumeration by text and by time                TestEnumeration
 names in uploads and in files, which lead nowhere   TestFiles
 SSRF: addresses that a file or a request gives      TestFiles
@@ -29,6 +31,7 @@ import socket
 import statistics
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
@@ -498,6 +501,39 @@ class TestFiles:
 
 
 class TestSizes:
+    def test_long_texts_that_everybody_s_lists_would_hold(self, lab: Lab) -> None:
+        long, content = {"name": "x", "extra": {"a": "y" * 70_000}}, {"data": ("x", b"long")}
+        told = {"hash": "h", "serialized": "x", "metadata": long}
+        form: dict[str, Any] = {"files": content, "data": {"metadata": json.dumps(long)}}
+        header = base64.b64encode(json.dumps(long).encode()).decode()
+        for path, body, more in (
+            ("/v1/benchmarks", told, {}),
+            ("/benchmarks/create", told, {}),
+            ("/artifacts/upload", None, form),
+            ("/v1/artifacts", None, {"content": b"long", "headers": {"Artifact-Metadata": header}}),
+        ):
+            refused = lab.eve.call("POST", path, body, **more)
+            assert refused.status_code == 413 and "at most 65536 bytes" in refused.text, path
+        for path in ("/v1/groups", "/access/groups/create"):
+            refused = lab.eve.call("POST", path, {"name": "long", "description": "d" * 1001})
+            assert refused.status_code == 400 and "at most 1000 characters" in refused.text, path
+        role = {"role": "long", "rights": [], "description": "d" * 1001}
+        assert lab.admin.call("POST", "/v1/roles", role).status_code == 400
+
+    def test_a_quota_holds_for_requests_at_once(self, tmp_path: Path) -> None:
+        with serving(Settings(tmp_path / "served", quota=1_000_000)) as url:
+            (eve,) = people(Person(url, "admin"), "eve")
+
+            def store(number: int) -> int:
+                told = {"Artifact-Metadata": base64.b64encode(b'{"name": "x"}').decode()}
+                content = bytes([number]) * 900_000
+                return eve.call("POST", "/v1/artifacts", headers=told, content=content).status_code
+
+            with ThreadPoolExecutor(8) as pool:
+                assert sorted(pool.map(store, range(8))) == [200, *[507] * 7]
+            assert eve.ask("GET", "/v1/me")["used"] == 900_000
+        assert len(list((tmp_path / "served" / "artifacts").iterdir())) == 1
+
     def test_a_head_without_an_end(self, lab: Lab) -> None:
         parts = urlsplit(lab.url)
         with socket.create_connection((parts.hostname, parts.port or 0)) as connection:

@@ -328,6 +328,9 @@ class Library:
                     if (
                         self.blobs.size(key) is not None
                     ):  # else another user's deletion of the same bytes has removed them meanwhile
+                        quotas.demand_room(
+                            connection, self.settings, caller, len(data)
+                        )  # others came in between
                         settle(connection, key)
                         return self.items.store_artifact(connection, caller, data, metadata)
         except BaseException:

@@ -38,9 +38,21 @@ from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
 
-__all__ = ["AskedFilter", "Error", "Found", "Listing", "answer", "listed", "paged", "tell_errors", "told"]
+__all__ = [
+    "AskedFilter",
+    "Error",
+    "Found",
+    "Listing",
+    "answer",
+    "demand_short",
+    "listed",
+    "paged",
+    "tell_errors",
+    "told",
+]
 
 _MOST_VALUES: Final = 20_000
+_MOST_METADATA: Final = 64 << 10  # bytes of JSON
 _MOST_OFFSET: Final = 1 << 53  # larger numbers in JSON are not exact in all programs
 
 _STATUS: Final[dict[type[TupliError], int]] = {
@@ -113,6 +125,15 @@ class Found(BaseModel):
 def answer(value: Any) -> Response:
     """A JSON answer; models become objects. Numbers that JSON lacks (NaN, infinities) are tagged, as in our files."""
     return Response(jsonvalue.dumps(_as_json(value)), media_type="application/json")
+
+
+def demand_short(metadata: BaseModel) -> None:
+    """Raises TooLargeError for long metadata of an item: they are in every list, and in a header of an artifact."""
+    size = len(jsonvalue.dumps(_as_json(metadata)))
+    if size > _MOST_METADATA:
+        raise TooLargeError(
+            f"expected metadata of at most {_MOST_METADATA} bytes, found {size}; store an artifact instead"
+        )
 
 
 def listed(items: Iterable[BaseModel], following: str | None = None) -> Response:

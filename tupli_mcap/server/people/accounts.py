@@ -49,6 +49,7 @@ _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's 
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
 _MOST_PASSWORD: Final = 1024
+_MOST_DESCRIPTION: Final = 1000
 
 
 class ConflictError(StorageError):
@@ -193,6 +194,7 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
         ConflictError: a user or a group has or had this name.
     """
     caller.demand(Right.GROUP_CREATE)
+    _demand_short(description)
     if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name):
         raise StorageError(
             f"expected a group name of 1 to 100 printable characters without slashes, found {name!r:.80}"
@@ -300,6 +302,7 @@ def create_role(
 ) -> None:
     """Creates a role. Raises ConflictError if the name is taken, StorageError for an unknown right."""
     caller.demand(Right.ROLE_MANAGEMENT)
+    _demand_short(description)
     unknown = [right for right in rights if right not in set(Right)]
     if unknown or not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= 100:
         raise StorageError(f"expected a role's name and its rights, found {name!r:.80}, {unknown!r:.200}")
@@ -327,6 +330,14 @@ def delete_role(connection: Connection, caller: Caller, name: str) -> None:
     connection.execute(delete(ROLE).where(ROLE.c.name == name))
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.role == name))
     audit(connection, caller.name, "delete_role", name)
+
+
+def _demand_short(description: str | None) -> None:
+    """Raises StorageError for a long description: it is in every list."""
+    if description is not None and len(description) > _MOST_DESCRIPTION:
+        raise StorageError(
+            f"expected a description of at most {_MOST_DESCRIPTION} characters, found {len(description)}"
+        )
 
 
 def _add_role(

@@ -15,7 +15,7 @@ from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuer
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored.items import artifact_key
-from tupli_mcap.server.wire import Found, Listing, answer, paged
+from tupli_mcap.server.wire import Found, Listing, answer, demand_short, paged
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
@@ -27,6 +27,7 @@ router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"])
 @router.post("/benchmarks")
 def store_benchmark(library: Served, caller: Writer, told: BenchmarkQuery) -> Response:
     """Stores a benchmark, unless the caller has it already; answers with its header."""
+    demand_short(told.metadata)
     metadata = BenchmarkMetadata.model_validate(restored(told.metadata.model_dump()))
     query = told.model_copy(update={"metadata": metadata})
     with library.database.writing() as connection:
@@ -82,6 +83,7 @@ async def store_artifact(
         raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
     except ValueError as err:
         raise StorageError(f"expected the metadata of an artifact as JSON in base64: {err}") from err
+    demand_short(told)
     data = await request.body()
     return answer(await run_in_threadpool(library.store_artifact, caller, data, told))
 

@@ -36,7 +36,7 @@ from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
-from tupli_mcap.server.wire import AskedFilter, answer
+from tupli_mcap.server.wire import AskedFilter, answer, demand_short
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]
@@ -273,6 +273,7 @@ def _unpublish(library: Library, caller: Caller, kind: Kind, uri: str, group: st
 @router.post("/benchmarks/create", response_model=BenchmarkHeader)
 def store_benchmark(library: Served, caller: Changing, told: BenchmarkQuery) -> Response:
     """Stores a benchmark that the caller does not have yet."""
+    demand_short(told.metadata)
     own = FilterEQ(key="hash", value=told.hash) & FilterEQ(key="created_by", value=caller.name)
     with library.database.writing() as connection:
         if library.items.list_benchmarks(connection, caller, own):
@@ -324,6 +325,7 @@ def store_artifact(
         raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
     except ValueError as err:
         raise StorageError(f"expected the metadata of an artifact as JSON: {err}") from err
+    demand_short(told)
     return answer(library.store_artifact(caller, data, told))
 
 
