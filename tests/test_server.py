@@ -143,7 +143,7 @@ def token_of(user: TupliAPIClient) -> dict[str, str]:
 
 
 def routes(url: str) -> list[tuple[str, str]]:
-    document = httpx.get(f"{url}/openapi.json").json()
+    document = httpx.get(f"{url}/openapi.json", timeout=120).json()
     found = [(method.upper(), path) for path, item in document["paths"].items() for method in item]
     assert len(found) > 45
     return found
@@ -156,7 +156,7 @@ def call(url: str, method: str, path: str, headers: dict[str, str], **names: str
     body = None if method in ("GET", "HEAD", "DELETE") else BODIES.get(path, {})
     if path == "/artifacts/upload":
         form: dict[str, Any] = {"files": {"data": b"x"}, "data": {"metadata": '{"name": "x"}'}}
-        return httpx.post(target, headers=headers, **form)
+        return httpx.post(target, headers=headers, timeout=120, **form)
     told: dict[str, Any] = {"headers": {**HEADERS, **headers}, "json": body, "params": PARAMETERS}
     return httpx.request(method, target, **told, timeout=120)  # a viewer may be loaded first
 
