@@ -1008,6 +1008,14 @@ def test_blocks_follow_the_numbers() -> None:
     assert sparkline([float("nan")]) == ""
 
 
+def test_a_depth_image_does_not_hide_the_joints(tmp_path: Path) -> None:
+    states = {"depth": np.ones((9, 6, 8), np.uint16), "joints": np.ones((9, 2))}
+    tupli_mcap.write_rollout(tmp_path / "r.mcap", states, np.zeros((9, 2)), np.zeros(9))
+    with Recording(tmp_path / "r.mcap") as recording:
+        names = [series.name for series in sketch(recording, 10).distributions]
+    assert names[1:4] == ["joints[0]", "joints[1]", "depth[0,0]"]
+
+
 def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     with Recording(cartpole) as recording:
         found = sketch(recording, 10)

@@ -171,7 +171,8 @@ def _consecutive(recording: Recording, positions: Array, begin: int, stop: int) 
 def _distributions(
     recording: Recording, leaves: list[Leaf], field: str, pieces: list[Columns], points: int
 ) -> Iterator[Series]:
-    for leaf in leaves:
+    # a depth image, say, must not hide the joints
+    for leaf in sorted(leaves, key=lambda leaf: leaf.size > _MOST_STATES):
         if leaf.kind == "variable" or leaf.apart or not leaf.size:
             continue
         columns = [leaf.get(getattr(piece, field)) for piece in pieces]
