@@ -325,7 +325,7 @@ def _warn_of_unseen(filter: TupleFilter, keys: Collection[str]) -> None:
     for comparison in comparisons(filter) if isinstance(filter, BaseFilter) else ():
         name, *inside = path_of(comparison)
         if name == "info" and inside and inside[0] not in keys:
-            known = f"infos have {', '.join(sorted(keys))}" if keys else "no infos are recorded"
+            known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
             warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
 
 
