@@ -258,6 +258,25 @@ def test_threads_fetch_a_file_once() -> None:
     assert asked == [0]
 
 
+def test_what_two_users_have_published_is_fetched_once(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=60, seed=1)
+    with serving(Settings(tmp_path / "served")) as url:
+        for person in (admin := Person(url, "admin"), made_by(admin, "ann")):
+            person.send((tmp_path / "run.mcap").read_bytes())
+            person.ask("POST", "/v1/episodes/publish", {"filter": None, "group": "global"})
+        made_by(admin, "bob")
+        with TupliAPIClient(url) as bob, FileStorage(tmp_path / "mine") as mine:
+            bob.login("bob", "bob's password")
+            (copied,) = copy_episodes(bob, mine).values()
+            assert copied.episodes == len(mine.list_episodes()) == len(bob.list_episodes()) / 2
+    assert len(list((tmp_path / "mine").rglob("*.mcap"))) == 1
+
+
+def made_by(admin: Person, name: str) -> Person:
+    admin.ask("POST", "/v1/users", {"username": name, "password": f"{name}'s password"})
+    return Person(admin.url, name)
+
+
 NAMES = (
     "line\nbreak.mcap", "tab\t.mcap", "back\\slash.mcap", "%2e%2e.mcap", "a%2Fb.mcap", "\U0001f916.mcap", "é/run.mcap",
     "e/run.mcap", "q?x=1#y&z.mcap", "\"'<b>.mcap", "\r\nX-Evil: 1.mcap", f"{'d' * 200}/{'e' * 200}.mcap", "\u202e.mcap",

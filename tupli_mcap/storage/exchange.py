@@ -28,9 +28,10 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import TupliStorage, anew
+from tupli_mcap.storage.base import LOCAL_USER, TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
+from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
 __all__ = [
@@ -91,7 +92,8 @@ def _copy(
         chosen = of_it if filter is None else of_it & filter
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
-    for header in source.list_episodes(chosen):
+    me = source.username if isinstance(source, TupliAPIClient) else LOCAL_USER
+    for header in each_once(source.list_episodes(chosen), me):
         wanted.setdefault(header.benchmark_id, []).append(header)
     copied = {}
     for uri, headers in wanted.items():
