@@ -93,7 +93,7 @@ def _from_bucket(
 
 
 class _File(FileResponse):
-    chunk_size = 1 << 19
+    chunk_size = 1 << 18  # larger ones are kept by the allocator, for each thread
 
 
 async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) -> AsyncIterator[bytes]:

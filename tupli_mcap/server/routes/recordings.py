@@ -34,7 +34,7 @@ _FOR_VIEWERS = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
 }
-_AT_ONCE = 2 << 20  # bytes that are written at a time
+_AT_ONCE = 1 << 20  # bytes that are written at a time
 
 
 class Named(BaseModel):
