@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from tupli_mcap.cli.app import _COMMANDS, _EXAMPLES, app
+from tupli_mcap.cli.app import _COMMANDS, _EXAMPLES, _plain, app
 
 
 def documented() -> str:
@@ -42,7 +42,9 @@ def _entry(name: str, command: Any, context: Any) -> Iterator[str]:
 
 def _record(param: Any, context: Any) -> tuple[str, str] | None:
     record = param.get_help_record(context)
-    return None if record is None or "--help" in record[0] else record
+    if record is None or "--help" in record[0]:
+        return None
+    return _plain(record[0], param.param_type_name), record[1]
 
 
 def _prose(text: str) -> str:
