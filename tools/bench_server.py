@@ -36,6 +36,7 @@ import psutil
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import nginx
 from served import served, sign_in
+from waiting import free_port
 
 MIB = 1 << 20
 RATE, MEMORY_MIB = 0.6, 150
@@ -115,7 +116,7 @@ def transfers(options: argparse.Namespace, folder: Path) -> bool:
     record(path, options.mib)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     size = path.stat().st_size
-    static, before = nginx.free_port(), nginx.free_port()
+    static, before = free_port(), free_port()
     root = folder / "static"
     root.mkdir(mode=0o755)
     with (
@@ -127,7 +128,7 @@ def transfers(options: argparse.Namespace, folder: Path) -> bool:
             behind.url.removeprefix("http://"),
             {
                 "listen 443 ssl": f"listen 127.0.0.1:{before}",
-                "    listen 80;\n": f"    listen 127.0.0.1:{nginx.free_port()};\n",
+                "    listen 80;\n": f"    listen 127.0.0.1:{free_port()};\n",
                 "    ssl_certificate /etc/nginx/tls/certificate.pem;\n": "",
                 "    ssl_certificate_key /etc/nginx/tls/key.pem;\n": "",
                 "/srv/tupli-mcap/": f"{folder}/served/",
