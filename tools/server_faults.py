@@ -59,6 +59,7 @@ ENGINES = ("sqlite", "postgresql")
 _FAULTS = ("pass", "pass", "refuse", "reset", "reset", "5xx", "flip", "flip up", "stall")
 _OWN = {"secret", "uploads", "making", "server.sqlite", "server.sqlite-wal", "server.sqlite-shm"}
 _USERS = ("ann", "bob", "eve")
+_PENDING = 3.0  # seconds
 
 
 class Server:
@@ -118,8 +119,9 @@ class Campaign:
         self.cluster: postgres.Cluster | None = None
         self.store: Between | None = None
         self._bucket: buckets.StoredBucket | None = None
-        # What waits to be deleted is deleted at the next start, instead of a day later: nobody else is at work then.
-        settings = Settings(folder / "served", pending_seconds=0, access_seconds=1 << 20)
+        # What waits to be deleted is deleted at a start soon after, instead of a day later. By then, the object store
+        # has finished what a killed server was sending.
+        settings = Settings(folder / "served", pending_seconds=_PENDING, access_seconds=1 << 20)
         environment = {"TUPLI_MCAP_ADMIN_PASSWORD": PASSWORD}
         if engine == "postgresql":
             self.cluster = stack.enter_context(postgres.cluster())
@@ -230,6 +232,7 @@ class Campaign:
     def _last(self) -> Iterator[str]:
         """What is wrong after a start without users."""
         yield from self._compare(again=True)
+        time.sleep(_PENDING + 1)
         self._server.kill()
         self._server.start()
         yield from self._compare(again=False)
