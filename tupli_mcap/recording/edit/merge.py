@@ -138,14 +138,9 @@ def merge_excerpts(
     if lanes is not None:
         turns = [(i, np.arange(len(source.rows))) for i, source in enumerate(sources)]
     numbered, next_episode = _numbered(sources, turns)
-    trims = {
-        str(number + shift): [trim.start, trim.stop]
-        for (i, _), (_, rows, shift) in zip(turns, numbered, strict=True)
-        for number in rows["episode"].tolist()
-        if (trim := sources[i].trims.get(number)) is not None
-    }
     codec = None if "infos" in without else _common_infos(sources)
     target = Assembler(container)
+    trims = _new_trims(sources, turns, numbered)
     how = "trim" if trims else "merge"
     facts = {"without": sorted(without)} if without else {"steps": trims} if trims else {}
     said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), how, **facts)}
@@ -269,6 +264,20 @@ def _numbered(
         begun.add(i)
         numbered.append((recording, rows, shift))
     return numbered, free
+
+
+def _new_trims(
+    sources: Sequence[Excerpt],
+    turns: Sequence[tuple[int, Array]],
+    numbered: Sequence[tuple[Recording, Array, int]],
+) -> dict[str, list[int]]:
+    """By the new numbers of episodes, which of their steps stay."""
+    return {
+        str(number + shift): [trim.start, trim.stop]
+        for (i, _), (_, rows, shift) in zip(turns, numbered, strict=True)
+        for number in rows["episode"].tolist()
+        if (trim := sources[i].trims.get(number)) is not None
+    }
 
 
 def _define_missing(
