@@ -249,9 +249,8 @@ class Library:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
             with self.database.writing() as connection:
-                arrivals.demand_benchmark(
-                    connection, caller, recording.benchmark_id
-                )  # it is part of the name
+                # before it becomes part of a path: an id in a file may hold anything
+                arrivals.demand_benchmark(connection, caller, recording.benchmark_id)
                 place = arrivals.new_name(recording.benchmark_id)
                 pend(connection, place)
             try:
@@ -325,12 +324,10 @@ class Library:
                     pend(connection, key)
                 self.blobs.write(key, data)
                 with self.database.writing() as connection:
-                    if (
-                        self.blobs.size(key) is not None
-                    ):  # else another user's deletion of the same bytes has removed them meanwhile
-                        quotas.demand_room(
-                            connection, self.settings, caller, len(data)
-                        )  # others came in between
+                    # else another user's deletion of the same bytes has removed them meanwhile
+                    if self.blobs.size(key) is not None:
+                        # once more: what the user has sent at the same time may have taken the room
+                        quotas.demand_room(connection, self.settings, caller, len(data))
                         settle(connection, key)
                         return self.items.store_artifact(connection, caller, data, metadata)
         except BaseException:
