@@ -278,7 +278,7 @@ def _parts(
         rows: Any = slice(begins[first], ends[stop - 1] + 1)
         after = ends[first : stop - 1] + 1
         if (begins[first + 1 : stop] != after).any():  # resets, which are no steps
-            rows = np.setdiff1d(np.arange(rows.start, rows.stop), after)
+            rows = np.delete(np.arange(rows.start, rows.stop), after - rows.start)
         where, last = (rows, *column), ends[first:stop] if whole else int(ends[first])
         states, actions, rewards, terminals, timeouts, infos = (
             arrays_at(tree, where) for tree in (*given[:5], given.infos or {})
