@@ -15,6 +15,8 @@ import pytest
 from served import COMMAND, begin, certificate, served, sign_in
 from serving import PASSWORD
 
+from tupli_mcap import Recording
+from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.wrappers.rollout import record_rollouts
 
@@ -31,6 +33,11 @@ def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) 
     options = ("--workers", "2", "--certificate", str(cert), "--key", str(key))
     with served(tmp_path / "served", *options) as server:
         assert server.url.startswith("https://")
+        unknown = "certificate of .* is not trusted here.*SSL_CERT_FILE"
+        with pytest.raises(StorageError, match=unknown), TupliAPIClient(server.url) as stranger:
+            stranger.login("admin", PASSWORD)
+        with pytest.raises(RecordingError, match=unknown):
+            Recording(f"{server.url}/run.mcap")
         context = ssl.create_default_context(cafile=str(cert))
         secrets = [PASSWORD]
         for _ in range(4):  # each connection may reach another process

@@ -9,7 +9,7 @@ patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
 names:    recognises URLs, and removes secrets from them.
 """
 
-from tupli_mcap.remote.failures import why
+from tupli_mcap.remote.failures import AUTHORITY, why
 from tupli_mcap.remote.names import is_server, is_url, is_web, shown
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
@@ -17,6 +17,7 @@ from tupli_mcap.remote.plan import is_cut_cheaper
 from tupli_mcap.remote.source import RemoteSource, copied, open_url, watching
 
 __all__ = [
+    "AUTHORITY",
     "RemoteSource",
     "copied",
     "is_cut_cheaper",

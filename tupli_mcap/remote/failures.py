@@ -9,9 +9,10 @@ from typing import Final, TypeVar
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.names import shown
 
-__all__ = ["SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked", "why"]
+__all__ = ["AUTHORITY", "SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked", "why"]
 
 SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
+AUTHORITY: Final = "put the certificate of an authority of your own (PEM) into SSL_CERT_FILE"
 _T = TypeVar("_T")
 # Without credentials in the environment, obstore would ask the cloud's machine for them.
 _WHERE_MACHINES_ASK: Final = ("//169.254.", "//metadata.google.internal")
@@ -22,7 +23,7 @@ _CAUSES: Final = (
     ("ConnectionRefused", "{} refuses connections", f"check the address, or {_AGAIN}"),
     ("NetworkUnreachable", "there is no way to {}", "check the network"),
     ("HostUnreachable", "there is no way to {}", "check the network"),
-    ("invalid peer certificate", "the certificate of {} is not valid", "check the address, and the clock"),
+    ("InvalidCertificate", "the certificate of {} is not trusted here", f"check the address; {AUTHORITY}"),
     (
         "kind: Timeout",
         "{} does not answer in time",

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
-from tupli_mcap.remote import shown
+from tupli_mcap.remote import AUTHORITY, shown
 from tupli_mcap.storage.api.answers import LATER, Page, TokenPair, UnreachableError, as_told, error_of
 from tupli_mcap.storage.api.tokens import TokenStore, user_tokens
 
@@ -247,6 +247,10 @@ class Session:
 
     def _unreachable(self, err: Exception) -> UnreachableError:
         why = str(err) or type(err).__name__
+        if "CERTIFICATE_VERIFY_FAILED" in why:
+            return UnreachableError(
+                f"the certificate of {shown(self.url)} is not trusted here: {why}; check the address; {AUTHORITY}"
+            )
         return UnreachableError(
             f"{shown(self.url)} does not answer: {why}; is the server running, and the address right?"
         )
