@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import gymnasium as gym
@@ -58,6 +59,16 @@ def test_of_a_file_and_back(runs: Path) -> None:
     ]
     assert seeds(file) == [0, 1, 2, 3]
     assert sorted(path.name for path in runs.rglob("[!.]*")) == ["a.mcap", "b.mcap", "deep"]
+
+
+def test_of_a_copy_only(runs: Path) -> None:
+    file, copy = runs / "a.mcap", runs / "copy.mcap"
+    shutil.copyfile(file, copy)
+    assert "deleted 1 episode" in run("delete", str(copy), "--episodes", "0")
+    assert (seeds(copy), seeds(file)) == ([1, 2, 3], [0, 1, 2, 3])
+    assert "deleted 1 episode" in run("delete", str(file), "--episodes", "0")
+    assert "restored 1 episode" in run("restore", str(copy))
+    assert (seeds(copy), seeds(file)) == ([0, 1, 2, 3], [1, 2, 3])
 
 
 def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:

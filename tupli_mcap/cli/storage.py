@@ -163,14 +163,14 @@ def delete(
     """
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
-    from tupli_mcap.schema import FilterIN
+    from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
     from tupli_mcap.storage.sidecar import storage_of
 
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
     wanted = filter_of(filter_text)
-    doomed: dict[Path, list[str]] = {}
+    doomed: dict[Path, dict[tuple[str, str], list[int]]] = {}
     for path in (file for given in paths for file in find_recordings(given)):
         with Recording(path) as recording:
             among = candidates(recording, wanted)
@@ -180,15 +180,23 @@ def delete(
                     f"{path}: all its episodes would be deleted, and with them the file, which restore cannot bring "
                     "back; choose fewer episodes, or remove the file with --force"
                 )
-            ids = [recording.episodes[position].id for position in positions]
-        doomed.setdefault(storage_of(path.absolute()), []).extend(ids)
-    count = sum(map(len, doomed.values()))
-    for root, ids in doomed.items():
-        if ids and not dry_run:
-            with open_storage(root) as storage:
-                storage.delete_episodes(FilterIN(key="id", value=ids))
+            numbers = recording.index["episode"][positions].tolist()
+            root = storage_of(path.absolute())
+            key = path.absolute().relative_to(root).as_posix(), recording.uuid
+        if numbers:
+            doomed.setdefault(root, {})[key] = numbers
+    ids = [
+        episode_id(uuid, number)
+        for by_recording in doomed.values()
+        for (_, uuid), numbers in by_recording.items()
+        for number in numbers
+    ]
+    count = len(ids) if dry_run else 0
+    for root, by_recording in () if dry_run else doomed.items():
+        with open_storage(root) as storage:
+            count += storage.delete_numbers(by_recording)
     if as_json:
-        print_json({"dry_run": dry_run, "episodes": [one for ids in doomed.values() for one in ids]})
+        print_json({"dry_run": dry_run, "episodes": ids})
         return
     say(f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}")
 
@@ -201,25 +209,24 @@ def restore(
     It cannot bring back episodes whose space compact has freed.
     """
     from tupli_mcap.dataset.which import bounds_of
-    from tupli_mcap.recording.recover.prefix import metadata_at
     from tupli_mcap.storage.listing import find_recordings
     from tupli_mcap.storage.sidecar import storage_of
 
     wanted = [bounds_of(item.strip(), episodes) for item in episodes.split(",")] if episodes else None
     restored: list[str] = []
     by_root: dict[Path, set[str]] = {}
-    for file in (file for given in paths for file in find_recordings(given)):
-        by_root.setdefault(storage_of(file.absolute()), set()).add(metadata_at(file)["uuid"])
-    for root, uuids in by_root.items():
+    for file in (file.absolute() for given in paths for file in find_recordings(given)):
+        root = storage_of(file)
+        by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
+    for root, recordings in by_root.items():
         with open_storage(root) as storage:
             chosen = []
-            for one in storage.deleted_episodes():
-                uuid, _, found = one.partition("-")
-                named = wanted is None or any(first <= int(found) <= last for first, last in wanted)
-                if uuid in uuids and named:
+            for one in storage.deleted_episodes(recordings):
+                found = int(one.rpartition("-")[2])
+                if wanted is None or any(first <= found <= last for first, last in wanted):
                     chosen.append(one)
             if not dry_run:
-                storage.restore_episodes(chosen)
+                storage.restore_episodes(chosen, recordings)
             restored += chosen
     if as_json:
         print_json({"dry_run": dry_run, "episodes": restored})

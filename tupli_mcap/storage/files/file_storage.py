@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -273,19 +273,31 @@ class FileStorage(TupliStorage):
     def delete_episodes(self, filter: BaseFilter) -> int:
         return self._recordings.delete(self._catalog.headers(filter))
 
-    def deleted_episodes(self) -> list[str]:
+    def delete_numbers(self, by_recording: Mapping[tuple[str, str], Collection[int]]) -> int:
+        """Deletes episodes of recordings that may be copies of others, which the catalog does not list.
+
+        Args:
+            by_recording: numbers of episodes, by the recording's path below `root` and its UUID.
+        """
+        return self._recordings.delete_numbers(by_recording)
+
+    def deleted_episodes(self, recordings: Collection[str] | None = None) -> list[str]:
         """The ids of deleted episodes that can be restored, because `compact` has not freed their space.
 
-        A recording whose episodes were all deleted was removed and cannot be restored.
+        A recording whose episodes were all deleted was removed and cannot be restored. `recordings`: only those at
+        these paths below `root`.
         """
-        return self._recordings.deleted()
+        return self._recordings.deleted(recordings)
 
-    def restore_episodes(self, ids: Iterable[str] | None = None) -> int:
+    def restore_episodes(
+        self, ids: Iterable[str] | None = None, recordings: Collection[str] | None = None
+    ) -> int:
         """Restores deleted episodes, by default all that `deleted_episodes` names; returns their number.
 
-        Other ids are ignored.
+        Other ids are ignored. `recordings`: only those at these paths below `root`.
         """
-        return self._recordings.restore(set(self._recordings.deleted() if ids is None else ids))
+        wanted = set(self._recordings.deleted(recordings) if ids is None else ids)
+        return self._recordings.restore(wanted, recordings)
 
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self._recordings.publish(self._recordings.header(uri), publish_in)

@@ -20,7 +20,7 @@ from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
 from tupli_mcap.storage.base import LOCAL_USER, episode_id, published_in
 from tupli_mcap.storage.files.sync import SyncedCatalog
-from tupli_mcap.storage.listing import scan
+from tupli_mcap.storage.listing import FoundRecording, scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles"]
@@ -147,12 +147,19 @@ class RecordingFiles:
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
             by_recording.setdefault((header.recording, _uuid(header)), set()).add(header.episode)
+        return self.delete_numbers(by_recording)
+
+    def delete_numbers(self, by_recording: Mapping[tuple[str, str], Collection[int]]) -> int:
+        """`delete` for the numbers of episodes, by the recording's path below the root and its UUID.
+
+        A copy of a recording is another one: only the recordings that are named here lose episodes.
+        """
         with self._lock:
             self._finish_deletion()
             doomed: dict[str, Sidecar] = {}
             for (relative, uuid), numbers in by_recording.items():
                 with contextlib.suppress(NotFoundError):  # somebody else was first
-                    left = self._left(self.path(relative), uuid) & numbers
+                    left = self._left(self.path(relative), uuid).intersection(numbers)
                     if left:
                         doomed[relative] = Sidecar(uuid=uuid, deleted=left)
             if len(doomed) > 1:
@@ -163,10 +170,10 @@ class RecordingFiles:
             self._do_deletion(doomed)
         return sum(len(note.deleted) for note in doomed.values())
 
-    def deleted(self) -> list[str]:
-        """The ids of the episodes that are deleted and still in their recordings."""
+    def deleted(self, only: Collection[str] | None = None) -> list[str]:
+        """The ids of the episodes that are deleted and still in their recordings, or `only` in those at these paths."""
         found = []
-        for item in sorted(scan(self._root)):
+        for item in self._recordings(only):
             notes = Notes.read(self._root / item.relative, self._root)
             if notes.deleted:
                 with Recording(self._root / item.relative) as recording:
@@ -176,12 +183,12 @@ class RecordingFiles:
                     found += [episode_id(recording.uuid, number) for number in sorted(numbers)]
         return found
 
-    def restore(self, ids: Collection[str]) -> int:
-        """Restore deleted episodes; returns their number."""
+    def restore(self, ids: Collection[str], only: Collection[str] | None = None) -> int:
+        """Restore deleted episodes, `only` in recordings at these paths below the root; returns their number."""
         restored = 0
         with self._lock:
             self._finish_deletion()
-            for item in sorted(scan(self._root)):
+            for item in self._recordings(only):
                 path = self._root / item.relative
                 notes = Notes.read(path, self._root)
                 if notes.deleted:
@@ -192,6 +199,9 @@ class RecordingFiles:
                         sidecar.write(path)  # the next query notices
                         restored += len(back)
         return restored
+
+    def _recordings(self, only: Collection[str] | None) -> list[FoundRecording]:
+        return sorted(item for item in scan(self._root) if only is None or item.relative in only)
 
     def _finish_deletion(self) -> None:
         """Finish a deletion that was interrupted; only recordings in its list are changed."""
