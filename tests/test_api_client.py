@@ -183,4 +183,6 @@ def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_pa
         with admin.open_recording(names[-1]) as recording:
             assert len(recording) == episodes
     assert names[0] == names[1]
-    assert [header.recording for header in admin.list_episodes()] == names
+    headers = admin.list_episodes()
+    assert [header.recording for header in headers] == names
+    assert {header.run["name"] for header in headers} == {Path(names[0]).stem}  # it was given none

@@ -101,6 +101,7 @@ def register(
     name = _name_of(place, min(numbers), [part.name for part in earlier], [part.name for part in replaced])
     if numbers <= sidecar.deleted:
         return name, [*gone, place]
+    recording.name = name  # a run without a name is named after its file
     settle(connection, place)
     _put(connection, caller, recording, name, sidecar)
     told = {"path": escape_text(name), "place": escape_text(place), "created_by": caller.name}
