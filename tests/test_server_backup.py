@@ -157,3 +157,6 @@ def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
         damaged.write_bytes(data)
         with pytest.raises(FormatError, match=r"recordings/.*mcap is damaged: expected the SHA-256"):
             back_up(settings, tmp_path / "backup")
+        data[100] ^= 1
+        damaged.write_bytes(data)
+        assert back_up(settings, tmp_path / "backup").recordings  # goes on in what the failed one has left

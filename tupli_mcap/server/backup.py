@@ -52,7 +52,8 @@ class Copied(NamedTuple):
 
 
 def back_up(settings: Settings, target: Path) -> Copied:
-    """Backs up a server into a directory, which is empty or holds an earlier backup. The server may run.
+    """Backs up a server into a directory, which is empty or holds an earlier backup. The server may run. After an
+    interruption, call it again.
 
     Raises:
         StorageError: there is no data of a server, the directory holds something else, or a file cannot be read.
@@ -63,12 +64,12 @@ def back_up(settings: Settings, target: Path) -> Copied:
         raise StorageError(
             f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
         )
-    if target.exists() and any(target.iterdir()) and not kept.sqlite.exists():
+    new = kept.sqlite.with_name("server.sqlite.new")  # also what an interrupted backup has left
+    if target.exists() and any(target.iterdir()) and not (kept.sqlite.exists() or new.exists()):
         raise StorageError(
             f"expected a backup or nothing in {str(target)!r}, found other files; choose another directory"
         )
     kept.sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    new = kept.sqlite.with_name("server.sqlite.new")
     with contextlib.closing(Database(place.database, _UNLIMITED)) as source:
         for attempt in range(_ATTEMPTS):
             _remove(new)
