@@ -19,7 +19,9 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import made_of, merge_recordings, relabel_recording, say_made_of, verify_recording
+from tupli_mcap.recording import made_of, merge_recordings, say_made_of, verify_recording
+from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMA = Path(__file__).parent.parent / "schemas" / "made_of.schema.json"
@@ -78,8 +80,22 @@ def test_actions_and_rewards_of_some_episodes_of_several_recordings(tmp_path: Pa
     assert [episode.run.name for episode in after] == ["w0", "w0", "w1", "w1"]
     said = made_of(Recording(new))
     assert said is not None
+    assert (said["how"], said["fields"]) == ("map", ["actions", "rewards"])
     assert [Path(one["name"]).name for one in said["sources"]] == ["0.mcap", "1.mcap"]
     assert verify_recording(new).ok
+
+
+def test_the_function_sees_the_episodes_of_the_sources(tmp_path: Path) -> None:
+    paths = [record(tmp_path / f"{i}.mcap", name=f"w{i}") for i in range(2)]
+    seen = []
+
+    def same_rewards(episode: Any) -> Any:
+        seen.append(episode.id)
+        return episode.rewards
+
+    ds = tupli_mcap.open(paths).filter("seed != 0")
+    ds.map(same_rewards, tmp_path / "new.mcap")
+    assert seen == [episode.id for episode in ds]
 
 
 def test_of_a_vector_environment_with_a_dict_of_actions(tmp_path: Path) -> None:
@@ -149,7 +165,12 @@ def reversed_arrays(column: Any) -> Any:
 @pytest.mark.parametrize("name", NAMES)
 def test_states_of_every_kind_of_recording(name: str, tmp_path: Path) -> None:
     before = Recording(place(name, tmp_path))
-    relabel_recording(before, tmp_path / "new.mcap", lambda e: reversed_arrays(e.all_states), ["states"])
+    relabel_excerpts(
+        [Excerpt(before, before.index)],
+        tmp_path / "new.mcap",
+        lambda e: reversed_arrays(e.all_states),
+        ["states"],
+    )
     after = Recording(tmp_path / "new.mcap")
     for old, new in zip(before.episodes, after.episodes, strict=True):
         assert same(new.all_states, reversed_arrays(old.all_states))
@@ -204,13 +225,20 @@ def test_replaces_nothing_by_itself(tmp_path: Path) -> None:
     for folder in (tmp_path, f"{tmp_path}/new/"):
         with pytest.raises(DatasetError, match="is a directory"):
             tupli_mcap.open(source).map(lambda episode: episode.rewards, folder)
+    other = record(tmp_path / "other.mcap")
     with pytest.raises(DatasetError, match="exists"):
-        tupli_mcap.open(source).map(lambda episode: episode.rewards, source)
+        tupli_mcap.open(source).map(lambda episode: episode.rewards, other)
+    with pytest.raises(DatasetError, match="is one of the recordings themselves"):
+        tupli_mcap.open(source).map(lambda episode: episode.rewards, source, overwrite=True)
 
 
 def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
     paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
     merge_recordings(paths, tmp_path / "all.mcap")
+    both = tupli_mcap.open(paths).filter("seed = 1").save(tmp_path / "both.mcap")
+    said = made_of(Recording(both))
+    assert said is not None
+    assert (said["how"], "seed" in said["query"]) == ("filter", True)
     some = tupli_mcap.open(tmp_path / "all.mcap").filter("seed = 1").save(tmp_path / "some.mcap")
     said = made_of(Recording(some))
     assert said is not None

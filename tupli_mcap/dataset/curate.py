@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,13 +16,13 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
     Recording,
-    relabel_recording,
     rewrite_recording,
     say_made_of,
     trim_recording,
 )
 from tupli_mcap.recording.edit import merge, split
 from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
+from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
@@ -247,17 +246,19 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, qu
     """See `Dataset.save`. `query`: the filter that chose the episodes, where the dataset does not know it."""
     target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
+    known = query or ("" if dataset._filter is None else str(dataset._filter))
+    facts = {"query": known} if known else {}
     chosen = dataset._chosen
     target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()
         source = dataset._open(name)
-        known = query or ("" if dataset._filter is None else str(dataset._filter))
-        said = say_made_of([source], "filter", **({"query": known} if known else {}))
+        said = say_made_of([source], "filter", **facts)
         rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
         return target
+    made = {"how": "filter" if known else "merge", **facts}
     with replacing(target) as (fd, _):
-        merge_excerpts(_excerpts(dataset), Container(fd, str(target), "zstd"))
+        merge_excerpts(_excerpts(dataset), Container(fd, str(target), "zstd"), made=made)
     return target
 
 
@@ -269,13 +270,7 @@ def relabel(
     *,
     overwrite: bool,
 ) -> Path:
-    """See `Dataset.map`. Several recordings are merged first."""
-    if target.exists() and not overwrite:
-        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".tupli-", dir=target.parent) as folder:
-        chosen = save(dataset, Path(folder) / target.name, overwrite=False)
-        with Recording(chosen) as recording:
-            sources = [dataset._open(name) for name in dataset._chosen]
-            relabel_recording(recording, target, function=function, fields=fields, sources=sources)
+    """See `Dataset.map`."""
+    _check_new(dataset, target, overwrite=overwrite)
+    relabel_excerpts(_excerpts(dataset), target, function, fields)
     return target

@@ -460,7 +460,8 @@ class Dataset(RandomAccess):
             fields: some of "rewards", "actions", "states".
 
         Raises:
-            DatasetError: there is no episode, or the target exists (without `overwrite`).
+            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
+            SpaceError: two recordings have different spaces.
             RecordingError: the function returns values that the recording's dtype cannot hold exactly, or the target
                 cannot be written.
             StepError: a value of variable size is not in its space.

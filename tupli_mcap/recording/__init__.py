@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
     from tupli_mcap.recording.edit.made_of import made_of, say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
-    from tupli_mcap.recording.edit.relabel import relabel_recording
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
     from tupli_mcap.recording.edit.split import Part, split_recording
@@ -44,7 +43,6 @@ _HOMES = {
     "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
     "edit.made_of": "made_of say_made_of",
     "edit.merge": "MergeReport merge_recordings",
-    "edit.relabel": "relabel_recording",
     "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
     "edit.rewrite": "rewrite_recording",
     "edit.split": "Part split_recording",
@@ -74,7 +72,6 @@ __all__ = [
     "made_of",
     "merge_recordings",
     "recover_recording",
-    "relabel_recording",
     "rewrite_recording",
     "say_made_of",
     "split_recording",

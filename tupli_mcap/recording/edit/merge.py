@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, Trim
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
 from tupli_mcap.recording.edit.made_of import say_made_of
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
@@ -64,11 +64,17 @@ class UnmergeableError(RecordingError):
 
 
 class Excerpt(NamedTuple):
-    """Some episodes of a recording: rows of its index, in order; and by number, the steps that stay of an episode."""
+    """Some episodes of a recording: rows of its index, in order.
+
+    Attributes:
+        trims: by number, the steps that stay of an episode.
+        values: new values of steps.
+    """
 
     recording: Recording
     rows: Array
     trims: Mapping[int, Trim] = MappingProxyType({})
+    values: NewValues | None = None
 
 
 def merge_recordings(
@@ -121,11 +127,16 @@ def merge_recordings(
 
 
 def merge_excerpts(
-    excerpts: Sequence[Excerpt], container: Container, without: Collection[str] = ()
+    excerpts: Sequence[Excerpt],
+    container: Container,
+    without: Collection[str] = (),
+    made: Mapping[str, Any] = MappingProxyType({"how": "merge"}),
 ) -> Assembler:
     """Writes a recording of at least one excerpt, as `merge_recordings` does.
 
-    `without` names fields to leave out: "states", "actions", "infos", "frames".
+    Args:
+        without: fields to leave out: "states", "actions", "infos", "frames".
+        made: what `made_of.json` says about how it was made, besides the sources, trims and fields that are left out.
 
     Raises:
         SpaceError: they have different spaces or dtypes.
@@ -141,9 +152,11 @@ def merge_excerpts(
     codec = None if "infos" in without else _common_infos(sources)
     target = Assembler(container)
     trims = _new_trims(sources, turns, numbered)
-    how = "trim" if trims else "merge"
-    facts = {"without": sorted(without)} if without else {"steps": trims} if trims else {}
-    said = {**carry_runs(numbered), **say_made_of((source.recording for source in sources), how, **facts)}
+    facts = {"without": sorted(without)} if without else {"how": "trim", "steps": trims} if trims else {}
+    said = {
+        **carry_runs(numbered),
+        **say_made_of([source.recording for source in sources], **{**made, **facts}),
+    }
     target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
     if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
@@ -165,7 +178,7 @@ def merge_excerpts(
         layout = recording.layout.without(without) if without else None
         copier = EpisodeCopier(
             recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout,
-            infos=_new_infos(recording, codec), trims=sources[i].trims,
+            infos=_new_infos(recording, codec), trims=sources[i].trims, values=sources[i].values,
         )  # fmt: skip
         episodes += copier.copy(rows)
         infos.append(copier.infos(rows))
@@ -199,12 +212,12 @@ def _lanes(sources: Sequence[Excerpt], turns: int) -> list[int] | None:
     when another one has ended takes its place. So do recordings that alternate too often: each turn of a recording
     ends a chunk and reads all of its infos.
     """
-    alike = len({(recording.is_vector, recording.num_envs) for recording, _, _ in sources}) == 1
+    alike = len({(recording.is_vector, recording.num_envs) for recording, *_ in sources}) == 1
     if alike and turns < max(_MOST_TURNS, len(sources) + 1) and not _overlap(sources):
         return None
     free: list[int] = []  # by sub-environment, when its last episode ends
     lanes = []
-    for recording, rows, _ in sources:  # in the order in which they begin
+    for recording, rows, *_ in sources:  # in the order in which they begin
         begin, n = int(rows["start_time"].min()), recording.num_envs
         at = 0
         while any(end > begin for end in free[at : at + n]):
@@ -314,7 +327,7 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
         raise UnmergeableError(
             f"expected at most {LAST_ROW} steps in a recording, found {steps}; merge fewer"
         )
-    for other, rows, _ in sources[1:]:
+    for other, rows, *_ in sources[1:]:
         description = other.layout.without(without).to_metadata()
         for name in _SPACES:
             if description[name] != expected[name]:

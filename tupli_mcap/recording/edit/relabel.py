@@ -20,25 +20,22 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.copy_episodes import NewValues
-from tupli_mcap.recording.edit.made_of import say_made_of
+from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
+from tupli_mcap.recording.edit.rewrite import return_of
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.spaces.leaves import Leaf
 
 _FIELDS = ("rewards", "actions", "states")
 
 
-def relabel_recording(
-    source: Recording,
+def relabel_excerpts(
+    excerpts: Sequence[Excerpt],
     target: Path,
     function: Callable[[Episode], Any],
     fields: Sequence[str] = ("rewards",),
-    *,
-    sources: Sequence[Recording] = (),
 ) -> None:
     """Writes `target` (replaced in one rename) with new values of some fields.
 
@@ -46,43 +43,39 @@ def relabel_recording(
     computed from the new rewards. The recording has a new UUID and no signature.
 
     Args:
-        source: the recording to read.
-        target: path of the new one.
+        excerpts: the episodes; at least one.
+        target: path of the new recording.
         function: takes an episode and returns its new column; with several fields, a dict of columns by field. A column
             has a value for each step, nested as the space is, which the recording's dtype holds exactly. A column of
             states has one more value if the final state is known, like `Episode.all_states`.
         fields: some of "rewards", "actions" and "states".
-        sources: the recordings that `made_of.json` names, if that is not `source`.
 
     Raises:
         RecordingError: there is no such field, or the function returns something else.
+        SpaceError, FormatError: as `merge_excerpts`.
         StepError: a value of variable size does not fit its space.
     """
     fields = field_names(fields, _FIELDS)
     name = (
         f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
     )
-    said = say_made_of(sources or [source], "map", function=name, fields=fields)
-    with replacing(target) as (fd, new), _NewColumns(source, fields, new.parent) as columns:
-        values = _new_values(source, function, fields, columns)
-        container = Container(fd, str(target), "zstd")
-        write(
-            source,
-            container,
-            new_metadata(source),
-            None,
-            said,
-            values=values,
-            signed=False,
-            left_out=STATEMENTS,
-        )
+    excerpts, _ = check_mergeable(excerpts)
+    with replacing(target) as (fd, new), ExitStack() as opened:
+        changed = []
+        for i, excerpt in enumerate(excerpts):
+            columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))
+            changed.append(excerpt._replace(values=_new_values(excerpt, function, fields, columns)))
+        made = {"how": "map", "function": name, "fields": fields}
+        merge_excerpts(changed, Container(fd, str(target), "zstd"), made=made)
 
 
 def _new_values(
-    source: Recording, function: Callable[[Episode], Any], fields: list[str], new: _NewColumns
+    excerpt: Excerpt, function: Callable[[Episode], Any], fields: list[str], new: _NewColumns
 ) -> NewValues:
-    returns: dict[int, float] = {}
-    for episode, row in zip(source.episodes, source.index, strict=True):
+    source, returns = excerpt.recording, {}
+    places = np.searchsorted(source.index["episode"], excerpt.rows["episode"])
+    for place, row in zip(places.tolist(), excerpt.rows, strict=True):
+        episode = source.episodes[place]
         made = function(episode)
         by_field: Any = {fields[0]: made} if len(fields) == 1 else made
         if isinstance(by_field, Mapping):
@@ -99,7 +92,7 @@ def _new_values(
 
 
 class _NewColumns:
-    """Collects the columns of `NewValues`, episode by episode; columns of constant size are in files in `spool`.
+    """Collects the columns of `NewValues`, episode by episode; columns of constant size are in files `spool.*`.
 
     As a context manager it closes these files.
     """
@@ -144,9 +137,8 @@ class _NewColumns:
             if leaf.kind == "variable":
                 columns[name] = [None] * self._file.store.count(channel)
             else:
-                spool = _Spool(
-                    self._spool / f"{channel}.{name}", self._layout.dtypes[leaf.name], leaf.stored_shape
-                )
+                path = self._spool.with_name(f"{self._spool.name}.{channel}.{name}")
+                spool = _Spool(path, self._layout.dtypes[leaf.name], leaf.stored_shape)
                 columns[name] = self._open.enter_context(spool)
         return columns[name]
 

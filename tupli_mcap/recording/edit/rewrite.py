@@ -17,7 +17,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.carry_runs import carry_runs
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, NewValues, Trim
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
@@ -99,7 +99,6 @@ def write(
     *,
     signed: bool,
     left_out: Sequence[str] = (),
-    values: NewValues | None = None,
     trims: Mapping[int, Trim] | None = None,
 ) -> int:
     """Writes some of a source's episodes, and its attachments but those in `left_out`, to a new recording.
@@ -127,7 +126,7 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        EpisodeCopier(source, target, cameras, frames=frames, values=values, trims=trims).run(rows)
+        EpisodeCopier(source, target, cameras, frames=frames, trims=trims).run(rows)
     target.finish(now)
     return target.copied
 

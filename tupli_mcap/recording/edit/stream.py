@@ -38,7 +38,7 @@ def stream_excerpts(
 
 
 def _write(excerpts: Sequence[Excerpt], fd: int, without: Collection[str]) -> None:
-    source, rows, _ = excerpts[0]
+    source, rows, *_ = excerpts[0]
     table = source.file.store.table
     compression = COMPRESSIONS[int(table["compression"][0])]  # so that chunks can be copied as they are
     container = Container(fd, source.name, compression)

@@ -131,7 +131,7 @@ def _id(selected: Selected, digest: str) -> str:
 def _described(library: Library, selected: Selected) -> dict[str, Any]:
     """The topics of a source, their schemas, and the time range of its messages."""
     with opened(library.blobs, [selected]) as excerpts:
-        recording, rows, _ = excerpts[0]
+        recording, rows, *_ = excerpts[0]
         contents, store = recording.file.contents, recording.file.store
         channels = [channel for channel in contents.channels.values() if store.count(channel.id)]
         schemas = [contents.schemas[number] for number in sorted({c.schema_id for c in channels})]
