@@ -383,7 +383,7 @@ class TestRecord:
 
         monkeypatch.setattr(TyperGroup, "parse_args", interrupted)
         result = CliRunner().invoke(app, ["ls"])
-        assert (result.exit_code, result.stderr) == (130, "interrupted\n")
+        assert (result.exit_code, result.stderr) == (130, "interrupted; nothing was changed\n")
 
     def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
         args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]

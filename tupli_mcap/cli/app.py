@@ -63,7 +63,7 @@ class _Group(TyperGroup):
         except BaseException as err:  # noqa: BLE001 - _report raises again what is not for the user
             if debug and not isinstance(err, SystemExit):
                 print_traceback(err)
-            code = _report(err, as_json=as_json)
+            code = _report(err, given, as_json=as_json)
         if not standalone_mode:
             return code
         sys.exit(code if isinstance(code, int) else 0)
@@ -141,7 +141,19 @@ def _before_typer() -> Iterator[None]:
         raise _InterruptedError(*err.args) from err
 
 
-def _report(err: BaseException, *, as_json: bool) -> int:
+def _what_is_safe(words: Sequence[str]) -> str:
+    """What Ctrl-C leaves of a command. A file is replaced as a whole or not at all, so this holds at any time."""
+    command = next((word for word in words if word in _NAMES), None)
+    if command is None or command in _READING:
+        return "nothing was changed"
+    if command in ("push", "pull"):
+        return "what has arrived is kept; run it again to go on"
+    if command in _ASKING:
+        return "the server may have done it all the same"
+    return "every file is as it was, or finished"
+
+
+def _report(err: BaseException, words: Sequence[str], *, as_json: bool) -> int:
     """Prints an error as a line, and as JSON if asked; returns the exit code. Raises a bug of ours again."""
     message = str(err)
     code, kind = FAILED, _kind_of(err)
@@ -150,7 +162,7 @@ def _report(err: BaseException, *, as_json: bool) -> int:
         stop_writing()
         return FAILED
     if isinstance(err, _InterruptedError | KeyboardInterrupt):
-        message = "; ".join(filter(None, ("interrupted", message)))
+        message = f"interrupted; {message or _what_is_safe(words)}"
         say_interrupted(message)
         if as_json:
             print_json_error("Interrupted", message, INTERRUPTED)
@@ -407,6 +419,10 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "help": ("help view",),
 }
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]
+_READING = {name for name in _NAMES if name.startswith("list-")}.union(
+    ("ls", "info", "episodes", "browse", "whoami", "read-group"), _COMMANDS["Check"], _COMMANDS["Help"]
+)
+_ASKING = {*_COMMANDS["Server"], *_COMMANDS["People"]} - {"serve", "backup-server", "restore-server"}
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
         app.command(_name, cls=_Command)(_command)
