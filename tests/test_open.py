@@ -629,10 +629,14 @@ def test_tables_fit_each_other(dataset: Dataset) -> None:
     assert str(episodes["seed"].dtype) == "Int64"
 
 
-def test_images_come_to_arrow(tmp_path: Path) -> None:
+def test_images_and_large_arrays_come_to_arrow(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     space = gym.spaces.Dict(
-        {"cam": gym.spaces.Box(0, 255, (4, 5, 3), np.uint8), "x": gym.spaces.Box(-1, 1, (2,))}
+        {
+            "cam": gym.spaces.Box(0, 255, (4, 5, 3), np.uint8),
+            "depth": gym.spaces.Box(0, 9, (16, 32, 1)),
+            "x": gym.spaces.Box(-1, 1, (2,)),
+        }
     )
     with tupli_mcap.RecordEpisodes(Sampler(space, gym.spaces.Discrete(2)), tmp_path / "r.mcap") as env:
         roll(env, 12)
@@ -640,7 +644,11 @@ def test_images_come_to_arrow(tmp_path: Path) -> None:
     table = dataset.to_arrow()
     cams = dataset.read(["states"]).states["cam"]
     assert np.array_equal(np.array(table.column("state['cam']").to_pylist(), np.uint8), cams)
-    assert set(dataset.stats()) == {"states['x']", "actions", "rewards"}
+    frame = dataset.to_pandas()
+    assert len([name for name in frame if "state" in name]) == 4
+    assert np.array_equal(np.stack(list(frame["state['depth']"])), dataset.read().states["depth"])
+    assert frame["state['depth']"][0].shape == (16, 32, 1)
+    assert set(dataset.stats()) == {"states['depth']", "states['x']", "actions", "rewards"}
 
 
 def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:

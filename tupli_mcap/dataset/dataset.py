@@ -414,7 +414,8 @@ class Dataset(RandomAccess):
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
         """One row per step or per episode, one column per dimension, with its label if the recording has one.
 
-        Infos and metadata have a column for each key: `info.x`, `metadata.score`.
+        Infos and metadata have a column for each key: `info.x`, `metadata.score`. An image, or an array of more than
+        500 numbers, is one column, with an array in each cell.
 
         Raises:
             MissingExtraError: pandas is not installed.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Level", "arrow", "dataframe"]
 
 Level: TypeAlias = Literal["steps", "episodes"]
+_MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is of no use to anybody
 
 
 def dataframe(dataset: Dataset, level: Level) -> pd.DataFrame:
@@ -127,14 +128,14 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
 
 
 def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mapping[str, Any]:
-    """A column for each element of each leaf; one of objects for a leaf of variable size."""
+    """A column for each element of each leaf; one of objects for images, large arrays, and values of variable size."""
     columns: dict[str, Any] = {}
     for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
         values = leaf.get(column)
         if isinstance(values, list):
             columns[leaf.path] = values
             continue
-        if leaf.apart:  # one image in each cell
+        if leaf.apart or leaf.size > _MOST_COLUMNS:
             columns[leaf.path] = list(values)
             continue
         flat = values.reshape(len(values), leaf.size)
