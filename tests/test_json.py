@@ -113,6 +113,7 @@ list-episodes: list-episodes --storage lab
 rename: rename {pole} pole2 --description standing --storage lab --dry-run
 compact: compact --storage lab --dry-run
 reindex: reindex --storage lab
+declare-key: declare-key metadata.score --storage lab
 trust --key: trust --key key.pub --name me
 bundle: bundle {pole} -o signed.mcap --storage lab --sign key
 bundle: bundle {wind} -o wind.mcap --storage lab

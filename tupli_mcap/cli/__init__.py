@@ -8,7 +8,7 @@ render         render, plot
 edit           tag, edit, merge, split, filter, trim, recover
 doctor         doctor
 verify         verify
-storage        delete, restore, compact, rename, reindex, list-benchmarks, list-artifacts, list-episodes
+storage        delete, restore, compact, rename, reindex, declare-key, list-benchmarks, list-artifacts, list-episodes
 share/         bundles, trust, servers
 options        options of several commands
 output         formats what is printed

@@ -323,6 +323,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "rename": storage.rename,
         "compact": storage.compact,
         "reindex": storage.reindex,
+        "declare-key": storage.declare_key,
     },
     "Help": {"help": _help, "version": _version},
 }
@@ -416,6 +417,10 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "rename": ("rename 3f2a 'cart pole, windy' --storage lab", "rename 3f2a --undo --storage lab"),
     "compact": ("compact --storage lab --dry-run",),
     "reindex": ("reindex --storage lab",),
+    "declare-key": (
+        "declare-key metadata.score --storage lab",
+        "declare-key metadata.score --storage http://127.0.0.1:8080",
+    ),
     "help": ("help view",),
 }
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]

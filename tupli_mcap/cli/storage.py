@@ -1,4 +1,5 @@
-"""Commands on storages: delete, restore, compact, list-benchmarks, list-artifacts, list-episodes, rename, reindex."""
+"""Commands on storages: delete, restore, compact, list-benchmarks, list-artifacts, list-episodes, rename, reindex,
+declare-key."""
 
 from __future__ import annotations
 
@@ -40,6 +41,7 @@ from tupli_mcap.errors import RecordingError
 
 __all__ = [
     "compact",
+    "declare_key",
     "delete",
     "list_artifacts",
     "list_benchmarks",
@@ -317,3 +319,21 @@ def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) 
         print_json({"storage": storage_path, "episodes": count})
     else:
         say(f"{storage_path}: {counted(count, 'episode')}")
+
+
+def declare_key(
+    key: Annotated[str, typer.Argument(metavar="KEY", help="Such as metadata.score.")],
+    place: AnyStorage = None,
+    as_json: Json = False,
+) -> None:
+    """Make an index of a key of metadata.
+
+    With many thousand episodes, a filter or an order by a key of metadata is slow without
+    one. The storage keeps the index up to date.
+    """
+    with any_storage(place) as storage:
+        storage.declare_key(key)
+    if as_json:
+        print_json({"key": key})
+    else:
+        say(f"{key} has an index")
