@@ -71,6 +71,19 @@ def test_of_a_copy_only(runs: Path) -> None:
     assert (seeds(copy), seeds(file)) == ([0, 1, 2, 3], [1, 2, 3])
 
 
+def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
+    one, other = runs / "a.mcap", runs / "deep" / "b.mcap"
+    sizes = [path.stat().st_size for path in (one, other)]
+    run("delete", str(one), str(other), "--episodes", "0")
+    assert "a.mcap" in run("compact", str(one), "--dry-run")
+    assert "rewrote 1 recording" in run("compact", str(one))
+    assert (one.stat().st_size < sizes[0], other.stat().st_size) == (True, sizes[1])
+    assert (seeds(one), seeds(other)) == ([1, 2, 3], [1, 2, 3])
+    assert "restored 0 episodes" in run("restore", str(one))
+    assert "rewrote 1 recording" in run("compact", str(other.parent))
+    assert other.stat().st_size < sizes[1]
+
+
 def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:
     file, other = runs / "a.mcap", runs / "deep" / "b.mcap"
     run("delete", str(file), "--episodes", "1,2")

@@ -415,7 +415,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "list-artifacts": ("list-artifacts --storage lab",),
     "list-episodes": ("list-episodes --storage lab --filter 'metadata.score > 30'",),
     "rename": ("rename 3f2a 'cart pole, windy' --storage lab", "rename 3f2a --undo --storage lab"),
-    "compact": ("compact --storage lab --dry-run",),
+    "compact": ("compact run.mcap", "compact lab/ --dry-run"),
     "reindex": ("reindex --storage lab",),
     "declare-key": (
         "declare-key metadata.score --storage lab",

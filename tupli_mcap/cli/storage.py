@@ -237,6 +237,12 @@ def restore(
 
 
 def compact(
+    given: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[PATH]", help="A file, directory or storage; by default, --storage.", parser=local_path
+        ),
+    ] = None,
     storage_path: StoragePath = DEFAULT_STORAGE,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be rewritten.")] = False,
     as_json: Json = False,
@@ -249,11 +255,16 @@ def compact(
     """
     from tupli_mcap.files import left_below
     from tupli_mcap.storage.listing import compactable
+    from tupli_mcap.storage.sidecar import storage_of
 
-    with open_storage(storage_path) as storage:
-        recordings = compactable(storage_path)
-        left = list(left_below(storage_path))
-        freed = 0 if dry_run else storage.compact()
+    place, only = given or storage_path, None
+    if place.is_file():
+        file, place = place.absolute(), storage_of(place.absolute())
+        only = {file.relative_to(place).as_posix()}
+    with open_storage(place) as storage:
+        recordings = [one for one in compactable(place) if only is None or one.recording in only]
+        left = list(left_below(place))
+        freed = 0 if dry_run else storage.compact(only)
     if as_json:
         print_json({"dry_run": dry_run, "recordings": recordings, "left_over": left, "bytes_freed": freed})
         return

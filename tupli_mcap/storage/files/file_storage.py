@@ -344,13 +344,14 @@ class FileStorage(TupliStorage):
         """Rebuild the catalog from the recordings."""
         self._catalog.reindex()
 
-    def compact(self) -> int:
+    def compact(self, recordings: Collection[str] | None = None) -> int:
         """Rewrite recordings that hold deleted episodes, and remove the temporary files of killed processes; returns
         the number of bytes freed.
 
-        Recordings that are being written are left alone. Episodes that stay keep their ids.
+        Recordings that are being written are left alone. Episodes that stay keep their ids. `recordings`: only those
+        at these paths below `root`.
         """
-        return self._recordings.compact()
+        return self._recordings.compact(recordings)
 
     # --- sharing ---
 

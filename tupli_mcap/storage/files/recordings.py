@@ -262,9 +262,9 @@ class RecordingFiles:
             with contextlib.suppress(OSError):  # not empty
                 directory.rmdir()
 
-    def compact(self) -> int:
+    def compact(self, only: Collection[str] | None = None) -> int:
         """Rewrite the recordings that hold deleted episodes, and remove the temporary files of killed processes;
-        returns the number of bytes that this freed.
+        returns the number of bytes that this freed. `only`: the recordings at these paths below the root.
 
         Recordings that are being written stay unchanged. Episodes that stay keep their ids.
         """
@@ -274,7 +274,7 @@ class RecordingFiles:
         for name in _OLD_CATALOG:  # left by earlier versions, which had the catalog here
             with contextlib.suppress(OSError):
                 (self._root / name).unlink()
-        for item in sorted(scan(self._root)):
+        for item in self._recordings(only):
             path = self._root / item.relative
             with self._lock:
                 if not path.exists() or not Notes.read(path, self._root).deleted:
