@@ -16,6 +16,7 @@ bodies: oversized, of no length, half, too deep     test_server_limits
     heads without an end, compressed bombs          TestSizes
     metadata and descriptions without an end        TestSizes
 a quota that requests at once would exceed          TestSizes
+a file with the UUID of somebody else's recording   test_server_shadowing
 user enumeration by text and by time                TestEnumeration
 names in uploads and in files, which lead nowhere   TestFiles
 SSRF: addresses that a file or a request gives      TestFiles

@@ -83,6 +83,30 @@ def test_rows_of_the_first_version_stay(url: str) -> None:
         database.close()
 
 
+def test_who_was_the_first_to_store_a_recording_is_known(url: str) -> None:
+    fill_first(url)
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        (uuid,) = connection.execute(text("SELECT uuid FROM file")).scalars()
+        for number, owner, of in ((30, "ann", uuid), (20, "eve", uuid), (40, "eve", "0"), (10, "bob", "0")):
+            name = f"{owner}-{of}.mcap"
+            told = {"path": name, "owner": owner, "uuid": of, "number": number}
+            columns = "path, created_by, uuid, place, digest, size, episodes, deleted"
+            row = text(f"INSERT INTO file ({columns}) VALUES (:path, :owner, :uuid, :path, '', 1, 1, '[]')")
+            connection.execute(row, told)
+            columns = 'number, time, "user", action, target'
+            row = text(f"INSERT INTO audit ({columns}) VALUES (:number, 0, :owner, 'store_recording', :path)")
+            connection.execute(row, told)
+    engine.dispose()
+    database = Database(url)
+    with database.reading() as connection:
+        for table in ("claim", "file"):
+            rows = connection.execute(text(f"SELECT uuid, created_by FROM {table} ORDER BY uuid, rank")).all()
+            assert [tuple(row) for row in rows if row.uuid == "0"] == [("0", "bob"), ("0", "eve")]
+            assert [row.created_by for row in rows if row.uuid == uuid] == ["admin", "eve", "ann"]
+    database.close()
+
+
 def test_the_last_revision_makes_the_tables_that_the_code_says(url: str) -> None:
     database = Database(url)
     with database.reading() as connection:

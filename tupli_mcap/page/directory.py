@@ -84,6 +84,9 @@ class _OpenToAll:
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
         return true()
 
+    def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
+        return true()
+
 
 class DirectoryShelf(_OpenToAll):
     """The recordings below a directory, and the benchmarks if it is a storage."""

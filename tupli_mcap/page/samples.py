@@ -74,13 +74,17 @@ def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> S
     facts = (EPISODE.c[name] for name in ("created_at", "episode_return", "n_tuples", "success", "seed"))
     query = select(RECORDING.c.path, *facts).select_from(EPISODE.join(RECORDING, of_one_recording()))
     if dataset.episodes <= _EPISODES:
-        rows = list(connection.execute(query.where(seen_episodes(shelf, of_dataset(dataset.key)))))
+        rows = list(
+            connection.execute(query.where(seen_episodes(shelf, connection, of_dataset(dataset.key))))
+        )
     else:
         recordings = _evenly(dataset.recordings, _RECORDINGS)
         share = _EPISODES / sum(item.episodes for item in recordings)
         rows = []
         for ids in _batches(_ids(shelf, connection, recordings, share)):
-            rows += connection.execute(query.where(seen_episodes(shelf, EPISODE.c.id.in_(ids)))).all()
+            rows += connection.execute(
+                query.where(seen_episodes(shelf, connection, EPISODE.c.id.in_(ids)))
+            ).all()
     rows.sort(key=lambda row: row[1])
     returns, steps, success, seeds = (np.array([row[i] for row in rows], np.float64) for i in range(2, 6))
     names, ended = [unescape_text(row[0]) for row in rows], np.array([row[1] for row in rows], np.int64)
@@ -153,7 +157,7 @@ def sample_numbers(
     found = []
     for item in _evenly(dataset.recordings, _OPENED):
         ids = _ids(shelf, connection, [item], min(1.0, each / max(1, item.episodes)))
-        chosen = seen_episodes(shelf, EPISODE.c.id.in_(list(ids)))
+        chosen = seen_episodes(shelf, connection, EPISODE.c.id.in_(list(ids)))
         joined = EPISODE.join(RECORDING, of_one_recording())
         numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(chosen)).scalars()
         found.append((item.recording, list(numbers)))
@@ -170,7 +174,7 @@ def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
 def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
     """The row ids of about a `share` of the episodes of some recordings, at even distances in each."""
     counts = {escape_text(item.recording): item.episodes for item in recordings}
-    own = seen_episodes(shelf, in_order())
+    own = seen_episodes(shelf, connection, in_order())
     # Of one of them alone, SQLite reads an end of the index; of both in one query, all between them.
     ends = (select(of(EPISODE.c.id)).where(own).scalar_subquery() for of in (func.min, func.max))
     query = select(RECORDING.c.id, RECORDING.c.path, *ends)
@@ -181,7 +185,7 @@ def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], shar
                 continue
             there: Any = range(low, high + 1)
             if len(there) != counts[path]:  # some are deleted, or the reader may not see them
-                these = seen_episodes(shelf, episodes_of(recording_id, EPISODE.c.id))
+                these = seen_episodes(shelf, connection, episodes_of(recording_id, EPISODE.c.id))
                 ids = connection.execute(select(EPISODE.c.id).where(these).order_by(EPISODE.c.id))
                 there = ids.scalars().all()
             count = max(1, round(len(there) * share))

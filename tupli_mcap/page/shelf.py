@@ -11,7 +11,6 @@ from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
-from tupli_mcap.storage.catalog.tables import EPISODE
 from tupli_mcap.storage.catalog.tallies import recordings_seen
 
 __all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes", "seen_recordings"]
@@ -50,6 +49,10 @@ class Shelf(Protocol):
         """The condition, on these two columns of the queried table, for rows that the reader may see."""
         ...
 
+    def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
+        """The condition on EPISODE for the episodes that the reader may see."""
+        ...
+
     def open(self, recording: str) -> Recording:
         """An open recording of the catalog. Others use it at the same time: do not close it.
 
@@ -69,9 +72,11 @@ class Shelf(Protocol):
         ...
 
 
-def seen_episodes(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
+def seen_episodes(
+    shelf: Shelf, connection: Connection, *conditions: ColumnElement[bool]
+) -> ColumnElement[bool]:
     """A condition for the episodes that the reader may see and that meet all conditions."""
-    return and_(shelf.seen(EPISODE.c.created_by, EPISODE.c.published_in), *conditions)
+    return and_(shelf.seen_episodes(connection), *conditions)
 
 
 def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
@@ -80,14 +85,13 @@ def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnEle
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:
-    """Episodes by their ids, each once, in the order of their recordings. If several users have stored an episode, the
-    reader's own copy is taken.
+    """Episodes by their ids, each once, in the order of their recordings.
 
     Raises:
         NotFoundError: an episode does not exist, or the reader may not see it.
     """
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
-    found = each_once(find_episodes(connection, wanted, only=seen_episodes(shelf)), shelf.user)
+    found = each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection)))
     known = {header.id for header in found}
     missing = [uri for uri in uris if uri not in known]
     if missing:

@@ -12,6 +12,7 @@ __all__ = [
     "API_TOKEN",
     "AUDIENCE",
     "AUDIT",
+    "CLAIM",
     "FAILURE",
     "FILE",
     "GROUP",
@@ -123,12 +124,25 @@ FILE: Final = Table(
     METADATA,
     Column("path", TEXT, primary_key=True),
     Column("created_by", TEXT, nullable=False, index=True),
-    Column("uuid", TEXT, nullable=False, index=True),
+    Column("uuid", TEXT, nullable=False),
     Column("place", TEXT, nullable=False),  # its name among the blobs; a new one for each version
     Column("digest", TEXT, nullable=False),  # SHA-256 in hex digits
     Column("size", NUMBER, nullable=False),
     Column("episodes", NUMBER, nullable=False),  # in the file, deleted ones too
     Column("deleted", TEXT, nullable=False),  # JSON: numbers of episodes
+    Column("rank", NUMBER, nullable=False, server_default="0", index=True),  # as in the claim of its owner
+    Index("ix_file_uuid_created_by", "uuid", "created_by"),
+    Index("ix_file_uuid_rank", "uuid", "rank"),
+)
+
+# The users who have stored a recording of a UUID. A claim stays when the recording is deleted: who has waited for that
+# does not become the first.
+CLAIM: Final = Table(
+    "claim",
+    METADATA,
+    Column("uuid", TEXT, primary_key=True),
+    Column("created_by", TEXT, primary_key=True),
+    Column("rank", NUMBER, nullable=False),  # how many other users did so before
 )
 
 # Files that are being stored or deleted. A clean-up deletes those that the other tables do not name.

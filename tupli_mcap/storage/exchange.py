@@ -7,12 +7,13 @@ import itertools
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap import trust
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -28,7 +29,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, TupliStorage, anew
+from tupli_mcap.storage.base import TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.catalog.queries import each_once
@@ -67,10 +68,11 @@ def copy_episodes(
     to be copied whole for that.
 
     Returns:
-        By benchmark, how much was copied.
+        By benchmark, how much was copied. A warning names benchmarks that the source lacks, or an artifact of them;
+        their episodes are not copied.
 
     Raises:
-        NotFoundError: the source has no such benchmark, or an artifact of it is gone.
+        NotFoundError: the source lacks the named benchmark, or an artifact of it.
         StorageError: the target refuses it.
     """
     return anew(lambda: _copy(source, target, filter, benchmark_id, dry_run=dry_run))
@@ -92,12 +94,18 @@ def _copy(
         chosen = of_it if filter is None else of_it & filter
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
-    me = source.username if isinstance(source, TupliAPIClient) else LOCAL_USER
-    for header in each_once(source.list_episodes(chosen), me):
+    for header in each_once(source.list_episodes(chosen)):
         wanted.setdefault(header.benchmark_id, []).append(header)
     copied = {}
     for uri, headers in wanted.items():
-        artifacts = _copy_benchmark(source, target, uri, dry_run=dry_run) if uri else 0
+        try:
+            artifacts = _copy_benchmark(source, target, uri, dry_run=dry_run) if uri else 0
+        except NotFoundError as err:
+            if uri == benchmark_id:
+                raise
+            # somebody has published the episodes without their benchmark, which must not keep the others away
+            warnings.warn(f"not copied: {len(headers)} episodes: {err}", stacklevel=4)
+            continue
         held = {header.id for header in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         new = [header for header in headers if header.id not in held]
         groups = [

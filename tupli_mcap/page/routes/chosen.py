@@ -94,7 +94,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         of = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
-        return each_once(find_episodes(connection, wanted, only=seen_episodes(shelf), of=of), shelf.user)
+        return each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection), of=of))
 
     headers = shelf.ask(ask)
     if not headers:

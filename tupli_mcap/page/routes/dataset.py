@@ -113,7 +113,7 @@ def shown_first(shelf: Shelf, connection: Connection, dataset: Dataset, show: st
         chosen = min(known, key=lambda item: item.return_least or 0.0)
         order = Sort("return")
     of = seen_recordings(shelf, of_dataset(dataset.key), of_recording(chosen.recording))
-    found = find_episodes(connection, None, limit=1, only=seen_episodes(shelf), of=of, sort=order)
+    found = find_episodes(connection, None, limit=1, only=seen_episodes(shelf, connection), of=of, sort=order)
     return next(found, None)
 
 

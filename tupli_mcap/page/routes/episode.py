@@ -175,7 +175,7 @@ def _neighbours(
                 wanted,
                 limit=1,
                 after=at,
-                only=seen_episodes(shelf),
+                only=seen_episodes(shelf, connection),
                 of=seen_recordings(shelf, *of),
                 sort=order,
                 backwards=backwards,

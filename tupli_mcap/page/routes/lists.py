@@ -136,7 +136,7 @@ def table_of(
     try:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         order = Sort.parse(sort)
-        only = seen_episodes(shelf)
+        only = seen_episodes(shelf, connection)
         of_some = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
         at = find_episode(shelf, connection, after or before) if after or before else None
         found = list(

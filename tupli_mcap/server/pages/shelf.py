@@ -17,7 +17,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people.access import Caller, Right, readable
+from tupli_mcap.server.people.access import Caller, Right, readable, readable_episodes
 from tupli_mcap.server.stored.selection import Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
@@ -58,6 +58,9 @@ class LibraryShelf:
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
         return readable(self._caller, Right.EPISODE_READ, created_by, published_in)
 
+    def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
+        return readable_episodes(connection, self._caller)
+
     def open(self, recording: str) -> Recording:
         """The recording; if the caller may read only some of its episodes, a recording of these."""
         place, numbers = self._readable(recording)
@@ -72,15 +75,11 @@ class LibraryShelf:
             NotFoundError: there is no such recording, or the caller may read none of its episodes.
         """
         file = select(FILE.c.place, FILE.c.episodes).where(FILE.c.path == escape_text(recording))
-        numbers = (
-            select(EPISODE.c.episode)
-            .join(RECORDING, of_one_recording())
-            .where(seen_episodes(self, of_recording(recording)))
-            .order_by(EPISODE.c.episode)
-        )
+        numbers = select(EPISODE.c.episode).join(RECORDING, of_one_recording()).order_by(EPISODE.c.episode)
         with self._library.database.reading() as connection:
             found = connection.execute(file).first()
-            seen = tuple(connection.execute(numbers).scalars())
+            of = seen_episodes(self, connection, of_recording(recording))
+            seen = tuple(connection.execute(numbers.where(of)).scalars())
         if found is None or not seen:
             raise NotFoundError(f"there is no recording {recording[:200]!r}")
         return unescape_text(found.place), None if len(seen) == found.episodes else seen

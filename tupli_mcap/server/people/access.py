@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import Connection, and_, or_, select
+from sqlalchemy import Connection, FromClause, and_, not_, or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.schema import Right
-from tupli_mcap.server.tables import AUDIENCE, GROUP, USER
+from tupli_mcap.server.tables import AUDIENCE, FILE, GROUP, USER
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, first_of
 from tupli_mcap.storage.texts import escape_text
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "demand_audience",
     "left_alone",
     "readable",
+    "readable_episodes",
 ]
 
 GLOBAL: Final = "global"
@@ -101,6 +103,40 @@ def readable(
     groups = [escape_text(group) for group in caller.groups_with(right)]
     seen = select(AUDIENCE.c.published_in).where(AUDIENCE.c.team.in_(groups))
     return or_(created_by == escape_text(caller.name), published_in.in_(seen))
+
+
+def readable_episodes(connection: Connection, caller: Caller) -> ColumnElement[bool]:
+    """The condition on EPISODE for the episodes that a caller may read, of which no two have the same id.
+
+    Anybody can store a file with the UUID of somebody else's recording, and refusing it would reveal that this exists.
+    So an id shows the caller's own episode, or else that of the user who was the first to store a recording of this
+    UUID; the others do not exist for the caller as long as that one may be read.
+    """
+    seen = _seen(caller, EPISODE)
+    copied = (
+        select(FILE.c.uuid)
+        .join(RECORDING, RECORDING.c.path == FILE.c.path)
+        .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
+        .where(FILE.c.rank > 0, _seen(caller, TALLY))
+    )
+    if connection.execute(copied.limit(1)).first() is None:  # as nearly always
+        return seen
+    file, other, recording, episode = FILE.alias(), FILE.alias(), RECORDING.alias(), EPISODE.alias()
+    same = select(episode.c.id).where(
+        and_(RECORDING.c.id == EPISODE.c.recording_id, file.c.path == RECORDING.c.path),
+        and_(other.c.uuid == file.c.uuid, recording.c.path == other.c.path),
+        and_(episode.c.id == first_of(recording.c.id) + EPISODE.c.episode, _seen(caller, episode)),
+    )
+    name = escape_text(caller.name)
+    better = (other.c.created_by == name, other.c.rank < file.c.rank)  # apart, each by its index
+    before = [same.where(of).correlate(EPISODE).exists() for of in better]
+    recordings = select(RECORDING.c.id).where(RECORDING.c.uuid.in_(copied))
+    of_others = and_(EPISODE.c.recording_id.in_(recordings), EPISODE.c.created_by != name)
+    return and_(seen, not_(and_(of_others, or_(*before))))
+
+
+def _seen(caller: Caller, rows: FromClause) -> ColumnElement[bool]:
+    return readable(caller, Right.EPISODE_READ, rows.c.created_by, rows.c.published_in)
 
 
 def demand_audience(connection: Connection, caller: Caller, right: Right, group: str) -> None:

@@ -18,7 +18,7 @@ from tupli_mcap.server.database import audience, audit, settle
 from tupli_mcap.server.people.access import Caller, Right, readable
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.stored.episodes import forget, whole_name
-from tupli_mcap.server.tables import FILE, ITEM
+from tupli_mcap.server.tables import CLAIM, FILE, ITEM
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
@@ -106,7 +106,12 @@ def register(
     _put(connection, caller, recording, name, sidecar)
     told = {"path": escape_text(name), "place": escape_text(place), "created_by": caller.name}
     told |= {"uuid": recording.uuid, "digest": digest, "deleted": json.dumps(sorted(sidecar.deleted))}
-    connection.execute(insert(FILE).values(**told, size=recording.size, episodes=len(numbers)))
+    counts = {
+        "size": recording.size,
+        "episodes": len(numbers),
+        "rank": _rank(connection, caller, recording.uuid),
+    }
+    connection.execute(insert(FILE).values(**told, **counts))
     audit(connection, caller.name, "store_recording", name)
     return name, [each for each in gone if each != place]
 
@@ -141,6 +146,17 @@ def _name_of(place: str, first: int, earlier: Sequence[str], replaced: Sequence[
     if whole in replaced or whole not in earlier:
         return whole
     return replaced[0] if replaced else f"{whole}/{first:010}-{secrets.token_hex(6)}.mcap"
+
+
+def _rank(connection: Connection, caller: Caller, uuid: str) -> int:
+    """How many other users have stored a recording of a UUID before the caller did so for the first time."""
+    found = connection.execute(select(CLAIM.c.created_by, CLAIM.c.rank).where(CLAIM.c.uuid == uuid))
+    ranks = {created_by: int(rank) for created_by, rank in found}
+    if caller.name not in ranks:
+        ranks[caller.name] = len(ranks)
+        row = {"uuid": uuid, "created_by": caller.name, "rank": ranks[caller.name]}
+        connection.execute(insert(CLAIM).values(**row))
+    return ranks[caller.name]
 
 
 def _put(connection: Connection, caller: Caller, recording: Recording, name: str, sidecar: Sidecar) -> None:

@@ -13,7 +13,15 @@ from sqlalchemy.sql.elements import ColumnElement
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.server.database import audience, audit, pend
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, demand_audience, left_alone, readable
+from tupli_mcap.server.people.access import (
+    Caller,
+    DeniedError,
+    Right,
+    demand_audience,
+    left_alone,
+    readable,
+    readable_episodes,
+)
 from tupli_mcap.server.tables import FILE, USER
 from tupli_mcap.storage.base import published_in
 from tupli_mcap.storage.catalog import queries
@@ -54,11 +62,19 @@ def find_episodes(
     offset: int = 0,
     after: After | None = None,
     only: ColumnElement[bool] | None = None,
+    copies: bool = False,
 ) -> Iterator[EpisodeHeader]:
-    """The readable episodes that match a filter, see `queries.find_episodes`."""
+    """The readable episodes that match a filter, see `queries.find_episodes`.
+
+    copies: with all episodes of one id, not only the one that it shows the caller.
+    """
     seen = _seen(caller)
-    rows, of = seen(EPISODE.c.created_by, EPISODE.c.published_in), recordings_seen(seen)
-    rows = rows if only is None else and_(rows, only)
+    rows = (
+        seen(EPISODE.c.created_by, EPISODE.c.published_in)
+        if copies
+        else readable_episodes(connection, caller)
+    )
+    rows, of = rows if only is None else and_(rows, only), recordings_seen(seen)
     return queries.find_episodes(
         connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of
     )
@@ -66,9 +82,8 @@ def find_episodes(
 
 def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
     """The number of readable episodes that match a filter."""
-    seen = _seen(caller)
-    rows, of = seen(EPISODE.c.created_by, EPISODE.c.published_in), recordings_seen(seen)
-    return queries.count_episodes(connection, filter, only=rows, of=of)
+    of = recordings_seen(_seen(caller))
+    return queries.count_episodes(connection, filter, only=readable_episodes(connection, caller), of=of)
 
 
 def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
@@ -121,7 +136,7 @@ def publish(
     Returns:
         How many they are.
     """
-    found = queries.each_once(find_episodes(connection, caller, filter, only=only), caller.name)
+    found = list(find_episodes(connection, caller, filter, only=only))
     for header in found:
         if header.created_by != caller.name:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
@@ -141,14 +156,16 @@ def unpublish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Hides episodes from a group. The owner may, and whoever has the right to delete in that group.
+    """Hides episodes from a group. The owner may, and whoever has the right to delete in that group, who hides all
+    episodes of an id.
 
     only: see `find_episodes`.
 
     Returns:
         How many they are.
     """
-    found = queries.each_once(find_episodes(connection, caller, filter, only=only), caller.name)
+    copies = caller.may(Right.EPISODE_DELETE, group)
+    found = list(find_episodes(connection, caller, filter, only=only, copies=copies))
     if any(header.created_by != caller.name for header in found):
         caller.demand(Right.EPISODE_DELETE, group)
     _set_audiences(connection, found, lambda groups: [name for name in groups if name != group])
@@ -157,20 +174,17 @@ def unpublish(
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
-    """Deletes the readable episodes that match a filter; returns how many, and the names of files to delete.
+    """Deletes the readable episodes that match a filter; returns how many, and the names of files to delete. A caller
+    who may delete what others have stored deletes all episodes of an id.
 
     Raises:
         DeniedError: an episode is somebody else's, and the caller may not delete it; then none is deleted.
     """
-    found = list(find_episodes(connection, caller, filter))
-    own = {header.id for header in found if header.created_by == caller.name}
-    doomed = []
-    for header in found:
-        if header.created_by != caller.name and not caller.may(Right.EPISODE_DELETE):
-            if header.id in own:  # another user has stored the same recording
-                continue
+    may = caller.may(Right.EPISODE_DELETE)
+    doomed = list(find_episodes(connection, caller, filter, copies=may))
+    for header in doomed:
+        if header.created_by != caller.name and not may:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may delete it")
-        doomed.append(header)
     _note(connection, caller, "delete_episodes", doomed)
     return len(doomed), _delete(connection, doomed)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import and_
 from typing import Final, NamedTuple
@@ -95,24 +95,9 @@ def select_episodes(
         raise StorageError(
             f"expected episodes of at most {_MOST} recordings, found {len(numbers)}; name some (`recordings`)"
         )
-    return _each_once(connection, caller, numbers)
-
-
-def _each_once(
-    connection: Connection, caller: Caller, numbers: Mapping[str, Sequence[int]]
-) -> list[Selected]:
-    """Episodes by the names of their recordings; of those that several users have stored, the caller's own copy."""
-    columns = (FILE.c.path, FILE.c.place, FILE.c.uuid, FILE.c.created_by)
-    found = connection.execute(select(*columns).where(FILE.c.path.in_(map(escape_text, numbers)))).all()
-    files = {unescape_text(file.path): file for file in found}
-    kept: dict[str, Selected] = {}
-    known: dict[str, set[int]] = {}
-    for name in sorted(numbers, key=lambda name: files[name].created_by != caller.name):
-        seen = known.setdefault(files[name].uuid, set())
-        if new := [number for number in numbers[name] if number not in seen]:
-            kept[name] = Selected(name, unescape_text(files[name].place), new)
-        seen.update(new)
-    return [kept[name] for name in numbers if name in kept]
+    files = select(FILE.c.path, FILE.c.place).where(FILE.c.path.in_(map(escape_text, numbers)))
+    places = {unescape_text(path): unescape_text(place) for path, place in connection.execute(files)}
+    return [Selected(name, places[name], some) for name, some in numbers.items()]
 
 
 @contextlib.contextmanager

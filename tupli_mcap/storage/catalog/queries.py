@@ -148,12 +148,11 @@ def find_episodes(
     return _all_of_them(connection, asked, limit, offset)
 
 
-def each_once(headers: Iterable[EpisodeHeader], user: str) -> list[EpisodeHeader]:
-    """Each episode once: if several people have stored it, the user's own, or else the first."""
+def each_once(headers: Iterable[EpisodeHeader]) -> list[EpisodeHeader]:
+    """Each episode once: if several files of a directory have it, that of the first one."""
     found: dict[str, EpisodeHeader] = {}
     for each in headers:
-        if each.id not in found or each.created_by == user:
-            found[each.id] = each
+        found.setdefault(each.id, each)
     return list(found.values())
 
 
