@@ -1,6 +1,6 @@
 """Kills a server, its database and its object store while users work, and breaks their connections.
 
-    python tools/server_faults.py --kills 300 --seed 1 --engine postgresql
+    python tools/server_faults.py --kills 300 --seed 1 --engine postgresql [--only database]
 
 Three users store, fetch, publish and delete recordings and artifacts at the same time, through a proxy that refuses,
 resets, stalls, answers 503 and flips bits. At a random moment, the server is killed, its PostgreSQL crashes, or its
@@ -56,6 +56,7 @@ from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.texts import unescape_text
 
 ENGINES = ("sqlite", "postgresql")
+VICTIMS = ("server", "database", "bucket")
 _FAULTS = ("pass", "pass", "refuse", "reset", "reset", "5xx", "flip", "flip up", "stall")
 _OWN = {"secret", "uploads", "making", "server.sqlite", "server.sqlite-wal", "server.sqlite-shm"}
 _USERS = ("ann", "bob", "eve")
@@ -147,9 +148,10 @@ class Campaign:
         assert self.cluster is not None
         return self._stack.enter_context(self.cluster.database())
 
-    def run(self, kills: int) -> Iterator[tuple[int, str, list[str]]]:
-        """Yields the number of each kill, what was killed, and what was wrong after it."""
-        some = ("server", "server", "database", "bucket") if self.cluster else ("server",)
+    def run(self, kills: int, victims: Sequence[str] = ()) -> Iterator[tuple[int, str, list[str]]]:
+        """Yields the number of each kill, what was killed, and what was wrong after it. victims: what to kill; all if
+        none is named."""
+        some = victims or (("server", "server", "database", "bucket") if self.cluster else ("server",))
         number = 0
         while number < kills:
             number += 1
@@ -158,9 +160,9 @@ class Campaign:
                 yield number, "migration", list(self._migrate(number, rng))
                 continue
             most = min(3, kills - number + 1, 10 - number % 10)
-            victims = [rng.choice(some) for _ in range(rng.randint(1, most))]
-            number += len(victims) - 1
-            yield number, " and ".join(victims), list(self._break(victims, rng))
+            hit = [rng.choice(some) for _ in range(rng.randint(1, most))]
+            number += len(hit) - 1
+            yield number, " and ".join(hit), list(self._break(hit, rng))
         yield kills, "the last start", list(self._last())
 
     def _break(self, victims: Sequence[str], rng: random.Random) -> Iterator[str]:
@@ -302,11 +304,13 @@ class Campaign:
             self._server.wait()
 
 
-def campaign(engine: str, kills: int, seed: int, folder: Path) -> Iterator[tuple[int, str, list[str]]]:
+def campaign(
+    engine: str, kills: int, seed: int, folder: Path, victims: Sequence[str] = ()
+) -> Iterator[tuple[int, str, list[str]]]:
     """Runs kills; yields the number of each, what was killed, and what was wrong then."""
     with contextlib.ExitStack() as stack:
         made = Campaign(engine, folder, seed, stack)
-        yield from made.run(kills)
+        yield from made.run(kills, victims)
         yield 0, ", ".join(f"{count} {what}" for what, count in made.counts.items()), []
 
 
@@ -317,10 +321,14 @@ def main() -> None:
     parser.add_argument("--engine", choices=ENGINES, default="sqlite")
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=VICTIMS, help="kill nothing else; the last two need postgresql")
     chosen = parser.parse_args()
+    if chosen.only not in (None, "server") and chosen.engine != "postgresql":
+        parser.error(f"--only {chosen.only} needs --engine postgresql")
+    victims = [chosen.only] if chosen.only else []
     bad = 0
     with tempfile.TemporaryDirectory() as folder:
-        for number, what, wrong in campaign(chosen.engine, chosen.kills, chosen.seed, Path(folder)):
+        for number, what, wrong in campaign(chosen.engine, chosen.kills, chosen.seed, Path(folder), victims):
             bad += bool(wrong)
             if number % 10 == 0:
                 print(f"{number} ({time.strftime('%H:%M:%S')})", flush=True)
