@@ -288,7 +288,13 @@ class TestEdits:
         command("edit", str(path), "--name", "sac", "--set", "lr=2", "--set", "seed=3")
         command("edit", str(path), "--tag", "b", "--split", "eval")
         assert Recording(path).run.tags == ("b",)
-        command("edit", str(path), "--undo", "--dry-run")
+        told = command("edit", str(path), "--undo", "--dry-run")
+        assert [line.split(maxsplit=1)[0] for line in told.splitlines()] == [
+            "would",
+            "run",
+            "tags",
+            "settings",
+        ]
         run = undo_edit(path)
         assert (run.name, run.tags, run.split, run.metadata) == ("sac", ("a",), "", {"lr": 2, "seed": 3})
         assert "ppo" in command("edit", str(path), "--undo")

@@ -24,6 +24,7 @@ from tupli_mcap.cli.output import (
     bytes_of,
     counted,
     number,
+    pairs_of,
     print_facts,
     print_json,
     print_table,
@@ -107,7 +108,11 @@ def split(
     if as_json:
         print_json({"dry_run": dry_run, "recordings": parts})
         return
-    columns = (Column("RECORDING", shrink="start"), Column("EPISODES", "right"), Column("STEPS", "right"))
+    columns = (
+        Column("WOULD WRITE" if dry_run else "RECORDING", shrink="start"),
+        Column("EPISODES", "right"),
+        Column("STEPS", "right"),
+    )
     rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
     print_table(columns, rows, empty="nothing to split")
 
@@ -158,12 +163,14 @@ def tag(
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
     for one in done:
-        would = "would be " if dry_run else ""
         noted = ", ".join(
             f"{key}={'' if value is None else dumps_any(value)}" for key, value in one["values"].items()
         )
         count = counted(len(one["episodes"]), "episode")
-        say(f"{one['path']}: {count} {would}{'undone' if undo else 'annotated'}: {noted}")
+        if undo:
+            say(f"{one['path']}: {'would take' if dry_run else 'took'} {noted} back from {count}")
+        else:
+            say(f"{one['path']}: {count} {'would be ' if dry_run else ''}annotated: {noted}")
 
 
 def edit(
@@ -212,11 +219,14 @@ def edit(
         edited = zip(files, runs, strict=True)
         print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
         return
-    from tupli_mcap.jsonvalue import shown as as_text
-
     for file, run in zip(files, runs, strict=True):
-        facts = {"recording": str(file), "run": run.name, "split": run.split, "tags": ", ".join(run.tags)}
-        facts |= {key: as_text(value) for key, value in run.metadata.items()}
+        facts = {
+            "would change" if dry_run else "recording": str(file),
+            "run": run.name,
+            "split": run.split,
+            "tags": ", ".join(run.tags),
+            "settings": pairs_of(run.metadata),
+        }
         print_facts([(key, text) for key, text in facts.items() if text])
 
 

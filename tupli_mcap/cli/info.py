@@ -73,6 +73,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         {str(header.run["environment"]) for header in headers if header.run.get("environment")}
     )
     keys = sorted({key for header in headers for key in header.metadata})
+    settings = sorted({key for header in headers for key in header.run.get("metadata", {})})
     lengths, returns = spread_of(dataset.lengths), spread_of(dataset.returns)
     rate = sum(said) / len(said) if said else None
     if as_json:
@@ -81,7 +82,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
                 "path": shown(source), "recordings": recordings, "runs": runs, "environments": environments,
                 "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
                 "returns": returns, "success": rate, "seeds": len(seeds), "metadata_keys": keys,
-                "made_of": None if is_url(source) else dataset.made_of,
+                "setting_keys": settings, "made_of": None if is_url(source) else dataset.made_of,
             }
         )  # fmt: skip
         return
@@ -90,6 +91,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         "server" if is_server(source) else "pattern" if is_url(source) else "directory": shown(source),
         "recordings": number(recordings),
         "runs": _some(runs),
+        "settings": _some(settings),
         "environments": _some(environments),
         "episodes": number(len(headers)) + (f" ({ended})" if ended else ""),
         "steps": number(dataset.n_steps) + _spread_text(lengths, len(headers), " an episode"),
@@ -119,8 +121,8 @@ def info(
     For a recording: its run, spaces, benchmark, returns and lengths of episodes,
     distributions of rewards, actions, states and infos, channels and attachments.
     Distributions and keys of infos of a long recording come from a sample of its steps; for
-    a URL, they are left out. For a directory: its runs, environments, episodes and metadata
-    keys. --episodes and --filter choose episodes; channels, attachments and size are those
+    a URL, they are left out. For a directory: its runs, environments, episodes, and the
+    keys of settings and metadata. --episodes and --filter choose episodes; channels, attachments and size are those
     of the whole file.
     """
     import numpy as np

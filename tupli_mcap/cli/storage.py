@@ -314,7 +314,11 @@ def rename(
     if as_json:
         print_json({"dry_run": dry_run, "benchmark": header.model_dump()})
         return
-    facts = {"benchmark": uri, "name": header.metadata.name, "description": header.metadata.description}
+    facts = {
+        "would change" if dry_run else "benchmark": uri,
+        "name": header.metadata.name,
+        "description": header.metadata.description,
+    }
     print_facts([(key, text) for key, text in facts.items() if text])
 
 

@@ -18,7 +18,7 @@ from tupli_mcap.plots import style
 from tupli_mcap.plots.groups import Group
 from tupli_mcap.plots.measure import SUCCESS, Measured
 from tupli_mcap.plots.style import Cell, Page, cut
-from tupli_mcap.recording.description import nan_text, spread_of
+from tupli_mcap.recording.description import RecordingDescription, nan_text, spread_of
 
 _MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 _MOST_LISTED = 12  # recordings
@@ -58,6 +58,7 @@ def facts_of(groups: Sequence[Group]) -> list[tuple[str, str]]:
     ends = ", ".join(f"{count:,} {name}" for count, name in zip(counts, END_NAMES, strict=True) if count)
     found = {
         "recording": one.name + ("" if about.state == "complete" else f" ({about.state})"),
+        **_run_facts(about),
         "environment": (about.environment or "none attached")
         + (f", {about.num_envs} sub-environments" if about.num_envs > 1 else ""),
         "recorded": _times_text(one),
@@ -73,6 +74,17 @@ def facts_of(groups: Sequence[Group]) -> list[tuple[str, str]]:
         "action": _space_text(about.action),
     }
     return [(label, value) for label, value in found.items() if value]
+
+
+def _run_facts(about: RecordingDescription) -> dict[str, str]:
+    """The run's name, split and settings; of several, their names."""
+    if len(about.runs) > 1:
+        return {"runs": ", ".join(str(run["name"]) for run in about.runs)}
+    split, settings = about.run.get("split", ""), about.run.get("metadata", {})
+    return {
+        "run": about.run.get("name", "") + (f" ({split})" if split else ""),
+        "settings": ", ".join(f"{key}={value!s:.{_VALUE}}" for key, value in settings.items()),
+    }
 
 
 def _group_text(group: Group) -> str:
