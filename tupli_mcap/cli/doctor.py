@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,18 +20,6 @@ __all__ = ["doctor"]
 _INDENT = 9  # columns: the longest severity and a gap
 _OTHERS = 3  # how many recordings with the same finding are named
 _STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}
-
-
-class _Level(StrEnum):
-    error = "error"
-    warning = "warning"
-    info = "info"
-
-
-class _FailOn(StrEnum):
-    error = "error"
-    warning = "warning"
-    never = "never"
 
 
 _Paths = Annotated[
@@ -60,9 +47,12 @@ def doctor(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     fail_on: Annotated[
-        _FailOn, typer.Option(help="Exit with 1 if a finding is as bad as this, or worse.")
-    ] = _FailOn.error,
-    level: Annotated[_Level, typer.Option(help="Print findings as bad as this, or worse.")] = _Level.info,
+        Literal["error", "warning", "never"],
+        typer.Option(help="Exit with 1 if a finding is as bad as this, or worse."),
+    ] = "error",
+    level: Annotated[
+        Literal["error", "warning", "info"], typer.Option(help="Print findings as bad as this, or worse.")
+    ] = "info",
     check: _Checks = None,
     skip: _Skipped = None,
     settings: _Thresholds = None,
@@ -102,8 +92,8 @@ def doctor(
     if as_json:
         print_json({key: value for key, value in diagnosis.to_dict().items() if key != "version"})
     else:
-        _print(diagnosis, Severity[level.name.upper()])
-    failing = () if fail_on is _FailOn.never else diagnosis.at_least(Severity[fail_on.name.upper()])
+        _print(diagnosis, Severity[level.upper()])
+    failing = () if fail_on == "never" else diagnosis.at_least(Severity[fail_on.upper()])
     if failing or diagnosis.of("unreadable"):
         raise typer.Exit(1)
 
@@ -158,8 +148,8 @@ def _print(diagnosis: Diagnosis, level: Severity) -> None:
     verdict = ["healthy"] if diagnosis.healthy else []
     severities = [str(finding.severity) for finding in diagnosis.findings]
     verdict += [
-        f"{number(count)} info" if name is _Level.info else counted(count, name)
-        for name in _Level
+        f"{number(count)} info" if name == "info" else counted(count, name)
+        for name in _STYLES
         if (count := severities.count(name))
     ]
     examined = (

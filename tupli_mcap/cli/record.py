@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -19,45 +18,9 @@ from tupli_mcap.errors import TupliError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from tupli_mcap.recording.write.options import CaptureEnv
     from tupli_mcap.wrappers.rollout import RolloutSummary
 
 __all__ = ["record"]
-
-
-class _Mode(StrEnum):
-    x = "x"
-    w = "w"
-    a = "a"
-
-
-class _Durability(StrEnum):
-    os = "os"
-    chunk = "chunk"
-    step = "step"
-
-
-class _Compression(StrEnum):
-    zstd = "zstd"
-    lz4 = "lz4"
-    none = "none"
-
-
-class _CaptureEnv(StrEnum):
-    spec = "spec"
-    pickle = "pickle"
-    none = "none"
-
-    @property
-    def argument(self) -> CaptureEnv:
-        """The value that `record_rollouts` takes."""
-        return None if self is _CaptureEnv.none else "pickle" if self is _CaptureEnv.pickle else "spec"
-
-
-class _Capture(StrEnum):
-    all = "all"
-    versions = "versions"
-    none = "none"
 
 
 def _check_policy(value: str | None) -> str | None:
@@ -86,14 +49,14 @@ _Policy = Annotated[
         help="A function that maps an observation to an action; by default, actions are random.",
     ),
 ]
-_ModeOption = Annotated[
-    _Mode,
+_Mode = Annotated[
+    Literal["x", "w", "a"],
     typer.Option(help="If the file exists, x refuses, w replaces it, a appends to it."),
 ]
-_CompressionOption = Annotated[_Compression, typer.Option(help="How chunks are compressed.")]
+_Compression = Annotated[Literal["zstd", "lz4", "none"], typer.Option(help="How chunks are compressed.")]
 _RecordInfo = Annotated[bool, typer.Option("--record-info", help="Also record the info dict of each step.")]
-_DurabilityOption = Annotated[
-    _Durability,
+_Durability = Annotated[
+    Literal["os", "chunk", "step"],
     typer.Option(
         help="When to wait for the disk, for power losses: never (os), at each chunk, or each step."
     ),
@@ -108,8 +71,8 @@ _Frames = Annotated[
     bool, typer.Option("--frames", help="Also record the frames that the environment renders (rgb_array).")
 ]
 _Every = Annotated[int, typer.Option(min=1, help="With --frames: only every n-th step.")]
-_CaptureEnvOption = Annotated[
-    _CaptureEnv,
+_CaptureEnv = Annotated[
+    Literal["spec", "pickle", "none"],
     typer.Option(help="What to store of the environment: its spec, also its code (pickle), or none."),
 ]
 _MaxBytes = Annotated[
@@ -128,8 +91,8 @@ _Tag = Annotated[
     list[str] | None, typer.Option("--tag", metavar="WORD", help="A tag of the run. Repeatable.")
 ]
 _Split = Annotated[str, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")]
-_CaptureOption = Annotated[
-    _Capture,
+_Capture = Annotated[
+    Literal["all", "versions", "none"],
     typer.Option(
         "--capture",
         help="What to store about this process: command, commit, host and versions (all), versions only, or none.",
@@ -144,21 +107,21 @@ def record(
     seed: _Seed = None,
     num_envs: _NumEnvs = 1,
     policy: _Policy = None,
-    mode: _ModeOption = _Mode.x,
-    compression: _CompressionOption = _Compression.zstd,
+    mode: _Mode = "x",
+    compression: _Compression = "zstd",
     record_info: _RecordInfo = False,
-    durability: _DurabilityOption = _Durability.os,
+    durability: _Durability = "os",
     live: _Live = None,
     frames: _Frames = False,
     every: _Every = 1,
-    capture_env: _CaptureEnvOption = _CaptureEnv.spec,
+    capture_env: _CaptureEnv = "spec",
     max_bytes: _MaxBytes = None,
     max_seconds: _MaxSeconds = None,
     name: _Name = None,
     settings: _Set = None,
     tags: _Tag = None,
     run_split: _Split = "",
-    capture: _CaptureOption = _Capture.all,
+    capture: _Capture = "all",
     as_json: Json = False,
 ) -> None:
     """Record rollouts of an environment.
@@ -177,15 +140,15 @@ def record(
         sys.path.append("")  # last, so that a file in this directory replaces no installed module
     function = None if policy is None else load_policy(policy)
     with (
-        _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode is _Mode.w),
+        _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode == "w"),
         step_progress(steps) as progress,
     ):
         summary = record_rollouts(
-            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode.value,
-            compression=compression.value, record_info=record_info, durability=durability.value, live=live,
-            frames=every if frames else False, capture_env=capture_env.argument, max_bytes=max_bytes,
-            max_seconds=max_seconds, name=name, metadata=dict(map(pair_of, settings or ())), tags=tags or (),
-            split=run_split, capture=capture.value, progress=progress,
+            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode,
+            compression=compression, record_info=record_info, durability=durability, live=live,
+            frames=every if frames else False, capture_env=None if capture_env == "none" else capture_env,
+            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=dict(map(pair_of, settings or ())),
+            tags=tags or (), split=run_split, capture=capture, progress=progress,
         )  # fmt: skip
     _print_rollout(summary, as_json=as_json)
 

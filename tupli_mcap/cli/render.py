@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,17 +26,6 @@ __all__ = ["plot", "render"]
 _MOST_NAMES = 5
 
 
-class _Format(StrEnum):
-    png = "png"
-    jpeg = "jpeg"
-
-
-class _X(StrEnum):
-    steps = "steps"
-    episodes = "episodes"
-    time = "time"
-
-
 _Source = Annotated[
     str,
     typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it."),
@@ -46,7 +34,7 @@ _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]
 _Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Width of the frames, in pixels.")]
 _FrameFormat = Annotated[
-    _Format, typer.Option("--format", help="Format of the frames in a .mcap; png is exact.")
+    Literal["png", "jpeg"], typer.Option("--format", help="Format of the frames in a .mcap; png is exact.")
 ]
 _Trust = Annotated[
     bool, typer.Option("--trust", help="Rebuild the environment even if that runs code from the file.")
@@ -64,7 +52,7 @@ def render(
     filter_text: FilterText = None,
     every: _Every = 1,
     width: _Width = None,
-    frame_format: _FrameFormat = _Format.png,
+    frame_format: _FrameFormat = "png",
     trust: _Trust = False,
     rerun: _Rerun = False,
     force: _Force = False,
@@ -103,7 +91,7 @@ def render(
             episodes=chosen,
             every=every,
             width=width,
-            frame_format=frame_format.value,
+            frame_format=frame_format,
             trust=trust,
             overwrite=force,
             progress=progress,
@@ -206,7 +194,7 @@ _Shown = Annotated[
     ),
 ]
 _Axis = Annotated[
-    _X | None,
+    Literal["steps", "episodes", "time"] | None,
     typer.Option(
         "--x", help="The horizontal axis; by default, episodes for one recording, steps for several."
     ),
@@ -235,9 +223,7 @@ def plot(
 
     goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")
     check_goal(goal, overwrite=force)
-    made = report(
-        paths, episode=episode, episode_filter=filter_of(filter_text), x=None if x is None else x.value
-    )
+    made = report(paths, episode=episode, episode_filter=filter_of(filter_text), x=x)
     made.save(goal, overwrite=force)
     size = goal.stat().st_size
     episodes, steps = (
