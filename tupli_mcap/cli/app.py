@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
-from tupli_mcap.cli.output import begin_json, print_json_error, with_options
+from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust, upkeep
 from tupli_mcap.cli.terminal import (
     fail,
@@ -167,10 +167,8 @@ def _report(err: BaseException, words: Sequence[str], *, as_json: bool) -> int:
         if as_json:
             print_json_error("Interrupted", message, INTERRUPTED)
         return INTERRUPTED
-    if isinstance(err, FilterError):
-        code = USAGE  # filters come from the command line only
-    elif isinstance(err, TupliError):
-        message = with_options(err)
+    if isinstance(err, TupliError):
+        code = USAGE if isinstance(err, FilterError) else FAILED  # filters come from the command line only
     elif isinstance(err, MemoryError):
         message = f"not enough memory ({message or 'out of memory'}); --debug shows where"
     elif isinstance(err, OSError):

@@ -11,7 +11,6 @@ from pathlib import PurePath
 from typing import Any, Final, Literal, NamedTuple
 
 from tupli_mcap.cli.terminal import say, say_json, say_styled, terminal_width, visible
-from tupli_mcap.errors import RecordingError, TupliError, UntrustedError
 
 __all__ = [
     "JSON_VERSION",
@@ -30,7 +29,6 @@ __all__ = [
     "short_value",
     "time_of",
     "when",
-    "with_options",
 ]
 
 JSON_VERSION: Final = 1
@@ -130,16 +128,6 @@ def print_json(result: Any) -> None:
     NamedTuples become objects, paths become texts, NumPy values become numbers and lists, NaN and infinities null.
     """
     _print_document({"result": _plain(result, _OWN_LEVELS)})
-
-
-def with_options(err: TupliError) -> str:
-    """The message of an error, with options in place of Python's arguments."""
-    message = str(err)
-    if isinstance(err, UntrustedError):  # each command that may raise it has --trust
-        return message.replace("pass trust=True", "pass --trust")
-    if isinstance(err, RecordingError):  # only `record` has modes
-        return message.replace('mode="a"', "--mode a").replace('"w" to replace', "w to replace")
-    return message
 
 
 def print_json_error(kind: str, message: str, exit_code: int) -> None:

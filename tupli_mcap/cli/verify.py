@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
-from tupli_mcap.cli.output import counted, number, print_json, print_wrapped, with_options
+from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.remote import is_url, shown
@@ -161,9 +161,9 @@ class _Replays:
                 certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
-            self._found.append((shown(path), None, with_options(err)))
+            self._found.append((shown(path), None, str(err)))
             if not quiet:
-                fail(with_options(err))
+                fail(str(err))
             return
         self._found.append((shown(path), certificate, ""))
         if not quiet:

@@ -64,7 +64,7 @@ def build(
     if reasons and not trusted:
         raise UntrustedError(
             f"rebuilding the environment {record.name[:200]!r} would run {'; '.join(reasons)}. If you trust "
-            "where it comes from, pass trust=True or run `tupli-mcap trust FILE` (digest "
+            "where it comes from, pass trust=True (--trust) or run `tupli-mcap trust FILE` (digest "
             f"{record.digest}); reading its episodes needs no trust"
         )
     spec = record.spec

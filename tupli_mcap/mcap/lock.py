@@ -218,8 +218,8 @@ class FileLock:
 
 def _exists(path: Path) -> RecordingError:
     return RecordingError(
-        f'{path} exists and is not overwritten; choose another path, or mode="a" to append, "w" to replace; '
-        "a directory gets a new file each time"
+        f'{path} exists and is not overwritten; choose another path, or mode="a" (--mode a) to append, '
+        'mode="w" (--mode w) to replace; a directory gets a new file each time'
     )
 
 

@@ -93,7 +93,7 @@ class Rotation:
                 names = ", ".join(one.name for one in list(later.values())[:3])
                 raise RecordingError(
                     f"{path}: {names}{' …' if len(later) > 3 else ''} of an earlier series would follow it; "
-                    'delete them, record to another path, or go on with mode="a"'
+                    'delete them, record to another path, or go on with mode="a" (--mode a)'
                 )
             return
         files = [base, *later.values()]
