@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import (
+    DryRun,
     Episodes,
     File,
     FilterText,
+    Force,
     Json,
+    Output,
     Sources,
     dataset_of,
     filter_of,
@@ -27,6 +30,7 @@ from tupli_mcap.cli.output import (
     pairs_of,
     print_facts,
     print_json,
+    print_result,
     print_table,
     print_wrapped,
 )
@@ -37,11 +41,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
 
 __all__ = ["edit", "filter_", "merge", "recover", "split", "tag", "trim"]
-
-_Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]
-_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
-_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be written.")]
-
 
 _NO_JOURNAL = {
     "missing": "their journal is not beside the file; if the file was cut off, also all after the cut",
@@ -56,9 +55,9 @@ def merge(
         list[str],
         typer.Argument(metavar="PATH|URL", help="Recordings with the same spaces, or directories of them."),
     ],
-    output: _Output,
-    force: _Force = False,
-    dry_run: _DryRun = False,
+    output: Output,
+    force: Force = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write the episodes of several recordings into one.
@@ -71,10 +70,7 @@ def merge(
     from tupli_mcap.dataset import merge_recordings
 
     report = merge_recordings(recordings_of(sources), output, overwrite=force, dry_run=dry_run)
-    if as_json:
-        print_json({"dry_run": dry_run, **report._asdict()})
-        return
-    _print_made(report, dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
 
 
 def split(
@@ -87,7 +83,7 @@ def split(
     ],
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes in each file.")] = None,
     max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes in each file, roughly.")] = None,
-    dry_run: _DryRun = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write the episodes of a recording into several.
@@ -124,7 +120,7 @@ def tag(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last note.")] = False,
-    dry_run: _DryRun = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Note something about episodes, such as success=true.
@@ -190,7 +186,7 @@ def edit(
         str | None, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")
     ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit.")] = False,
-    dry_run: _DryRun = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Change the name, metadata, tags or split of a run.
@@ -236,9 +232,9 @@ def filter_(
         str,
         typer.Argument(metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."),
     ],
-    output: _Output,
-    force: _Force = False,
-    dry_run: _DryRun = False,
+    output: Output,
+    force: Force = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write the episodes that match a filter into a new file.
@@ -249,10 +245,7 @@ def filter_(
     from tupli_mcap.dataset.curate import filter_dataset
 
     report = filter_dataset(dataset_of(sources), output, filter_text, overwrite=force, dry_run=dry_run)
-    if as_json:
-        print_json({"dry_run": dry_run, **report._asdict()})
-        return
-    _print_made(report, dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
 
 
 def trim(
@@ -260,11 +253,11 @@ def trim(
     steps: Annotated[
         str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a Python slice.")
     ],
-    output: _Output,
+    output: Output,
     episodes: Episodes = None,
     filter_text: FilterText = None,
-    force: _Force = False,
-    dry_run: _DryRun = False,
+    force: Force = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Cut steps off the ends of episodes, into a new recording.
@@ -290,16 +283,17 @@ def trim(
     else:
         ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
     report = trim_dataset(dataset, kept, ids, output, overwrite=force, dry_run=dry_run)
-    if as_json:
-        print_json({"dry_run": dry_run, **report._asdict()})
-        return
-    _print_made(report, dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
 
 
-def _print_made(report: Any, dry_run: bool) -> None:
+def _print_made(report: Any, *, dry_run: bool, as_json: bool) -> None:
     size = "" if dry_run else f", {bytes_of(report.size)}"
     would = "would write " if dry_run else ""
-    say(f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}")
+    print_result(
+        {"dry_run": dry_run, **report._asdict()},
+        f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}",
+        as_json=as_json,
+    )
 
 
 def recover(
@@ -310,11 +304,11 @@ def recover(
             "--output", "-o", metavar="FILE", help="The new recording; by default, FILE.recovered.mcap."
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")] = False,
+    force: Force = False,
     in_place: Annotated[
         bool, typer.Option("--in-place", help="Finish the file itself instead, if nothing of it is lost.")
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what could be saved.")] = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Save what is undamaged in a recording into a new one.

@@ -15,11 +15,12 @@ from tupli_mcap.remote import is_server, is_url, shown
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
     from tupli_mcap.schema import BaseFilter
-    from tupli_mcap.storage import FileStorage, TupliStorage
+    from tupli_mcap.storage import FileStorage, TupliAPIClient, TupliStorage
 
 __all__ = [
-    "AnyStorage", "ColumnNames", "Episodes", "File", "FilterText", "Json", "Limit", "Sort", "Sources", "StoragePath",
-    "any_storage", "dataset_of", "filter_of", "full_id", "local_path", "open_storage", "pair_of", "recordings_of"
+    "AnyStorage", "Benchmark", "ColumnNames", "DryRun", "Episodes", "File", "FilterText", "Force", "Json", "Limit",
+    "Output", "Sort", "Sources", "StoragePath", "Url", "any_storage", "dataset_of", "filter_of", "full_id",
+    "local_path", "open_storage", "pair_of", "recordings_of", "server_at",
 ]  # fmt: skip
 
 
@@ -38,6 +39,9 @@ Sources = Annotated[
     list[str], typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
+Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
 Episodes = Annotated[
     str | None,
     typer.Option(
@@ -65,7 +69,25 @@ FilterText = Annotated[
 ]
 StoragePath = Annotated[
     Path,
-    typer.Option("--storage", envvar="TUPLI_MCAP_STORAGE", help="The storage's directory.", readable=False),
+    typer.Option(
+        "--storage",
+        envvar="TUPLI_MCAP_STORAGE",
+        help="The storage's directory.",
+        parser=local_path,
+        readable=False,
+    ),
+]
+Benchmark = Annotated[
+    str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark's id; its first 4 digits are enough.")
+]
+Url = Annotated[
+    str | None,
+    typer.Option(
+        envvar="TUPLI_MCAP_URL",
+        metavar="URL",
+        help="The server; by default, that of the last login, or this machine.",
+        readable=False,
+    ),
 ]
 DEFAULT_STORAGE = Path("_local_storage")
 AnyStorage = Annotated[
@@ -147,13 +169,19 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
 def any_storage(place: str | None) -> AbstractContextManager[TupliStorage]:
     """The storage in an existing directory, or on a server; by default, the usual directory, or else the server of the
     last login."""
-    from tupli_mcap.storage import TupliAPIClient
     from tupli_mcap.storage.api import last_server
 
     if place is None:
         place = "" if DEFAULT_STORAGE.is_dir() else last_server()
         place = place or str(DEFAULT_STORAGE)
-    return TupliAPIClient(place) if is_url(place) else open_storage(Path(place))
+    return server_at(place) if is_url(place) else open_storage(Path(place))
+
+
+def server_at(url: str | None) -> TupliAPIClient:
+    """The storage on a server; see `Url`."""
+    from tupli_mcap.storage import TupliAPIClient  # takes long to import
+
+    return TupliAPIClient(url)
 
 
 def full_id(storage: TupliStorage, text: str) -> str:

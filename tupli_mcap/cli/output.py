@@ -23,6 +23,7 @@ __all__ = [
     "print_facts",
     "print_json",
     "print_json_error",
+    "print_result",
     "print_table",
     "print_wrapped",
     "short_ids",
@@ -128,6 +129,14 @@ def print_json(result: Any) -> None:
     NamedTuples become objects, paths become texts, NumPy values become numbers and lists, NaN and infinities null.
     """
     _print_document({"result": _plain(result, _OWN_LEVELS)})
+
+
+def print_result(result: Any, *lines: str, as_json: bool) -> None:
+    """Print the result of a command as JSON, or as lines."""
+    if as_json:
+        print_json(result)
+    else:
+        say(*lines)
 
 
 def print_json_error(kind: str, message: str, exit_code: int) -> None:

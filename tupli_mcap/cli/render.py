@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, Sources, filter_of
-from tupli_mcap.cli.output import bytes_of, counted, number, print_json
+from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, filter_of
+from tupli_mcap.cli.output import bytes_of, counted, number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote import is_server
@@ -42,7 +42,6 @@ _Trust = Annotated[
 _Rerun = Annotated[
     bool, typer.Option("--rerun", help="Run the episodes again, even if they were recorded with pictures.")
 ]
-_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 
 
 def render(
@@ -55,7 +54,7 @@ def render(
     frame_format: _FrameFormat = "png",
     trust: _Trust = False,
     rerun: _Rerun = False,
-    force: _Force = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Make a film of episodes, or a copy with frames.
@@ -105,10 +104,8 @@ def render(
 
 
 def _print_film(path: Path, pictures: int, *, as_json: bool) -> None:
-    if as_json:
-        print_json({"path": path, "frames": pictures, "recorded": True, "ok": True})
-    else:
-        say(f"{path}: {counted(pictures, 'recorded picture')}")
+    told = {"path": path, "frames": pictures, "recorded": True, "ok": True}
+    print_result(told, f"{path}: {counted(pictures, 'recorded picture')}", as_json=as_json)
 
 
 @contextlib.contextmanager
@@ -207,7 +204,7 @@ def plot(
     episode: _Shown = "best",
     x: _Axis = None,
     filter_text: FilterText = None,
-    force: _Force = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Draw a report of recordings as a picture or a page.
@@ -229,8 +226,9 @@ def plot(
     episodes, steps = (
         sum(counts) for counts in zip(*((len(m.rows), m.steps) for m in made.measured), strict=True)
     )
-    if as_json:
-        told = {"path": goal, "size": size, "recordings": len(made.measured), "episodes": episodes}
-        print_json({**told, "steps": steps, "notes": made.notes})
-    else:
-        say(f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}")
+    told = {"path": goal, "size": size, "recordings": len(made.measured), "episodes": episodes}
+    print_result(
+        {**told, "steps": steps, "notes": made.notes},
+        f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}",
+        as_json=as_json,
+    )

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Sources, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, filter_of
 from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
 
@@ -31,7 +31,6 @@ _Connect = Annotated[
         "--connect", metavar="URL", help="Send it to a running viewer: rerun+http://HOST:PORT/proxy."
     ),
 ]
-_Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
 _Layout = Annotated[
     Path | None,
     typer.Option(
@@ -49,7 +48,7 @@ def replay(
     save: _Save = None,
     web: _Web = False,
     connect: _Connect = None,
-    force: _Force = False,
+    force: Force = False,
     layout: _Layout = None,
 ) -> None:
     """Look at recordings in the Rerun viewer.

@@ -12,7 +12,9 @@ from tupli_mcap.cli.lists import list_stored
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     AnyStorage,
+    Benchmark,
     ColumnNames,
+    DryRun,
     Episodes,
     FilterText,
     Json,
@@ -32,6 +34,7 @@ from tupli_mcap.cli.output import (
     number,
     print_facts,
     print_json,
+    print_result,
     print_table,
     short_ids,
     when,
@@ -144,7 +147,6 @@ def list_episodes(
 _Paths = Annotated[
     list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
 ]
-_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only count them.")]
 
 
 def delete(
@@ -154,7 +156,7 @@ def delete(
     force: Annotated[
         bool, typer.Option("--force", help="Remove recordings whose episodes are all deleted.")
     ] = False,
-    dry_run: _DryRun = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Delete episodes; restore brings them back.
@@ -197,15 +199,14 @@ def delete(
     for root, by_recording in () if dry_run else doomed.items():
         with open_storage(root) as storage:
             count += storage.delete_numbers(by_recording)
-    if as_json:
-        print_json({"dry_run": dry_run, "episodes": ids})
-        return
-    say(f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}")
+    print_result(
+        {"dry_run": dry_run, "episodes": ids},
+        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
+        as_json=as_json,
+    )
 
 
-def restore(
-    paths: _Paths, episodes: Episodes = None, dry_run: _DryRun = False, as_json: Json = False
-) -> None:
+def restore(paths: _Paths, episodes: Episodes = None, dry_run: DryRun = False, as_json: Json = False) -> None:
     """Bring deleted episodes back, by default all.
 
     It cannot bring back episodes whose space compact has freed.
@@ -230,10 +231,11 @@ def restore(
             if not dry_run:
                 storage.restore_episodes(chosen, recordings)
             restored += chosen
-    if as_json:
-        print_json({"dry_run": dry_run, "episodes": restored})
-        return
-    say(f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}")
+    print_result(
+        {"dry_run": dry_run, "episodes": restored},
+        f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}",
+        as_json=as_json,
+    )
 
 
 def compact(
@@ -244,7 +246,7 @@ def compact(
         ),
     ] = None,
     storage_path: StoragePath = DEFAULT_STORAGE,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be rewritten.")] = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Free the space of deleted episodes.
@@ -284,14 +286,12 @@ def compact(
 
 
 def rename(
-    benchmark: Annotated[
-        str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark's id; its first 4 digits are enough.")
-    ],
+    benchmark: Benchmark,
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="The new name.")] = None,
     description: Annotated[str | None, typer.Option(help="The new description.")] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take back the last change.")] = False,
     storage_path: StoragePath = DEFAULT_STORAGE,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be written.")] = False,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Give a benchmark another name or description.
@@ -330,10 +330,8 @@ def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) 
     with open_storage(storage_path) as storage:
         storage.reindex()
         count = storage.count_episodes()
-    if as_json:
-        print_json({"storage": storage_path, "episodes": count})
-    else:
-        say(f"{storage_path}: {counted(count, 'episode')}")
+    told = {"storage": storage_path, "episodes": count}
+    print_result(told, f"{storage_path}: {counted(count, 'episode')}", as_json=as_json)
 
 
 def declare_key(
@@ -348,7 +346,4 @@ def declare_key(
     """
     with any_storage(place) as storage:
         storage.declare_key(key)
-    if as_json:
-        print_json({"key": key})
-    else:
-        say(f"{key} has an index")
+    print_result({"key": key}, f"{key} has an index", as_json=as_json)

@@ -7,22 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import print_facts, print_json
-from tupli_mcap.cli.terminal import ask_secret, say
+from tupli_mcap.cli.options import Json, Url, server_at
+from tupli_mcap.cli.output import print_facts, print_json, print_result
+from tupli_mcap.cli.terminal import ask_secret
 from tupli_mcap.errors import StorageError
 
-__all__ = ["Url", "login", "logout", "password", "signup", "whoami"]
+__all__ = ["login", "logout", "password", "signup", "whoami"]
 
-Url = Annotated[
-    str | None,
-    typer.Option(
-        envvar="TUPLI_MCAP_URL",
-        metavar="URL",
-        help="The server; by default, that of the last login, or this machine.",
-        readable=False,
-    ),
-]
 Username = Annotated[str, typer.Argument(metavar="USER", help="The user's name.")]
 
 
@@ -31,18 +22,14 @@ def login(username: Username, url: Url = None, as_json: Json = False) -> None:
 
     The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         client.login(username, _password("Password: "))
         _tell(client.url, username, f"signed in to {client.url} as {username}", as_json=as_json)
 
 
 def logout(url: Url = None, as_json: Json = False) -> None:
     """Sign out of a server."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         username = client.username
         client.logout()
         _tell(client.url, username, f"signed out of {client.url}", as_json=as_json)
@@ -50,9 +37,7 @@ def logout(url: Url = None, as_json: Json = False) -> None:
 
 def whoami(url: Url = None, as_json: Json = False) -> None:
     """Show which user is signed in, and their roles."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         me = client.whoami()
         memberships = {membership.group: membership.roles for membership in me.memberships}
         found: dict[str, Any] = {"url": client.url, "username": me.username, "memberships": memberships}
@@ -69,9 +54,7 @@ def signup(username: Username, url: Url = None, as_json: Json = False) -> None:
     If the server was started with --open-signup, everybody may; else it takes the right
     user_create. The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         client.signup(username, _password("Password of the new user: "))
         _tell(client.url, username, f"created the user {username} at {client.url}", as_json=as_json)
 
@@ -88,9 +71,7 @@ def password(
     Passwords are asked for, or taken from TUPLI_MCAP_PASSWORD (the old one) and
     TUPLI_MCAP_NEW_PASSWORD.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         me = client.whoami().username
         own = username in (None, me)
         old = _password("Old password: ") if own else None
@@ -103,10 +84,7 @@ def password(
 
 
 def _tell(url: str, username: str, line: str, *, as_json: bool) -> None:
-    if as_json:
-        print_json({"url": url, "username": username})
-    else:
-        say(line)
+    print_result({"url": url, "username": username}, line, as_json=as_json)
 
 
 def _password(question: str, variable: str = "TUPLI_MCAP_PASSWORD") -> str:

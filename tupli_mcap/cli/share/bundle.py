@@ -12,12 +12,13 @@ from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     FilterText,
     Json,
+    Output,
     StoragePath,
     filter_of,
     full_id,
     open_storage,
 )
-from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json
+from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json, print_result
 from tupli_mcap.cli.terminal import ask_secret, say
 from tupli_mcap.remote import is_url
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["bundle", "export", "import_"]
 
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file to write (.mcap).")]
 Source = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")]
 
 
@@ -180,10 +180,9 @@ def _print_written(path: Path, as_json: bool) -> None:
     from tupli_mcap.storage.listing import list_recordings
 
     (item,) = list_recordings([path])
-    if as_json:
-        facts = {"path": path, "benchmark_id": item.benchmark_id}
-        print_json({**facts, "episodes": item.episodes, "steps": item.steps, "size": item.size})
-    else:
-        say(
-            f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size or 0)}"
-        )
+    facts = {"path": path, "benchmark_id": item.benchmark_id}
+    print_result(
+        {**facts, "episodes": item.episodes, "steps": item.steps, "size": item.size},
+        f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size or 0)}",
+        as_json=as_json,
+    )

@@ -10,9 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import DEFAULT_STORAGE, FilterText, Json, filter_of, full_id, local_path
-from tupli_mcap.cli.output import bytes_of, counted, print_json
-from tupli_mcap.cli.share.account import Url
+from tupli_mcap.cli.options import (
+    DEFAULT_STORAGE,
+    Benchmark,
+    DryRun,
+    FilterText,
+    Json,
+    StoragePath,
+    Url,
+    filter_of,
+    full_id,
+    server_at,
+)
+from tupli_mcap.cli.output import bytes_of, counted, print_result
 from tupli_mcap.cli.terminal import say
 from tupli_mcap.remote import copied, is_url, shown
 
@@ -22,11 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["publish", "pull", "push", "unpublish"]
 
-Benchmark = Annotated[
-    str, typer.Argument(metavar="BENCHMARK_ID", help="A benchmark's id; its first 4 digits are enough.")
-]
 Group = Annotated[str, typer.Option(metavar="GROUP", help="Who sees it: 'global' is everybody.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be done.")]
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
@@ -49,14 +55,14 @@ def push(
     server has already. Nobody else sees them until you publish them. Without DIR or FILE, it
     sends the recordings that could not be sent while they were recorded.
     """
-    from tupli_mcap.storage import FileStorage, TupliAPIClient
+    from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes, push_recording
 
     is_one = source is not None and (is_url(source) or Path(source).is_file())
     if (source is None or is_one) and (filter_text is not None or benchmark is not None):
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
     verb = "would send" if dry_run else "sent"
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         to = client.url
         if source is None:
             _push_waiting(client, verb, dry_run=dry_run, as_json=as_json)
@@ -100,11 +106,9 @@ def _tell_sent(
     episodes: int | None = None,
     as_json: bool,
 ) -> None:
-    if as_json:
-        named = {"benchmarks": list(benchmarks), "recordings": list(recordings)}
-        print_json({"dry_run": dry_run, "url": url, **named, "episodes": episodes})
-    else:
-        say(f"{line} to {url}")
+    named = {"benchmarks": list(benchmarks), "recordings": list(recordings)}
+    told = {"dry_run": dry_run, "url": url, **named, "episodes": episodes}
+    print_result(told, f"{line} to {url}", as_json=as_json)
 
 
 def pull(
@@ -116,16 +120,7 @@ def pull(
             readable=False,
         ),
     ] = None,
-    storage_path: Annotated[
-        Path,
-        typer.Option(
-            "--storage",
-            envvar="TUPLI_MCAP_STORAGE",
-            help="The storage's directory.",
-            parser=local_path,
-            readable=False,
-        ),
-    ] = DEFAULT_STORAGE,
+    storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
     dry_run: DryRun = False,
     url: Url = None,
@@ -137,13 +132,13 @@ def pull(
     fetches matching episodes of all benchmarks. Only new episodes are fetched. Environments
     are not trusted, unless a key that you trust has signed them.
     """
-    from tupli_mcap.storage import FileStorage, TupliAPIClient
+    from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes
 
     if item is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter")
     chosen = filter_of(filter_text)
-    with TupliAPIClient(url) as client, FileStorage(storage_path) as storage:
+    with server_at(url) as client, FileStorage(storage_path) as storage:
         uri = None
         if item is not None and _EPISODE.fullmatch(item):
             chosen = _only(client, item, chosen)
@@ -152,12 +147,13 @@ def pull(
         copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run)
     ids = list(filter(None, copied))
     artifacts, episodes = (sum(counts) for counts in zip(*copied.values(), strict=True)) if copied else (0, 0)
-    if as_json:
-        told = {"dry_run": dry_run, "benchmarks": ids, "storage": str(storage_path)}
-        print_json({**told, "artifacts": artifacts, "episodes": episodes})
-    else:
-        verb = "would fetch" if dry_run else "fetched"
-        say(f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')} into {storage_path}")
+    told = {"dry_run": dry_run, "benchmarks": ids, "storage": str(storage_path)}
+    verb = "would fetch" if dry_run else "fetched"
+    print_result(
+        {**told, "artifacts": artifacts, "episodes": episodes},
+        f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')} into {storage_path}",
+        as_json=as_json,
+    )
 
 
 def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> BaseFilter:
@@ -182,10 +178,9 @@ def publish(
 
     They also see its artifacts, and your episodes of it.
     """
-    from tupli_mcap.storage import TupliAPIClient
     from tupli_mcap.storage.exchange import publish_benchmark
 
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         uri = full_id(client, benchmark)
         episodes = publish_benchmark(client, uri, group, dry_run=dry_run)
         verb = "would publish" if dry_run else "published"
@@ -205,10 +200,9 @@ def unpublish(
     It also hides your episodes of it. Its artifacts stay visible, as other benchmarks may
     need them.
     """
-    from tupli_mcap.storage import TupliAPIClient
     from tupli_mcap.storage.exchange import unpublish_benchmark
 
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         uri = full_id(client, benchmark)
         episodes = unpublish_benchmark(client, uri, group, dry_run=dry_run)
         rest = f"{uri[:8]} and {counted(episodes, 'episode')} of yours"
@@ -217,7 +211,5 @@ def unpublish(
 
 
 def _tell_published(uri: str, group: str, episodes: int, line: str, *, dry_run: bool, as_json: bool) -> None:
-    if as_json:
-        print_json({"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes})
-    else:
-        say(line)
+    told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes}
+    print_result(told, line, as_json=as_json)

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import Column, print_facts, print_json, print_table, when
-from tupli_mcap.cli.share.account import Url
-from tupli_mcap.cli.terminal import confirmed, say
+from tupli_mcap.cli.options import Json, Url, server_at
+from tupli_mcap.cli.output import Column, print_facts, print_json, print_result, print_table, when
+from tupli_mcap.cli.terminal import confirmed
 from tupli_mcap.errors import StorageError
 
 if TYPE_CHECKING:
@@ -30,9 +29,7 @@ Description = Annotated[str | None, typer.Option(help="A description of it.")]
 
 def list_users(url: Url = None, as_json: Json = False) -> None:
     """List the users of a server, and their groups."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         users = client.list_users()
     if as_json:
         held = [{membership.group: membership.roles for membership in user.memberships} for user in users]
@@ -53,9 +50,7 @@ def delete_user(
     What they published stays. Nobody can take the name again. You may delete yourself. The
     command asks first; without a terminal, it takes --yes.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         question = f"Delete the user {username} at {client.url}, and what only they could see?"
         if not (yes or confirmed(question)):
             raise StorageError(
@@ -67,9 +62,7 @@ def delete_user(
 
 def list_groups(url: Url = None, as_json: Json = False) -> None:
     """List the groups of a server that you may see."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         groups = client.list_groups()
     if as_json:
         print_json([group.model_dump() for group in groups])
@@ -80,9 +73,7 @@ def list_groups(url: Url = None, as_json: Json = False) -> None:
 
 def read_group(group: Group, url: Url = None, as_json: Json = False) -> None:
     """Show a group and its members."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         _print_group(client.read_group(group), as_json=as_json)
 
 
@@ -94,14 +85,10 @@ def create_group(
     `publish --group` lets its members see a benchmark.
     """
     from tupli_mcap.schema import Group
-    from tupli_mcap.storage import TupliAPIClient
 
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         made = client.create_group(Group(name=group, description=description))
-        if as_json:
-            print_json(made.model_dump())
-        else:
-            say(f"created the group {group} at {client.url}")
+        print_result(made.model_dump(), f"created the group {group} at {client.url}", as_json=as_json)
 
 
 def delete_group(group: Group, url: Url = None, as_json: Json = False) -> None:
@@ -109,9 +96,7 @@ def delete_group(group: Group, url: Url = None, as_json: Json = False) -> None:
 
     Only their owners still see what was published in it. The name cannot be used again.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         client.delete_group(group)
         _deleted(client.url, "group", group, as_json=as_json)
 
@@ -132,25 +117,19 @@ def add_group_members(
     group_admin adds and removes members. An admin of the server sees all roles, and their
     rights, with list-roles. You cannot give a right that you do not have.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         _print_group(client.add_group_members(_query(group, users, roles)), as_json=as_json)
 
 
 def remove_group_members(group: Group, users: Users, url: Url = None, as_json: Json = False) -> None:
     """Remove users from a group."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         _print_group(client.remove_group_members(_query(group, users, None)), as_json=as_json)
 
 
 def list_roles(url: Url = None, as_json: Json = False) -> None:
     """List the roles on a server, and their rights."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         roles = client.list_roles()
     if as_json:
         print_json([role.model_dump(mode="json") for role in roles])
@@ -169,18 +148,16 @@ def create_role(
 ) -> None:
     """Create a role from rights; for admins only."""
     from tupli_mcap.schema import Right, UserRole
-    from tupli_mcap.storage import TupliAPIClient
 
     unknown = [right for right in rights if right not in set(Right)]
     if unknown:
         raise typer.BadParameter(f"expected rights among {', '.join(Right)}, found {', '.join(unknown)}")
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         wanted = UserRole(role=role, rights=[Right(right) for right in rights], description=description)
         made = client.create_role(wanted)
-        if as_json:
-            print_json(made.model_dump(mode="json"))
-        else:
-            say(f"created the role {role} at {client.url}")
+        print_result(
+            made.model_dump(mode="json"), f"created the role {role} at {client.url}", as_json=as_json
+        )
 
 
 def delete_role(
@@ -189,18 +166,14 @@ def delete_role(
     as_json: Json = False,
 ) -> None:
     """Delete a role, and take it from all who have it."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         client.delete_role(role)
         _deleted(client.url, "role", role, as_json=as_json)
 
 
 def list_tokens(url: Url = None, as_json: Json = False) -> None:
     """List your tokens for machines."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         tokens = client.list_tokens()
     if as_json:
         print_json([token.model_dump(exclude={"token"}) for token in tokens])
@@ -225,14 +198,9 @@ def create_token(
 
     The token is shown only once. On the machine, put it into TUPLI_MCAP_TOKEN.
     """
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         token = client.create_token(name, "write" if write else "read", None if forever else days)
-    if as_json:
-        print_json(token.model_dump())
-    else:
-        say(token.token)
+    print_result(token.model_dump(), token.token, as_json=as_json)
 
 
 def delete_token(
@@ -241,9 +209,7 @@ def delete_token(
     as_json: Json = False,
 ) -> None:
     """Revoke one of your tokens for machines."""
-    from tupli_mcap.storage import TupliAPIClient
-
-    with TupliAPIClient(url) as client:
+    with server_at(url) as client:
         client.delete_token(token)
         _deleted(client.url, "token", token, as_json=as_json)
 
@@ -265,7 +231,4 @@ def _print_group(group: GroupWithMembers, *, as_json: bool) -> None:
 
 
 def _deleted(url: str, kind: str, name: str, *, as_json: bool) -> None:
-    if as_json:
-        print_json({"url": url, "deleted": name})
-    else:
-        say(f"deleted the {kind} {name} at {url}")
+    print_result({"url": url, "deleted": name}, f"deleted the {kind} {name} at {url}", as_json=as_json)

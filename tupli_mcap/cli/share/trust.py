@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import bytes_of, print_facts, print_json
-from tupli_mcap.cli.terminal import say
+from tupli_mcap.cli.output import bytes_of, print_facts, print_json, print_result
 
 if TYPE_CHECKING:
     from tupli_mcap.environment import PickleImports
@@ -70,10 +69,8 @@ def _trust_key(text: str, name: str | None, *, as_json: bool) -> None:
 
     key = find_key(text)
     trust.trust_key(key.public_key, name or key.name)
-    if as_json:
-        print_json({"fingerprint": fingerprint(key.public_key), "name": name or key.name})
-    else:
-        say(f"what {fingerprint(key.public_key)} {name or key.name} signs is trusted")
+    told = {"fingerprint": fingerprint(key.public_key), "name": name or key.name}
+    print_result(told, f"what {told['fingerprint']} {told['name']} signs is trusted", as_json=as_json)
 
 
 def untrust(
@@ -106,10 +103,11 @@ def untrust(
         was_trusted = trust.untrust_key(trusted_key.public_key)
     else:
         digest, was_trusted = untrust(what or "")
-    if as_json:
-        print_json({"digest": digest, "fingerprint": signer, "was_trusted": was_trusted})
-    else:
-        say(f"{digest or signer} {'is not trusted any more' if was_trusted else 'was not trusted'}")
+    print_result(
+        {"digest": digest, "fingerprint": signer, "was_trusted": was_trusted},
+        f"{digest or signer} {'is not trusted any more' if was_trusted else 'was not trusted'}",
+        as_json=as_json,
+    )
 
 
 def _list(*, as_json: bool) -> None:
@@ -118,12 +116,10 @@ def _list(*, as_json: bool) -> None:
 
     digests = trust.trusted_digests()
     keys = [{"fingerprint": fingerprint(key.public_key), "name": key.name} for key in trust.trusted_keys()]
-    if as_json:
-        print_json({"config_dir": trust.config_dir(), "digests": digests, "keys": keys})
-        return
     lines = [f"environment  {digest}" for digest in digests]
     lines += [f"key          {key['fingerprint']} {key['name']}" for key in keys]
-    say(*(lines or ["nothing is trusted"]))
+    told = {"config_dir": trust.config_dir(), "digests": digests, "keys": keys}
+    print_result(told, *(lines or ["nothing is trusted"]), as_json=as_json)
 
 
 def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:

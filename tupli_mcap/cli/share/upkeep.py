@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import bytes_of, counted, print_json
+from tupli_mcap.cli.output import bytes_of, counted, print_result
 from tupli_mcap.cli.share.serve import Blobs, Database, Served
-from tupli_mcap.cli.terminal import say
 from tupli_mcap.errors import missing_extra
 
 __all__ = ["backup_server", "restore_server"]
@@ -56,9 +55,6 @@ def _copy(directory: Path, backup: Path, database: str, blobs: str, done: str, *
         raise missing_extra("a server's data need SQLAlchemy and Alembic", "server") from err
     settings = Settings(directory.absolute(), database=database, blobs=blobs)
     copied = restore(backup, settings) if done == "restored" else back_up(settings, backup)
-    if as_json:
-        print_json({"directory": str(directory), "backup": str(backup), **copied._asdict()})
-        return
     contents = ", ".join(
         counted(count, what)
         for count, what in (
@@ -67,4 +63,8 @@ def _copy(directory: Path, backup: Path, database: str, blobs: str, done: str, *
             (copied.artifacts, "artifact"),
         )
     )
-    say(f"{done} {contents} ({bytes_of(copied.bytes)}); {counted(copied.copied, 'file')} copied")
+    print_result(
+        {"directory": str(directory), "backup": str(backup), **copied._asdict()},
+        f"{done} {contents} ({bytes_of(copied.bytes)}); {counted(copied.copied, 'file')} copied",
+        as_json=as_json,
+    )
