@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.base import episode_id
+from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes
 
@@ -362,7 +362,4 @@ def place_of(recording: Recording) -> str:
 
 def numbers_by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[int]]:
     """The numbers of episodes, by recording."""
-    found: dict[str, list[int]] = {}
-    for header in headers:
-        found.setdefault(header.recording, []).append(header.episode)
-    return found
+    return {name: [header.episode for header in same] for name, same in by_recording(headers).items()}

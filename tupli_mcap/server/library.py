@@ -9,7 +9,6 @@ import secrets
 import shutil
 import tempfile
 import time
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ from typing import Any
 from sqlalchemy import Connection, select
 
 from tupli_mcap.environment import sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
-from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError, warn
+from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -49,8 +48,7 @@ from tupli_mcap.server.stored.items import Items, artifact_key
 from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage
-from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
-from tupli_mcap.storage.from_values import episode_data, episode_spaces
+from tupli_mcap.storage.from_values import write_episodes
 from tupli_mcap.storage.listing import is_storage, scan, with_tuples
 from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.storage.texts import escape_text, unescape_text
@@ -143,10 +141,10 @@ class Library:
                 with self.database.writing() as connection:
                     arrivals.register(connection, admin, recording, name, digest, deleted=deleted)
         except (TupliError, OSError) as err:
-            warnings.warn(f"not served: {err}", stacklevel=3)
+            warn(f"not served: {err}")
             return False
         except UnicodeEncodeError:
-            warnings.warn(f"not served: {name!r}: expected a name in UTF-8; rename it", stacklevel=3)
+            warn(f"not served: {name!r}: expected a name in UTF-8; rename it")
             return False
         return True
 
@@ -225,18 +223,9 @@ class Library:
             raise StorageError("an episode needs at least one tuple, found none")
         with self.database.reading() as connection:
             benchmark = self.items.load_benchmark(connection, caller, episode.benchmark_id)
-        spaces = episode_spaces([episode], declared_spaces(benchmark.serialized))
         with tempfile.TemporaryDirectory(dir=self.settings.making) as folder:
             path = Path(folder) / "episode.mcap"
-            write_recording(
-                path,
-                [episode_data(episode, spaces)],
-                observation_space=spaces[0],
-                action_space=spaces[1],
-                reward_space=spaces[2],
-                benchmark_id=benchmark.id,
-                attachments=recording_attachments(benchmark.serialized),
-            )
+            write_episodes(path, [episode], benchmark)
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             with self.database.reading() as connection:
@@ -251,7 +240,7 @@ class Library:
             with self.database.writing() as connection:
                 # before it becomes part of a path: an id in a file may hold anything
                 arrivals.demand_benchmark(connection, caller, recording.benchmark_id)
-                place = arrivals.new_name(recording.benchmark_id)
+                place = arrivals.new_place(recording.benchmark_id)
                 pend(connection, place)
             try:
                 self.blobs.keep(place, path)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
+import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
@@ -22,13 +25,18 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     EpisodeItem,
 )
+from tupli_mcap.schema.times import time_ns
 
 __all__ = [
     "LOCAL_USER",
     "TupliStorage",
     "TupliStorageError",
     "anew",
+    "by_recording",
+    "check_page",
     "episode_id",
+    "new_name",
+    "oldest_first",
     "published_in",
 ]
 
@@ -40,6 +48,7 @@ LOCAL_USER = "local_storage"
 """The creator of all items in a directory; also the only group that sees them."""
 _ATTEMPTS = 5
 _T = TypeVar("_T")
+_Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
 
 
 class TupliStorage(ABC):
@@ -108,9 +117,9 @@ class TupliStorage(ABC):
 
     # --- episodes ---
 
-    @abstractmethod
     def record_episode(self, episode: Episode) -> EpisodeHeader:
         """Store an episode that was made from values, see `record_episodes`."""
+        return self.record_episodes([episode])[0]
 
     @abstractmethod
     def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
@@ -179,6 +188,33 @@ class TupliStorage(ABC):
     @abstractmethod
     def declare_key(self, key: str) -> None:
         """Index an episode metadata key (`metadata.score`), so that filters on it stay fast."""
+
+
+def check_page(limit: int | None, offset: int) -> None:
+    """Raises StorageError unless both are numbers of episodes, or there is no limit."""
+    for name, number in (("limit", 0 if limit is None else limit), ("offset", offset)):
+        if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
+            raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
+
+
+def by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[EpisodeHeader]]:
+    """Episodes by the names of their recordings."""
+    found: dict[str, list[EpisodeHeader]] = {}
+    for header in headers:
+        found.setdefault(header.recording, []).append(header)
+    return found
+
+
+def oldest_first(items: Iterable[_Item]) -> list[_Item]:
+    """Sorts benchmarks or artifacts by the time of their creation."""
+    return sorted(items, key=lambda item: (time_ns(item.created_at) or 0, item.id))
+
+
+def new_name(name: str = "") -> str:
+    """The name of a new recording's file: time (UTC), a given name, and random digits."""
+    now = datetime.datetime.now(datetime.UTC)
+    named = f"{files.as_file_name(name)}-" if name else ""
+    return f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
 
 
 def published_in(groups: Sequence[str], group: str) -> list[str]:

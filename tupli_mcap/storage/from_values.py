@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,10 +12,11 @@ from gymnasium import spaces
 
 from tupli_mcap.errors import SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
-from tupli_mcap.recording import EpisodeData
-from tupli_mcap.schema import Episode
+from tupli_mcap.recording import EpisodeData, write_recording
+from tupli_mcap.schema import Benchmark, Episode, EpisodeHeader
+from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 
-__all__ = ["conform", "episode_data", "infer_space"]
+__all__ = ["conform", "episode_data", "infer_space", "record_each", "write_episodes"]
 
 _NUMBERS = (bool, int, float, np.generic)
 _KINDS = "biuf"
@@ -123,6 +125,45 @@ def episode_spaces(
     if all(isinstance(reward, _NUMBERS) or np.shape(reward) == () for reward in rewards):
         return state, action, None
     return state, action, infer_space(rewards, "reward")
+
+
+def write_episodes(path: Path, episodes: Sequence[Episode], benchmark: Benchmark) -> None:
+    """Writes episodes of one benchmark as a recording.
+
+    Raises:
+        SpaceError: Values of one kind differ in structure from step to step, or have no space.
+        StorageError: A value in the metadata has no JSON form.
+    """
+    spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
+    write_recording(
+        path,
+        (episode_data(episode, spaces) for episode in episodes),
+        observation_space=spaces[0],
+        action_space=spaces[1],
+        reward_space=spaces[2],
+        benchmark_id=benchmark.id,
+        attachments=recording_attachments(benchmark.serialized),
+    )
+
+
+def record_each(
+    episodes: Iterable[Episode], record: Callable[[str, Sequence[Episode]], Sequence[EpisodeHeader]]
+) -> list[EpisodeHeader]:
+    """Stores episodes with a function that records those of one benchmark; returns their headers in the given order.
+
+    Raises:
+        StorageError: An episode has no tuple; nothing is stored.
+    """
+    groups: dict[str, list[tuple[int, Episode]]] = {}
+    for i, episode in enumerate(episodes):
+        if not episode.tuples:
+            raise StorageError(f"an episode needs at least one tuple, found none in episode {i}")
+        groups.setdefault(episode.benchmark_id, []).append((i, episode))
+    headers: dict[int, EpisodeHeader] = {}
+    for benchmark_id, group in groups.items():
+        places, given = zip(*group, strict=True)
+        headers.update(zip(places, record(benchmark_id, given), strict=True))
+    return [headers[i] for i in sorted(headers)]
 
 
 def _declared_or_inferred(

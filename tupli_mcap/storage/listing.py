@@ -22,6 +22,7 @@ from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.remote import is_url, matching, shown
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
+from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
 __all__ = [
@@ -219,10 +220,7 @@ def recordings_at(source: Path | str) -> Sequence[Path | str]:
 
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
     """The recordings that episodes of a storage are in, as far as their headers tell; size and state are unknown."""
-    by_recording: dict[str, list[EpisodeHeader]] = {}
-    for header in headers:
-        by_recording.setdefault(header.recording, []).append(header)
-    for name, same in by_recording.items():
+    for name, same in by_recording(headers).items():
         returns = spread_of(np.array([header.episode_return for header in same], np.float64))
         said = [found for header in same if (found := success_of(header.metadata)) is not None]
         run = same[0].run

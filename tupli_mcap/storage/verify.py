@@ -28,8 +28,6 @@ from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["StorageReport", "verify_paths", "verify_storage"]
 
-_PIECE = 1 << 20
-
 
 @dataclass
 class StorageReport:
@@ -265,7 +263,8 @@ def _artifacts(root: Path, findings: Findings) -> None:
             )
         if not is_hash(path.name):
             continue
-        digest = _digest(path)
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
         findings.report.attachments += 1
         if digest != path.name:
             what = f"artifact {path.name} has bytes with SHA-256 {digest}"
@@ -274,14 +273,6 @@ def _artifacts(root: Path, findings: Findings) -> None:
             artifacts.item(path.name)
         except (TupliError, FileNotFoundError) as err:
             findings.error("artifact", str(err), advice="store it again with its metadata")
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _benchmarks(root: Path, findings: Findings) -> None:

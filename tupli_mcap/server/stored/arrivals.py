@@ -4,7 +4,6 @@ Every function works in the transaction of its caller.
 
 from __future__ import annotations
 
-import datetime
 import json
 import secrets
 from collections.abc import Collection, Sequence
@@ -19,6 +18,7 @@ from tupli_mcap.server.people.access import Caller, Right, readable
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.stored.episodes import forget, whole_name
 from tupli_mcap.server.tables import CLAIM, FILE, ITEM
+from tupli_mcap.storage.base import new_name
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
@@ -26,7 +26,7 @@ from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = ["demand_benchmark", "new_name", "register", "stored_already"]
+__all__ = ["demand_benchmark", "new_place", "register", "stored_already"]
 
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
@@ -43,10 +43,9 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
         )
 
 
-def new_name(benchmark_id: str) -> str:
-    """A new name for a recording of a stored benchmark, or of none: of time (UTC) and random digits."""
-    now = datetime.datetime.now(datetime.UTC)
-    return f"recordings/{benchmark_id or _PLAIN}/{now:%Y%m%dT%H%M%S}-{secrets.token_hex(6)}.mcap"
+def new_place(benchmark_id: str) -> str:
+    """A new place for a recording of a stored benchmark, or of none."""
+    return f"recordings/{benchmark_id or _PLAIN}/{new_name()}"
 
 
 def stored_already(connection: Connection, caller: Caller, digest: str) -> str | None:

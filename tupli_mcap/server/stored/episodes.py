@@ -23,7 +23,7 @@ from tupli_mcap.server.people.access import (
     readable_episodes,
 )
 from tupli_mcap.server.tables import FILE, USER
-from tupli_mcap.storage.base import published_in
+from tupli_mcap.storage.base import by_recording, published_in
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.queries import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
@@ -214,7 +214,7 @@ def no_episode(uri: str) -> NotFoundError:
 
 def _delete(connection: Connection, doomed: Sequence[EpisodeHeader]) -> list[str]:
     empty = []
-    for path, headers in _by_recording(doomed).items():
+    for path, headers in by_recording(doomed).items():
         name, numbers = escape_text(path), [header.episode for header in headers]
         recording = connection.execute(select(RECORDING.c.id).where(RECORDING.c.path == name)).scalar_one()
         for of in _rows(recording, numbers):
@@ -235,7 +235,7 @@ def _set_audiences(
     connection: Connection, headers: Sequence[EpisodeHeader], changed: Callable[[list[str]], list[str]]
 ) -> None:
     """Changes who sees episodes, by a function of the groups that saw them before."""
-    for path, of_recording in _by_recording(headers).items():
+    for path, of_recording in by_recording(headers).items():
         of = select(RECORDING.c.id).where(RECORDING.c.path == escape_text(path))
         recording = connection.execute(of).scalar_one()
         numbers: dict[tuple[str, ...], list[int]] = {}
@@ -252,16 +252,9 @@ def _note(
     connection: Connection, caller: Caller, action: str, headers: Sequence[EpisodeHeader], more: str = ""
 ) -> None:
     """Logs a change of episodes in the audit table."""
-    for path, of_recording in _by_recording(headers).items():
+    for path, of_recording in by_recording(headers).items():
         numbers = ", ".join(str(header.episode) for header in of_recording)
         audit(connection, caller.name, action, f"{path}{more}: {numbers}")
-
-
-def _by_recording(headers: Sequence[EpisodeHeader]) -> dict[str, list[EpisodeHeader]]:
-    found: dict[str, list[EpisodeHeader]] = {}
-    for header in headers:
-        found.setdefault(header.recording, []).append(header)
-    return found
 
 
 def _rows(recording: int, numbers: Sequence[int]) -> Iterator[ColumnElement[bool]]:

@@ -24,13 +24,12 @@ from tupli_mcap.schema import (
     BenchmarkQuery,
     compile_predicate,
 )
-from tupli_mcap.schema.times import time_ns
 from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people import quotas
 from tupli_mcap.server.people.access import Caller, DeniedError, Right, demand_audience, left_alone, readable
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
-from tupli_mcap.storage.base import published_in
+from tupli_mcap.storage.base import oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
 from tupli_mcap.storage.files.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
@@ -87,7 +86,7 @@ class Items:
         """The readable benchmarks that match a filter, oldest first."""
         matches = compile_predicate(filter, BenchmarkHeader)
         found = [_benchmark(row) for row in self._readable(connection, caller, "benchmark")]
-        return sorted((h for h in found if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
+        return oldest_first(header for header in found if matches(header))
 
     def delete_benchmark(self, connection: Connection, caller: Caller, uri: str) -> None:
         """Deletes the caller's own benchmark; with the right to, also one that others have published."""
@@ -123,7 +122,7 @@ class Items:
         """The readable artifacts that match a filter, oldest first."""
         matches = compile_predicate(filter, ArtifactMetadataItem)
         found = [_artifact(row) for row in self._readable(connection, caller, "artifact")]
-        return sorted((i for i in found if matches(i)), key=lambda i: (time_ns(i.created_at) or 0, i.id))
+        return oldest_first(item for item in found if matches(item))
 
     def artifact_users(self, connection: Connection, caller: Caller, uri: str) -> list[str]:
         """The ids of the readable benchmarks that need a readable artifact."""

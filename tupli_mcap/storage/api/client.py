@@ -14,7 +14,6 @@ from pydantic import BaseModel
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
-from tupli_mcap.recording import write_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -35,10 +34,10 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, anew, published_in
-from tupli_mcap.storage.benchmark_json import declared_spaces, plain, recording_attachments
+from tupli_mcap.storage.base import TupliStorage, anew, check_page, published_in
+from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
-from tupli_mcap.storage.from_values import episode_data, episode_spaces
+from tupli_mcap.storage.from_values import record_each, write_episodes
 from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import is_hash
 
@@ -200,39 +199,16 @@ class TupliAPIClient(People, Recordings, TupliStorage):
 
     # --- episodes ---
 
-    def record_episode(self, episode: Episode) -> EpisodeHeader:
-        return self.record_episodes([episode])[0]
-
     def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
-        given = list(episodes)
-        groups: dict[str, list[int]] = {}
-        for i, episode in enumerate(given):
-            if not episode.tuples:
-                raise StorageError(f"an episode needs at least one tuple, found none in episode {i}")
-            groups.setdefault(episode.benchmark_id, []).append(i)
-        headers: dict[int, EpisodeHeader] = {}
-        for benchmark_id, positions in groups.items():
-            name = self._record(benchmark_id, [given[i] for i in positions])
-            made = self._episodes(FilterEQ(key="recording", value=name))
-            headers.update(zip(positions, made, strict=True))
-        return [headers[i] for i in range(len(given))]
+        return record_each(episodes, self._record)
 
-    def _record(self, benchmark_id: str, episodes: Sequence[Episode]) -> str:
-        """Stores episodes of one benchmark as a recording; returns its name."""
+    def _record(self, benchmark_id: str, episodes: Sequence[Episode]) -> list[EpisodeHeader]:
         benchmark = self._benchmarks.get(benchmark_id) or self.load_benchmark(benchmark_id)
-        spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
         with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
             path = Path(folder) / "episodes.mcap"
-            write_recording(
-                path,
-                (episode_data(episode, spaces) for episode in episodes),
-                observation_space=spaces[0],
-                action_space=spaces[1],
-                reward_space=spaces[2],
-                benchmark_id=benchmark_id,
-                attachments=recording_attachments(benchmark.serialized),
-            )
-            return self.push(path)
+            write_episodes(path, episodes, benchmark)
+            name = self.push(path)
+        return self._episodes(FilterEQ(key="recording", value=name))
 
     def list_episodes(
         self,
@@ -242,9 +218,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         limit: int | None = None,
         offset: int = 0,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        for name, number in (("limit", 0 if limit is None else limit), ("offset", offset)):
-            if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
-                raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
+        check_page(limit, offset)
         self.flush()
         if not include_tuples:
             return self._episodes(filter, limit, offset)

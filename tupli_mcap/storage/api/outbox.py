@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import datetime
 import hashlib
 import json
 import os
-import secrets
 import threading
 import time
 from collections import defaultdict
@@ -37,6 +35,7 @@ from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.api.waiting import finished, note, numbers_of, sent_before, state_of
 from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.base import new_name
 from tupli_mcap.storage.catalog.entries import rows_of
 from tupli_mcap.storage.sidecar import Sidecar
 
@@ -98,9 +97,7 @@ class Outbox:
             directory.mkdir(parents=True, exist_ok=True, mode=0o700)
             whose = {"url": self._identity[0], "username": self._identity[1]}
             files.write_bytes(self.directory / _WHOSE, json.dumps(whose).encode())
-        now = datetime.datetime.now(datetime.UTC)
-        named = f"{files.as_file_name(name)}-" if name else ""
-        path = directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+        path = directory / new_name(name)
         with self._turn:
             if not self._given:
                 atexit.register(self._send_at_exit, os.getpid())

@@ -16,7 +16,7 @@ from tupli_mcap.schema import (
     FilterIN,
 )
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import episode_id
+from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import (
     artifacts_of,
 )
@@ -118,9 +118,8 @@ def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
         return list(ids.values())
-    stored_numbers: dict[str, list[int]] = {}
-    for header in storage.list_episodes(FilterIN(key="id", value=list(ids))):
-        stored_numbers.setdefault(header.recording, []).append(header.episode)
+    known = by_recording(storage.list_episodes(FilterIN(key="id", value=list(ids))))
+    stored_numbers = {name: [header.episode for header in headers] for name, headers in known.items()}
     for name, numbers in stored_numbers.items():
         with storage.open_recording(name) as stored:
             if not _same_file(recording, stored) and not episodes_alike(

@@ -10,9 +10,8 @@ from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
-from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.base import LOCAL_USER, published_in
+from tupli_mcap.storage.base import LOCAL_USER, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import plain, restored
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
@@ -65,10 +64,7 @@ class ArtifactFiles:
                 items.append(self._read(sidecar))
             except (FormatError, StorageError) as err:
                 warn(f"skipped an artifact: {err}")
-        return sorted(
-            (item for item in items if matches(item)),
-            key=lambda item: (time_ns(item.created_at) or 0, item.id),
-        )
+        return oldest_first(item for item in items if matches(item))
 
     def delete(self, uri: str) -> None:
         with self._lock:

@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
-from tupli_mcap.schema.times import iso_utc, time_ns
+from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.base import LOCAL_USER, published_in
+from tupli_mcap.storage.base import LOCAL_USER, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import (
     artifacts_of,
     benchmark_entry,
@@ -83,7 +83,7 @@ class BenchmarkFiles:
                 pass  # deleted since, or not a benchmark's name
             except (FormatError, StorageError) as err:
                 warn(f"skipped a benchmark: {err}")
-        return sorted((h for h in headers if matches(h)), key=lambda h: (time_ns(h.created_at) or 0, h.id))
+        return oldest_first(header for header in headers if matches(header))
 
     def delete(self, uri: str) -> None:
         with self._lock:

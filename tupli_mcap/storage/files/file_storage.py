@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from sqlalchemy import Connection
 
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
-from tupli_mcap.recording import Recording, write_recording
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.annotate import user_name
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -28,14 +28,13 @@ from tupli_mcap.schema import (
     FilterEQ,
 )
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
-from tupli_mcap.storage.base import TupliStorage, anew
-from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
+from tupli_mcap.storage.base import TupliStorage, anew, check_page
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files.recordings import RecordingFiles
 from tupli_mcap.storage.files.sync import SyncedCatalog
-from tupli_mcap.storage.from_values import episode_data, episode_spaces
+from tupli_mcap.storage.from_values import record_each, write_episodes
 from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import first_defect
 
@@ -193,37 +192,14 @@ class FileStorage(TupliStorage):
 
     # --- episodes ---
 
-    def record_episode(self, episode: Episode) -> EpisodeHeader:
-        return self.record_episodes([episode])[0]
-
     def record_episodes(self, episodes: Iterable[Episode]) -> list[EpisodeHeader]:
-        given = list(episodes)
-        for i, episode in enumerate(given):
-            if not episode.tuples:
-                raise StorageError(f"an episode needs at least one tuple, found none in episode {i}")
-        groups: dict[str, list[int]] = {}
-        for i, episode in enumerate(given):
-            groups.setdefault(episode.benchmark_id, []).append(i)
-        headers: dict[int, EpisodeHeader] = {}
-        for benchmark_id, positions in groups.items():
-            made = self._record(benchmark_id, [given[i] for i in positions])
-            headers.update(zip(positions, made, strict=True))
-        return [headers[i] for i in range(len(given))]
+        return record_each(episodes, self._record)
 
     def _record(self, benchmark_id: str, episodes: Sequence[Episode]) -> list[EpisodeHeader]:
         benchmark = self.load_benchmark(benchmark_id)
-        spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
         path = self.new_recording_path(benchmark_id)
         with os_errors("cannot record", path), fill(path) as temporary:
-            write_recording(
-                temporary,
-                (episode_data(episode, spaces) for episode in episodes),
-                observation_space=spaces[0],
-                action_space=spaces[1],
-                reward_space=spaces[2],
-                benchmark_id=benchmark_id,
-                attachments=recording_attachments(benchmark.serialized),
-            )
+            write_episodes(temporary, episodes, benchmark)
         with self._lock:
             if not self._benchmarks.exists(benchmark_id):  # deleted meanwhile, with its episodes
                 path.unlink()
@@ -239,9 +215,7 @@ class FileStorage(TupliStorage):
         limit: int | None = None,
         offset: int = 0,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        for name, number in (("limit", 0 if limit is None else limit), ("offset", offset)):
-            if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < 1 << 63:
-                raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
+        check_page(limit, offset)
         if not include_tuples:
             return self._catalog.headers(filter, limit=limit, offset=offset)
         return anew(

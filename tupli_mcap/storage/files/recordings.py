@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import errno
 import re
-import secrets
 import stat
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +16,7 @@ from tupli_mcap.recording import Recording, journal_path, rewrite_recording
 from tupli_mcap.recording.recover.prefix import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, episode_id, published_in
+from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import FoundRecording, scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
@@ -45,9 +43,7 @@ class RecordingFiles:
         directory = self._root / "recordings" / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True)
-        now = datetime.datetime.now(datetime.UTC)
-        named = f"{files.as_file_name(name)}-" if name else ""
-        return directory / f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+        return directory / new_name(name)
 
     def path(self, recording: str) -> Path:
         """The file of a catalogued recording.
