@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import app
+from tupli_mcap.doctor import examine
 from tupli_mcap.errors import TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
@@ -128,6 +129,8 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
         done = CliRunner().invoke(app, [words[0], url, *words[1:], "--json"])
         assert done.exit_code == 0, done.output
         return json.loads(done.output)["result"]
+
+    assert examine(admin).episodes == 5
 
     made = str(tmp_path / "made.mcap")
     assert [episode["seed"] for episode in told("episodes", "--filter", 'run.name ~ "PPO" and seed < 2')] == [

@@ -31,7 +31,6 @@ from tupli_mcap.remote import is_server, is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
-    from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
 
@@ -49,12 +48,12 @@ __all__ = [
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
 Source = Recording | str | os.PathLike[str]
-Examinable: TypeAlias = Union[Source, "Listed", "TupliDataset", "TupliStorage"]
+Examinable: TypeAlias = Union[Source, "Listed", "TupliStorage"]
 
 
 @runtime_checkable
 class Listed(Protocol):
-    """The part of a `Dataset` that this module needs; it may not import `dataset`."""
+    """The part of a `Dataset` or `TupliDataset` that this module needs; it may not import `dataset`."""
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes that match the filter."""
@@ -93,24 +92,18 @@ def subjects_of(
         RecordingError: it is none of those.
         FilterError: the filter names an unknown field.
     """
-    from tupli_mcap.dataset.tupli import TupliDataset
     from tupli_mcap.storage import TupliStorage
 
-    if isinstance(source, str) and is_server(source):
-        server = _server(source)
-        yield from _of_headers(server, server.episodes(None, episode_filter))
+    if isinstance(source, TupliStorage) or (isinstance(source, str) and is_server(source)):
+        stored = _stored(source)
+        yield from _of_headers(stored, stored.episodes(None, episode_filter))
     elif isinstance(source, str | os.PathLike):
         yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
     elif isinstance(source, Recording):
         choose = _all if episode_filter is None else partial(candidates, filter=episode_filter)
         yield Subject(source.name, lambda: nullcontext(source), choose)
-    elif isinstance(source, TupliDataset):
-        dataset = source if episode_filter is None else _narrowed(source, episode_filter)
-        yield from _of_headers(dataset._query.source, dataset.preview())
     elif isinstance(source, Listed):
         yield from _of_headers(*source._episodes(episode_filter))
-    elif isinstance(source, TupliStorage):
-        yield from subjects_of(TupliDataset(source), episode_filter)
     elif isinstance(source, Chosen):  # before other iterables, since it is a tuple
         recording, positions = source
         yield Subject(
@@ -140,17 +133,11 @@ def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Su
 
 
 def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iterator[Subject]:
-    by_recording: dict[str, list[EpisodeHeader]] = {}
-    for header in headers:
-        by_recording.setdefault(header.recording, []).append(header)
-    for name, group in by_recording.items():
+    from tupli_mcap.storage.base import by_recording
+
+    for name, group in by_recording(headers).items():
         numbers = [header.episode for header in group]
         yield Subject(name, partial(source.open, name, numbers), partial(positions_of, headers=group))
-
-
-def _narrowed(dataset: TupliDataset, episode_filter: BaseFilter) -> TupliDataset:
-    own = dataset._query.episode_filter
-    return dataset.with_episode_filter(episode_filter if own is None else own & episode_filter)
 
 
 def _all(recording: Recording) -> Positions:
@@ -239,7 +226,7 @@ def _is_directory(source: str | os.PathLike[str]) -> bool:
 def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
     from tupli_mcap.dataset.sources import numbers_by_recording
 
-    server = _server(address)
+    server = _stored(address)
     headers = server.episodes(None, filter)
     numbers = np.array([header.episode for header in headers])
     returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
@@ -264,11 +251,11 @@ def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitSt
     ]
 
 
-def _server(address: str) -> EpisodeSource:
+def _stored(storage: TupliStorage | str) -> EpisodeSource:
     from tupli_mcap.dataset.sources import StorageSource
     from tupli_mcap.storage import storage_at
 
-    return StorageSource(storage_at(address))
+    return StorageSource(storage_at(storage))
 
 
 def _check_few(recordings: int, where: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -17,10 +16,9 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
-from tupli_mcap.dataset.columns.load import read_columns
+from tupli_mcap.dataset.columns.load import read_in_order
 from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.dataset.items import INFOS, ListedEpisodes, RecordedSteps, Steps, info_columns, info_keys
-from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
@@ -317,26 +315,13 @@ class Dataset(RandomAccess):
         wanted = field_names(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
             return example.read([], wanted)
-        names = list(dict.fromkeys(header.recording for header in self.headers))
-        place = {name: i for i, name in enumerate(names)}
-        order = np.argsort([place[header.recording] for header in self.headers], kind="stable")
-        headers = [self.headers[i] for i in order]
-        columns, selected, _ = read_columns(self._source, headers, wanted)
-        if (np.diff(order) < 0).any():
-            ends = np.cumsum(selected.lengths)
-            starts = ends - selected.lengths
-            back = np.argsort(order)
-            rows = np.concatenate([np.arange(starts[i], ends[i]) for i in back.tolist()])
-            columns = {field: pick(column, rows) for field, column in columns.items()}
-        return Columns(self.lengths, **columns)
+        return Columns(self.lengths, **read_in_order(self._source, self.headers, wanted))
 
     @property
     def steps(self) -> Steps:
         if self._steps is None:
-            groups = itertools.groupby(self.headers, key=lambda header: header.recording)
             self._steps = RecordedSteps(
-                (ListedEpisodes.of(name, group) for name, group in groups),
-                lambda name: nullcontext(self._open(name)),
+                ListedEpisodes.each(self.headers), lambda name: nullcontext(self._open(name))
             )
         return self._steps
 

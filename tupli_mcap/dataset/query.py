@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Any, Self
 
@@ -105,7 +104,7 @@ class Query:
             mask = None if self._selector is None else self.selected.mask
             chosen = numbers_by_recording(headers)
             self._recorded = RecordedSteps(
-                _listed(headers),
+                ListedEpisodes.each(headers),
                 lambda name: (
                     nullcontext(seen.pop(name)) if name in seen else self.source.open(name, chosen[name])
                 ),
@@ -157,11 +156,6 @@ def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[Episod
 def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
     """The facts that the columns of some episodes depend on."""
     return [(header.id, header.n_tuples, header.recording) for header in headers]
-
-
-def _listed(headers: Sequence[EpisodeHeader]) -> Iterator[ListedEpisodes]:
-    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        yield ListedEpisodes.of(name, group)
 
 
 def _frozen(array: Array) -> Array:

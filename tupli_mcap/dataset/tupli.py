@@ -197,6 +197,13 @@ class TupliDataset(RandomAccess):
     def _headers(self) -> Sequence[EpisodeHeader]:
         return self._query.headers
 
+    def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
+        """The source that opens its recordings, and its episodes, listed again, that also match the filter."""
+        own = self._query.episode_filter
+        narrowed = filter if own is None or filter is None else own & filter
+        dataset = self if filter is None else self.with_episode_filter(narrowed)
+        return dataset._query.source, dataset.preview()
+
     def _step_seconds(self) -> float | None:
         known = set()
         for name, episode in {header.recording: header.episode for header in self._headers}.items():
@@ -342,11 +349,7 @@ class TupliDataset(RandomAccess):
         Raises:
             DatasetError: it is no integer from 0.
         """
-        if seed is not None and (
-            isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0
-        ):
-            raise DatasetError(f"expected a seed that is an integer from 0, found {seed!r:.80}")
-        self._seed = None if seed is None else int(seed)
+        self._seed = None if seed is None else _count(seed, 0, "a seed")
         self._random = np.random.default_rng(self._seed)
 
     def as_batch_generator(

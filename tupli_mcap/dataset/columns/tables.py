@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from tupli_mcap.dataset.columns.convert import import_pandas
+from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
@@ -105,11 +106,10 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
     found = dataset.read((*FIVE, "times", "infos"))
     lengths = found.episode_lengths
     of_episode = np.repeat(np.arange(len(lengths)), lengths)
-    starts = np.repeat(np.cumsum(lengths) - lengths, lengths)
     episodes = _episode_columns(dataset)
     columns: dict[str, Any] = {
         "episode": of_episode,
-        "step": np.arange(len(of_episode)) - starts,
+        "step": steps_within(lengths),
         "time": found.times.astype("datetime64[ns]"),
     }
     recording = dataset.example

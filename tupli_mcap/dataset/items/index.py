@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,12 @@ class ListedEpisodes(NamedTuple):
         found = [(header.episode, header.n_tuples) for header in headers]
         numbers, lengths = np.array(found, np.int64).reshape(-1, 2).T
         return cls(recording, numbers, lengths)
+
+    @classmethod
+    def each(cls, headers: Iterable[EpisodeHeader]) -> Iterator[ListedEpisodes]:
+        """The episodes of each recording; of one whose episodes do not follow each other, several times."""
+        for name, same in itertools.groupby(headers, key=lambda header: header.recording):
+            yield cls.of(name, same)
 
 
 def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
