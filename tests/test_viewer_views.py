@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import viewed
+from environments import Sampler
+from gymnasium import spaces
 from rerun.experimental import ViewerState
 from typer.testing import CliRunner
 from viewing import HeadlessViewer, patiently
 
+from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli import app
 
 PLOT, LANES, PICTURE, TEXT, BARS = "TimeSeries", "StateTimeline", "2D", "TextDocument", "BarChart"
@@ -120,6 +124,18 @@ def test_pixels(viewer: HeadlessViewer, tmp_path: Path) -> None:
     bricks = (colors == (200, 72, 72)).all(axis=1) | (colors == (66, 72, 200)).all(axis=1)
     assert bricks.mean() > 0.02  # the top and the bottom row, as the Atari paints them
     assert viewer.filled("action", "return") == {"action": True, "return": True}
+
+
+@pytest.mark.parametrize(
+    ("shape", "name"), [((4, 40, 30), "state: 4 frames, the newest first"), ((40, 30), "state")]
+)
+def test_a_stack_says_its_order(
+    viewer: HeadlessViewer, tmp_path: Path, shape: tuple[int, ...], name: str
+) -> None:
+    env = Sampler(spaces.Box(0, 255, shape, np.uint8), spaces.Discrete(2))
+    with RecordEpisodes(env, tmp_path / "stack.mcap") as recorded:
+        viewed.rollout(recorded, lambda _: 0, 1)
+    assert views(shown(viewer, tmp_path / "stack.mcap"))[name] == PICTURE
 
 
 def test_dict(viewer: HeadlessViewer, tmp_path: Path) -> None:

@@ -66,12 +66,11 @@ class Picture(LeafPanel):
     def _tiled(self, values: Array) -> Array:
         """Pictures (rows x height x width x channels) of a column; black where the last line of a stack is not full."""
         leaf = self.leaf
-        frames_last = leaf.frames_last or leaf.shape == _ATARI
         if len(leaf.shape) == 2:
             return values[..., None]
-        if not frames_last and leaf.kind != "stack" and is_image(leaf.shape):
+        if not self._is_stack:
             return values
-        frames = (np.moveaxis(values, -1, 1) if frames_last else values)[:, ::-1]
+        frames = (np.moveaxis(values, -1, 1) if self._frames_last else values)[:, ::-1]
         rows, count, height, width = frames.shape[:4]
         across = min(math.ceil(math.sqrt(count)), _FRAMES_A_LINE)
         down = -(-count // across)
@@ -82,8 +81,21 @@ class Picture(LeafPanel):
         lines = tiles.reshape(rows, down, across, height, width, -1).swapaxes(2, 3)
         return lines.reshape(rows, down * height, across * width, -1)
 
+    @property
+    def _frames_last(self) -> bool:
+        return self.leaf.frames_last or self.leaf.shape == _ATARI
+
+    @property
+    def _is_stack(self) -> bool:
+        shape = self.leaf.shape
+        return len(shape) > 2 and (self._frames_last or self.leaf.kind == "stack" or not is_image(shape))
+
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _side_by_side(self.title, roots, self.entity)
+        title = self.title
+        if self._is_stack:
+            count = self.leaf.shape[-1 if self._frames_last else 0]
+            title = f"{title}: {count} frames, the newest first"
+        return _side_by_side(title, roots, self.entity)
 
 
 @dataclass(frozen=True)
