@@ -38,7 +38,7 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, crc32, with_crc
+from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, built, crc32, with_crc
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "tupli_mcap"
@@ -58,11 +58,6 @@ _TOGETHER = 64  # chunks compressed and written at once
 _PIECES = 1024  # buffers that one call of the system takes
 _LEVEL = -1  # of zstd: faster than level 1 to write and to read, for a little more room
 _CONTEXT = 4 << 20  # bytes: more than a compressor needs besides its output
-
-
-def _built(builder: RecordBuilder) -> bytes:
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
 
 
 def _write(fd: int, parts: Sequence[memoryview], position: int | None) -> int:
@@ -181,20 +176,20 @@ class Container:
         """Magic and header."""
         builder = RecordBuilder()
         Header(PROFILE, library).write(builder)
-        self.write(MAGIC + _built(builder))
+        self.write(MAGIC + built(builder))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.metadata[name] = values
         builder = RecordBuilder()
         Metadata(name, with_crc(values)).write(builder)
-        data = _built(builder)
+        data = built(builder)
         self.metadata_indexes.append(MetadataIndex(self.position, len(data), name))
         self.write(data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         builder = RecordBuilder()
         Attachment(time_ns, time_ns, name, media_type, data).write(builder)
-        record = _built(builder)
+        record = built(builder)
         offset = self.position
         self.write(record)
         self.attachment_indexes.append(
@@ -230,7 +225,7 @@ class Container:
             builder = RecordBuilder()
             self.schemas[record.schema_id].write(builder)
             record.write(builder)
-            self._definitions[channel] = known = record, _built(builder)
+            self._definitions[channel] = known = record, built(builder)
         return known[1]
 
     def add_chunk(self, rows: Rows) -> None:
@@ -385,7 +380,7 @@ class Container:
             self.add_metadata(name + REPEATED, values)
         builder = RecordBuilder()
         DataEnd(0).write(builder)
-        data_end = _built(builder)
+        data_end = built(builder)
         summary_start = self.position + len(data_end)
         groups: list[tuple[Opcode, list[Any]]] = [
             (Opcode.SCHEMA, list(self.schemas.values())),
@@ -405,11 +400,11 @@ class Container:
         offset_start = summary_start + builder.count
         for offset in offsets:
             offset.write(builder)
-        summary = _built(builder)
+        summary = built(builder)
         Footer(summary_start, offset_start, 0).write(builder)
-        crc = zlib.crc32(_built(builder)[:-4], zlib.crc32(summary))
+        crc = zlib.crc32(built(builder)[:-4], zlib.crc32(summary))
         Footer(summary_start, offset_start, crc).write(builder)
-        self.write(data_end + summary + _built(builder) + MAGIC)
+        self.write(data_end + summary + built(builder) + MAGIC)
 
     def _statistics(self) -> Statistics:
         return Statistics(
