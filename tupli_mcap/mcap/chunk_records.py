@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
+import sys
+from collections import deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
@@ -19,7 +20,9 @@ from tupli_mcap.mcap.walk import Chunk
 
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _BLOCK = 1 << 16  # headers that are copied at once
-HEADERS = np.dtype([(name, kind) for name, kind, _ in HEADER_FIELDS] + [("#offset", "<u8")])
+_NAMES, _KINDS, _OFFSETS = map(list, zip(*HEADER_FIELDS, strict=True))
+_HEADER: DType = np.dtype({"names": _NAMES, "formats": _KINDS, "offsets": _OFFSETS, "itemsize": BODY})
+HEADERS: DType = np.dtype([*zip(_NAMES, _KINDS, strict=True), ("#offset", "<u8")])
 
 
 class ChunkRecords(NamedTuple):
@@ -82,45 +85,47 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     return ChunkRecords(skip, schemas, channels, headers)
 
 
-def message_headers(data: memoryview, most: int | None = None) -> Array:
+def message_headers(data: memoryview, most: int = sys.maxsize) -> Array:
     """The headers of consecutive Message records, as HEADERS.
 
     Raises:
         FormatError: `data` is something else, or holds more than `most` messages.
     """
-    even = _even(data, most)
-    if even is not None:
-        return even
     offsets = message_places(data, most)[:, 0]
     found = np.empty(len(offsets), HEADERS)
     for begin in range(0, len(offsets), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        heads = np.ndarray(max(0, len(data) - BODY + 1), _packed(BODY), data, 0, (1,))[offsets[part]]
+        heads = headers_at(data)[offsets[part]]
         for name, _, _ in HEADER_FIELDS:
             found[name][part] = heads[name]
     found["#offset"] = offsets
     return found
 
 
-def message_places(data: Any, most: int | None) -> Array:
+def headers_at(data: Any) -> Array:
+    """The header that a Message record would have at each offset of `data`: a view."""
+    return np.ndarray(max(0, len(data) - BODY + 1), _HEADER, data, 0, (1,))
+
+
+def message_places(data: Any, most: int = sys.maxsize) -> Array:
     """Where consecutive Message records begin and end: int64 (records, 2). Raises as `message_headers` does."""
-    starts, at, size, length_at = [], 0, len(data), _LENGTH.unpack_from
-    for _ in itertools.count() if most is None else range(most):
-        if at + BODY > size:
-            break
+    starts: Any = []
+    at, end, length_at = 0, len(data), _LENGTH.unpack_from
+    size = 9 + length_at(data, 1)[0] if end >= BODY else 0
+    fits = size >= BODY and end % size == 0 and end // size <= most
+    if fits and (np.ndarray(end // size, "<u8", data, 1, (size,)) == size - 9).all():  # all of one size
+        starts, at = np.arange(0, end, size), end
+    while at + BODY <= end and len(starts) <= most:
         starts.append(at)
         at += 9 + length_at(data, at + 1)[0]
-    else:
-        if at + BODY <= size:
-            raise _too_many(most)
-    if at == size:
-        places = np.array([starts, [*starts[1:], at][: len(starts)]], np.int64).T
-        opcodes = np.frombuffer(data, np.uint8)[places[:, 0]]
-        if (opcodes == Opcode.MESSAGE).all() and (places[:, 1] - places[:, 0] >= BODY).all():
-            return places
-    return np.array(
-        [place[:2] for place in iter_records(data)], np.int64
-    )  # raises, and names the wrong record
+    if len(starts) > most:
+        raise FormatError(f"expected at most {most} messages, found more")
+    places = np.empty((len(starts), 2), np.int64)
+    places[:, 0], places[:-1, 1], places[-1:, 1] = starts, starts[1:], at
+    opcodes = np.frombuffer(data, np.uint8)[places[:, 0]]
+    if at != end or (opcodes != Opcode.MESSAGE).any() or (places[:, 1] - places[:, 0] < BODY).any():
+        deque(iter_records(data), 0)  # raises, and names the wrong record
+    return places
 
 
 def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -135,38 +140,3 @@ def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
         columns = (part[name].tolist() for name in ("#log_time", "#offset", "#length"))
         for log_time, start, length in zip(*columns, strict=True):
             yield log_time, data[start + BODY : start + 9 + length]
-
-
-def _too_many(most: int | None) -> FormatError:
-    return FormatError(f"expected at most {most} messages, found more")
-
-
-def _packed(size: int) -> np.dtype[Any]:
-    """The dtype of records of `size` bytes each, whose fields are those of the header."""
-    spec: Any = {
-        "names": [name for name, _, _ in HEADER_FIELDS],
-        "formats": [kind for _, kind, _ in HEADER_FIELDS],
-        "offsets": [at for _, _, at in HEADER_FIELDS],
-        "itemsize": size,
-    }
-    dtype: np.dtype[Any] = np.dtype(spec)
-    return dtype
-
-
-def _even(data: memoryview, most: int | None) -> Array | None:
-    """The headers if all records have the same size, else None."""
-    if len(data) < BODY:
-        return None
-    size = 9 + int.from_bytes(data[1:9], "little")
-    if size < BODY or len(data) % size:
-        return None
-    if most is not None and len(data) // size > most:
-        raise _too_many(most)
-    rows = np.frombuffer(data, _packed(size))
-    if (rows["#opcode"] != Opcode.MESSAGE).any() or (rows["#length"] != size - 9).any():
-        return None
-    found = np.empty(len(rows), HEADERS)
-    for name, _, _ in HEADER_FIELDS:
-        found[name] = rows[name]
-    found["#offset"] = np.arange(len(rows)) * size
-    return found

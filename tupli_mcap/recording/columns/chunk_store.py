@@ -20,7 +20,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import message_places, messages
+from tupli_mcap.mcap.chunk_records import headers_at, message_places, messages
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, crc32
@@ -29,14 +29,6 @@ from tupli_mcap.recording.limits import StepClaims
 from tupli_mcap.remote import RemoteSource
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory
-_MESSAGE_HEAD = np.dtype(
-    {
-        "names": ["channel", "sequence"],
-        "formats": ["<u2", "<u4"],
-        "offsets": [9, 11],
-        "itemsize": 15,
-    }
-)
 _U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
 _SEQUENCE_AT = 11  # in a record
 _LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
@@ -416,14 +408,15 @@ class ChunkStore:
             found = message_places(data, rows)
         except FormatError as err:
             raise FormatError(f"{where}: {err}") from err
-        heads = np.ndarray(max(0, len(data) - 14), _MESSAGE_HEAD, data, 0, (1,))[found[:, 0]]
-        others = heads["channel"][heads["channel"] != channel]
+        heads = headers_at(data)
+        channels = heads["#channel"][found[:, 0]]
+        others = channels[channels != channel]
         if len(others):
             raise FormatError(f"{where} holds a message of channel {others[0]}")
         if len(found) != rows:
             raise FormatError(f"{where} expected {rows} messages, found {len(found)}")
         if self.claims is not None:
-            _check_sequence(heads["sequence"], int(self.table["first"][i]), where)
+            _check_sequence(heads["#sequence"][found[:, 0]], int(self.table["first"][i]), where)
         return found
 
     def all_messages(self, channel: int | None) -> Iterator[tuple[int, int, memoryview]]:
