@@ -16,7 +16,8 @@ import stat
 import threading
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from tupli_mcap import files
@@ -25,70 +26,44 @@ from tupli_mcap.errors import RecordingError, os_reason
 _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for readers that ask whether the writer lives
 _guard = threading.RLock()  # held while a descriptor is opened and noted, so that no fork comes between
-_private: set[int] = set()
-_files: weakref.WeakSet[io.FileIO] = weakref.WeakSet()
+_private: weakref.WeakSet[io.FileIO] = weakref.WeakSet()
 
 
-def open_private(path: str | os.PathLike[str], flags: int) -> int:
-    """Opens a descriptor that no child process keeps, whether it was forked or started as another program."""
+def open_private(
+    path: str | os.PathLike[str], mode: str, opener: Callable[[str, int], int] | None = None
+) -> io.FileIO:
+    """Opens a file that no child process keeps open, whether it was forked or started as another program.
+
+    If an interrupt keeps the file from its owner, its last reference closes it.
+    """
     with _guard:
-        fd = os.open(path, flags | os.O_CLOEXEC, 0o666)
-        _private.add(fd)
-    return fd
-
-
-def _close_private(fd: int) -> None:
-    """Unlocks and closes a descriptor of `open_private`; does nothing in a child, where it is closed already."""
-    with _guard:
-        if fd not in _private:
-            return
-        _private.discard(fd)
-        try:
-            # a child that C code forked may have a copy
-            fcntl.flock(fd, fcntl.LOCK_UN)
-        finally:
-            os.close(fd)
-
-
-def drop_private(fd: int) -> None:
-    """Closes a descriptor that nothing was written to, and ignores errors."""
-    with contextlib.suppress(OSError):
-        _close_private(fd)
-
-
-def _open_file(path: Path, mode: str) -> io.FileIO:
-    """As `open_private`. If an interrupt keeps the file from its owner, its last reference closes it."""
-    with _guard:
-        file = io.FileIO(path, mode)
-        _files.add(file)
+        file = io.FileIO(path, mode, opener=opener or partial(os.open, mode=0o666))
+        _private.add(file)
     return file
 
 
-def _close_file(file: io.FileIO) -> None:
-    """As `_close_private`."""
+def _close_private(file: io.FileIO) -> None:
+    """Unlocks and closes a file of `open_private`; does nothing in a child, where it is closed already."""
     with _guard:
         if not file.closed:
             try:
+                # a child that C code forked may have a copy
                 fcntl.flock(file, fcntl.LOCK_UN)
             finally:
                 file.close()
 
 
-def _drop_file(file: io.FileIO | None) -> None:
-    """As `drop_private`."""
+def drop_private(file: io.FileIO | None) -> None:
+    """Closes a file that nothing was written to, and ignores errors."""
     if file is not None:
         with contextlib.suppress(OSError):
-            _close_file(file)
+            _close_private(file)
 
 
 def _drop_in_child() -> None:
     global _guard
     _guard = threading.RLock()
-    for fd in _private:
-        with contextlib.suppress(OSError):
-            os.close(fd)
-    _private.clear()
-    for file in list(_files):
+    for file in list(_private):
         with contextlib.suppress(OSError):
             file.close()
 
@@ -140,7 +115,7 @@ class FileLock:
             return
         self._temporary = files.temporary_path(self._path.parent)
         try:
-            self._file = _open_file(self._temporary, "x+")
+            self._file = open_private(self._temporary, "x+")
         except OSError as err:
             self._temporary = None
             reason = os_reason(err)
@@ -177,7 +152,7 @@ class FileLock:
         except OSError as err:
             raise RecordingError(f"{self._shown} cannot be recorded to: {os_reason(err)}") from err
         self._temporary = None
-        _drop_file(self._old)
+        drop_private(self._old)
         self._old = None
 
     @property
@@ -206,12 +181,12 @@ class FileLock:
             with contextlib.suppress(OSError):
                 self._temporary.unlink()
             self._temporary = None
-        _drop_file(self._old)
+        drop_private(self._old)
         self._old = None
         if self._file is None:
             return
         try:
-            _close_file(self._file)
+            _close_private(self._file)
         except OSError as err:
             raise RecordingError(f"{self._shown} could not be closed: {os_reason(err)}") from err
 
@@ -234,13 +209,13 @@ def writers_kept_out(path: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        _drop_file(file)
+        drop_private(file)
 
 
 def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
     while True:
         try:
-            file = _open_file(path, mode)
+            file = open_private(path, mode)
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except IsADirectoryError as err:
@@ -252,12 +227,12 @@ def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
             if _is_at(file.fileno(), path):
                 return file
         except BaseException as err:
-            _drop_file(file)
+            drop_private(file)
             if isinstance(err, OSError):
                 raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
             raise
         # it was deleted or replaced between opening and locking: whatever is written to it would be lost
-        _drop_file(file)
+        drop_private(file)
 
 
 def _lock(fd: int, path: Path) -> None:
@@ -305,11 +280,12 @@ def is_locked(path: Path) -> bool:
         RecordingError: the system does not say (too many open files, for example): there may be a writer.
     """
     try:
-        fd = open_private(path, os.O_RDONLY | os.O_NONBLOCK)  # does not wait for the other end of a pipe
+        # does not wait for the other end of a pipe
+        file = open_private(path, "r", lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
         try:
-            return not _try_shared(fd)
+            return not _try_shared(file.fileno())
         finally:
-            drop_private(fd)
+            drop_private(file)
     except (FileNotFoundError, PermissionError):
         return False
     except OSError as err:

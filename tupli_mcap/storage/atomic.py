@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import functools
 import inspect
+import io
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -106,7 +107,7 @@ class Lock:
         self._process = os.getpid()
         self._thread_lock = threading.RLock()
         self._depth = 0
-        self._fd = -1
+        self._file: io.FileIO | None = None
 
     def __enter__(self) -> Self:
         if self._process != os.getpid():  # forked: a thread of the parent may hold it
@@ -124,7 +125,7 @@ class Lock:
     def _open(self) -> None:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._fd = locked(self._path)
+            self._file = locked(self._path)
         except OSError as err:
             raise LockError(
                 f"cannot change the storage: its lock {str(self._path)!r} cannot be taken: {os_reason(err)}"
@@ -133,21 +134,21 @@ class Lock:
     def __exit__(
         self, kind: type[BaseException] | None, err: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._process != os.getpid() or self._fd < 0:
+        if self._process != os.getpid() or self._file is None:
             return  # the parent entered the block before the fork
         self._depth -= 1
         if self._depth == 0:
-            fd, self._fd = self._fd, -1
-            drop_private(fd)
+            file, self._file = self._file, None
+            drop_private(file)
         self._thread_lock.release()
 
 
-def locked(path: Path, *, exclusive: bool = True) -> int:
-    """A descriptor that holds the lock of a file (made if it is missing); close it with `drop_private`."""
-    fd = open_private(path, os.O_RDWR | os.O_CREAT)
+def locked(path: Path, *, exclusive: bool = True) -> io.FileIO:
+    """A file, made if it is missing, whose lock is held; close it with `drop_private`."""
+    file = open_private(path, "a+")
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
+        fcntl.flock(file, fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH)
     except BaseException:  # Ctrl-C while waiting
-        drop_private(fd)
+        drop_private(file)
         raise
-    return fd
+    return file

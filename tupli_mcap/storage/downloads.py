@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import io
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -58,12 +59,12 @@ def fetched(
     budget, path = _budget(), cache_dir() / "downloads" / name
     with os_errors("cannot keep what is downloaded in", path.parent):
         make_private(path.parent)
-        while (fd := _held(path)) is None:
+        while (file := _held(path)) is None:
             _fetch(path, pieces, digest, tell)
     try:
         yield path
     finally:
-        drop_private(fd)
+        drop_private(file)
         with contextlib.suppress(OSError):
             delete_oldest(path.parent.iterdir(), budget, _delete)
 
@@ -102,21 +103,21 @@ def fetched_url(url: str) -> Iterator[Path]:
         yield path
 
 
-def _held(path: Path) -> int | None:
-    """A descriptor with a shared lock, so that nobody deletes the file; None if there is no file."""
+def _held(path: Path) -> io.FileIO | None:
+    """The file, with a shared lock, so that nobody deletes the file; None if there is no file."""
     try:
-        fd = open_private(path, os.O_RDONLY)
+        file = open_private(path, "r")
     except FileNotFoundError:
         return None
     try:
-        fcntl.flock(fd, fcntl.LOCK_SH)
-        if _is_at(fd, path):
-            os.utime(fd)
-            return fd
+        fcntl.flock(file, fcntl.LOCK_SH)
+        if _is_at(file, path):
+            os.utime(file.fileno())
+            return file
     except BaseException:
-        drop_private(fd)
+        drop_private(file)
         raise
-    drop_private(fd)
+    drop_private(file)
     return None
 
 
@@ -127,22 +128,22 @@ def _fetch(
     tell: Callable[[int], None],
 ) -> None:
     part = path.with_name(path.name + _PART)
-    fd = open_private(part, os.O_RDWR | os.O_CREAT)
+    file = open_private(part, "a+")
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX)
-        if not _is_at(fd, part):  # another process has finished it, or it was deleted
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if not _is_at(file, part):  # another process has finished it, or it was deleted
             return
         if path.exists():  # another process had finished it before this file was made
             part.unlink()
             return
-        with os.fdopen(os.dup(fd), "r+b") as file:
-            tell(file.seek(0, os.SEEK_END))
-            for piece in pieces(file.tell()):
-                file.write(piece)
+        with os.fdopen(os.dup(file.fileno()), "r+b") as buffered:
+            tell(buffered.seek(0, os.SEEK_END))
+            for piece in pieces(buffered.tell()):
+                buffered.write(piece)
                 tell(len(piece))
-            file.flush()
-            file.seek(0)
-            found = digest and hashlib.file_digest(file, "sha256").hexdigest()
+            buffered.flush()
+            buffered.seek(0)
+            found = digest and hashlib.file_digest(buffered, "sha256").hexdigest()
         if found != digest:
             part.unlink()
             raise FormatError(
@@ -150,29 +151,29 @@ def _fetch(
             )
         part.replace(path)
     finally:
-        drop_private(fd)
+        drop_private(file)
 
 
 def _delete(path: Path) -> bool:
     """Deletes a file unless somebody uses it."""
     try:
-        fd = open_private(path, os.O_RDONLY)
+        file = open_private(path, "r")
     except FileNotFoundError:
         return True
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if _is_at(fd, path):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if _is_at(file, path):
             path.unlink()
     except BlockingIOError:
         return False
     finally:
-        drop_private(fd)
+        drop_private(file)
     return True
 
 
-def _is_at(fd: int, path: Path) -> bool:
+def _is_at(file: io.FileIO, path: Path) -> bool:
     try:
-        return os.path.samestat(os.fstat(fd), path.stat())
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:
         return False
 

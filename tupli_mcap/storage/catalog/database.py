@@ -390,21 +390,21 @@ def _lock_file(path: Path) -> Path:
 @contextlib.contextmanager
 def _exclusive(path: Path) -> Iterator[None]:
     """Hold the lock for creating or replacing the file."""
-    fd = locked(_lock_file(path))
+    file = locked(_lock_file(path))
     try:
         yield
     finally:
-        drop_private(fd)
+        drop_private(file)
 
 
 @contextlib.contextmanager
 def _shared(lock: Path) -> Iterator[None]:
     """Keep others from replacing the file."""
-    fd = locked(lock, exclusive=False)
+    file = locked(lock, exclusive=False)
     try:
         yield
     finally:
-        drop_private(fd)
+        drop_private(file)
 
 
 @contextlib.contextmanager
