@@ -10,16 +10,14 @@ import os
 import stat
 import threading
 import weakref
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, TypeVar
+from typing import Any, BinaryIO, Protocol
 from urllib.parse import unquote, urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
-_T = TypeVar("_T")
 _LARGEST_LENT = 4 << 20
 _lent = threading.local()
 
@@ -82,12 +80,50 @@ def _lent_buffer(length: int) -> memoryview:
     return buffer[:length]
 
 
-class PathSource:
+class _Checked:
+    """A source whose `_read` may return fewer bytes, or raise OSError."""
+
+    name: str
+    size: int
+
+    def read(self, offset: int, length: int) -> bytes:
+        self._check(offset, length)
+        try:
+            data = self._read(offset, length)
+        except OSError as err:  # a failing disk or connection is no defect of the file
+            raise RecordingError(
+                f"{self.name}: could not read {length} bytes at offset {offset}: {os_reason(err)}"
+            ) from err
+        if len(data) != length:
+            raise self._too_short(offset, length)
+        return data
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        return memoryview(self.read(offset, length))
+
+    def view(self, offset: int, length: int) -> memoryview:
+        return memoryview(self.read(offset, length))
+
+    def _check(self, offset: int, length: int) -> None:
+        if offset + length > self.size:
+            raise self._too_short(offset, length)
+
+    def _too_short(self, offset: int, length: int) -> FormatError:
+        return FormatError(
+            f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
+        )
+
+    def _read(self, offset: int, length: int) -> bytes:
+        raise NotImplementedError
+
+
+class PathSource(_Checked):
     """A local file, read with positioned reads."""
 
     def __init__(self, path: Path) -> None:
         self.path: Path | None = path
         self.name = str(path)
+        self._mapped: Any = b""
         try:
             self._fd = open_regular(path)
         except IsADirectoryError as err:
@@ -105,14 +141,6 @@ class PathSource:
         except BaseException:
             self.close()
             raise
-        self._mapped: Any = b""
-
-    def read(self, offset: int, length: int) -> bytes:
-        self._check(offset, length)
-        data = _read_or_refused(self.name, offset, length, lambda: self._read(offset, length))
-        if len(data) != length:
-            raise self._too_short(offset, length)
-        return data
 
     def lend(self, offset: int, length: int) -> memoryview:
         self._check(offset, length)
@@ -138,13 +166,7 @@ class PathSource:
     def _check(self, offset: int, length: int) -> None:
         if self._fd < 0:
             raise RecordingError(f"{self.name} is closed; open it again with Recording(...)")
-        if offset + length > self.size:
-            raise self._too_short(offset, length)
-
-    def _too_short(self, offset: int, length: int) -> FormatError:
-        return FormatError(
-            f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
-        )
+        super()._check(offset, length)
 
     def _read(self, offset: int, length: int) -> bytes:
         data = os.pread(self._fd, length, offset)
@@ -157,14 +179,9 @@ class PathSource:
 
     def refresh(self) -> None:
         try:
-            status = os.fstat(self._fd)
+            self.size = os.fstat(self._fd).st_size
         except OSError as err:
             raise RecordingError(f"{self.name} cannot be read: {os_reason(err)}") from err
-        if stat.S_ISDIR(status.st_mode):
-            raise RecordingError(
-                f"{self.name} is a directory; give one file, a recording (.mcap); tupli_mcap.open takes directories"
-            )
-        self.size = status.st_size
 
     def close(self) -> None:
         if self._fd >= 0:
@@ -200,7 +217,7 @@ def _delete(place: Path, process: int) -> None:
             place.unlink()
 
 
-class FileSource:
+class FileSource(_Checked):
     """An open, seekable binary file; `close` closes it only if it is `owned`."""
 
     def __init__(self, file: BinaryIO, name: str, *, owned: bool) -> None:
@@ -217,32 +234,16 @@ class FileSource:
         except (OSError, ValueError, AttributeError) as err:
             raise RecordingError(f"{name}: expected a seekable binary file, found {file!r}") from err
 
-    def read(self, offset: int, length: int) -> bytes:
-        if offset + length > self.size:
-            raise FormatError(
-                f"{self.name}: expected {length} bytes at offset {offset}, found the end at {self.size}"
-            )
-        if self._process != os.getpid() and self._fd < 0:
-            raise RecordingError(
-                f"{self.name} was opened by the process that this one was forked from; open it again here"
-            )
-        with self._lock if self._fd < 0 else contextlib.nullcontext():
-            data = _read_or_refused(self.name, offset, length, lambda: self._read(offset, length))
-        if len(data) != length:
-            raise FormatError(f"{self.name}: expected {length} bytes at offset {offset}, found {len(data)}")
-        return data
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        return memoryview(self.read(offset, length))
-
-    def view(self, offset: int, length: int) -> memoryview:
-        return memoryview(self.read(offset, length))
-
     def _read(self, offset: int, length: int) -> bytes:
         if self._fd >= 0 and not self._file.closed:
             return os.pread(self._fd, length, offset)
-        self._file.seek(offset)
-        return self._file.read(length)
+        if self._process != os.getpid():
+            raise RecordingError(
+                f"{self.name} was opened by the process that this one was forked from; open it again here"
+            )
+        with self._lock:
+            self._file.seek(offset)
+            return self._file.read(length)
 
     def refresh(self) -> None:
         with self._lock:
@@ -256,16 +257,6 @@ class FileSource:
 def _is_system_file(file: BinaryIO) -> bool:
     raw = file.raw if type(file) is io.BufferedReader else file
     return type(raw) is io.FileIO and not file.closed
-
-
-def _read_or_refused(name: str, offset: int, length: int, read: Callable[[], _T]) -> _T:
-    """Calls `read`; an OSError becomes a RecordingError: a failing disk or connection is no defect of the file."""
-    try:
-        return read()
-    except OSError as err:
-        raise RecordingError(
-            f"{name}: could not read {length} bytes at offset {offset}: {os_reason(err)}"
-        ) from err
 
 
 def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource) -> Source:
