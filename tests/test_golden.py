@@ -23,7 +23,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.mcap.container import PROFILE
+from tupli_mcap.mcap.records import PROFILE
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import Recording, finish_recording
 from tupli_mcap.recording.check.verify import verify_recording

@@ -35,7 +35,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.mcap.chunk_records import message_headers
-from tupli_mcap.mcap.container import MAGIC
+from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording import RecoveryReport

@@ -22,8 +22,8 @@ from sample_spaces import SPACES, space_id
 
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.journal.file import PAGE, Journal, LogArea, RowArea, journal_path
-from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, PROFILE
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
+from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, PROFILE, RECORD_HEADER
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.frames import FRAME_LAYOUT, encode_pair
 from tupli_mcap.messages.infos import InfoCodec

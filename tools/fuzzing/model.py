@@ -16,7 +16,8 @@ import lz4.frame
 import numpy as np
 import zstandard
 
-from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC
+from tupli_mcap.mcap.container import CHUNK_ROWS
+from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME
 
 __all__ = [

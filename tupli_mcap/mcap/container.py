@@ -38,10 +38,8 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.mcap.records import CHUNK_HEAD, MESSAGE_INDEX, built, crc32, with_crc
+from tupli_mcap.mcap.records import CHUNK_HEAD, MAGIC, MESSAGE_INDEX, PROFILE, built, crc32, with_crc
 
-MAGIC = b"\x89MCAP0\r\n"
-PROFILE = "tupli_mcap"
 REPEATED = ".repeated"
 """End of the name of metadata that are repeated at the end of a file: viewers warn of two records of one name."""
 Compression = str  # "zstd", "lz4" or "none"

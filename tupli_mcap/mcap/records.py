@@ -6,7 +6,7 @@ import io
 import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream, RecordBuilder
@@ -31,6 +31,8 @@ try:
 except ImportError:
     from zlib import crc32 as _crc32
 
+MAGIC = b"\x89MCAP0\r\n"  # begins and ends a file
+PROFILE = "tupli_mcap"
 RECORD = struct.Struct("<BQ")  # start of every record: opcode, and the length of what follows
 # RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
 # name, and the length of the compressed bytes (u64)
@@ -50,11 +52,14 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
     ("#publish_time", "<u8", 23),
     ("#cdr", "<u4", 31),
 ]
+FOOTER = struct.Struct("<BQQQI")  # RECORD, where the summary and the offsets in it begin, CRC
+OTHER_TOOLS = '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them'
 MAX_CHUNK = 1 << 31  # bytes, uncompressed
 MAX_ROWS_A_BYTE = 16
 """Messages for each compressed byte of a chunk, at most: each message has another `sequence`, so no compressor gets far
 below a byte for each."""
 
+_MAX_SUMMARY = 1 << 31
 _PIECE = 1 << 20
 _MOST_TEXT = 1 << 17  # bytes of name and media type of an attachment
 _KEY = "crc"
@@ -68,6 +73,7 @@ _PARSERS: dict[int, Any] = {
     Opcode.STATISTICS: Statistics,
     Opcode.METADATA: Metadata,
 }
+_SUMMARIZED = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 
 
 def records(data: bytes | memoryview, base: int, name: str) -> Iterator[tuple[int, int, memoryview]]:
@@ -270,3 +276,88 @@ def crc32_each(parts: Iterable[bytes]) -> list[int]:
     found = list(map(_crc32, parts))
     np.add(_ZEROS, _ZEROS, out=_ZEROS)
     return found
+
+
+# ---- the end of a finished file
+
+
+class Summary(NamedTuple):
+    """The parsed summary: it begins at offset `start` and lists `chunks` chunks."""
+
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+    attachments: dict[str, AttachmentIndex]
+    metadata: dict[str, MetadataIndex]
+    chunks: int
+    start: int
+
+
+def check_magic(source: Source) -> None:
+    """Raises FormatError unless the file starts as an MCAP file."""
+    if source.size == 0:
+        raise FormatError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
+    head = source.read(0, min(len(MAGIC), source.size))
+    if head != MAGIC:
+        raise FormatError(
+            f"{source.name}: expected an MCAP file, found {head!r} at its start; "
+            "give a recording (.mcap), or see what tupli-mcap recover can save"
+        )
+
+
+def has_summary(source: Source) -> bool:
+    """True if the file ends as a finished MCAP file does."""
+    size = FOOTER.size + len(MAGIC)
+    if source.size < len(MAGIC) + size:
+        return False
+    tail = source.read(source.size - size, size)
+    return tail.startswith(RECORD.pack(Opcode.FOOTER, FOOTER.size - RECORD.size)) and tail.endswith(MAGIC)
+
+
+def read_summary(source: Source) -> Summary:
+    """Parses the summary section.
+
+    Raises:
+        FormatError: the footer, the summary's CRC or a record in it is wrong.
+    """
+    end = source.size - len(MAGIC) - FOOTER.size
+    footer = source.read(end, FOOTER.size)
+    _, _, start, _, crc = FOOTER.unpack(footer)
+    if not len(MAGIC) <= start <= end or end - start > _MAX_SUMMARY:
+        raise FormatError(f"{source.name}: expected the summary before offset {end}, the footer says {start}")
+    data = source.read(start, end - start)
+    if crc32(footer[:-4], crc32(data)) != crc:
+        raise FormatError(f"{source.name}: the summary at offset {start} is damaged (its CRC differs)")
+    summary = Summary({}, {}, {}, {}, 0, start)
+    chunks = 0
+    topics: dict[str, int] = {}
+    for opcode, position, body in records(data, start, source.name):
+        parsed = parse_record(opcode, body, position, source.name) if opcode in _SUMMARIZED else None
+        if isinstance(parsed, Schema):
+            _once(summary.schemas, parsed.id, parsed, f"schema {parsed.id}", source.name)
+        elif isinstance(parsed, Channel):
+            _once(summary.channels, parsed.id, parsed, f"channel {parsed.id}", source.name)
+            if topics.setdefault(parsed.topic, parsed.id) != parsed.id:
+                raise FormatError(
+                    f"{source.name}: expected each topic once, found {parsed.topic!r:.80} twice"
+                )
+        elif isinstance(parsed, AttachmentIndex):
+            summary.attachments[parsed.name] = parsed
+        elif isinstance(parsed, MetadataIndex):
+            summary.metadata[parsed.name] = parsed
+        elif opcode == Opcode.CHUNK_INDEX:
+            chunks += 1
+    return summary._replace(chunks=chunks)
+
+
+def _once(found: dict[int, Any], number: int, value: Any, what: str, name: str) -> None:
+    """Keeps a definition; raises FormatError if there is another one of that number."""
+    if found.setdefault(number, value) != value:
+        raise FormatError(f"{name}: expected {what} once in the summary, found another one")
+
+
+def foreign(source: Source, why: str) -> FormatError:
+    """The error for an MCAP file that is no recording of ours."""
+    return FormatError(
+        f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); expected the profile {PROFILE!r} "
+        f"({OTHER_TOOLS})"
+    )

@@ -18,9 +18,9 @@ from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO, decompress
-from tupli_mcap.mcap.container import MAGIC
 from tupli_mcap.mcap.records import (
     CHUNK_HEAD,
+    MAGIC,
     MAX_CHUNK,
     RECORD,
     attachment_index,

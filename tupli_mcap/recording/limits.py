@@ -10,8 +10,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.compression import MAX_RATIO
-from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
-from tupli_mcap.mcap.records import BODY, MAX_CHUNK, MAX_ROWS_A_BYTE
+from tupli_mcap.mcap.container import COMPRESSIONS
+from tupli_mcap.mcap.records import BODY, MAGIC, MAX_CHUNK, MAX_ROWS_A_BYTE
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 
 EPISODE_TOPICS = (EPISODE_START, EPISODE_END, FINAL_STATE)

@@ -15,9 +15,16 @@ from mcap.records import Channel
 from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.mcap.records import BODY, read_attachment, read_metadata
+from tupli_mcap.mcap.records import (
+    BODY,
+    check_magic,
+    foreign,
+    has_summary,
+    read_attachment,
+    read_metadata,
+    read_summary,
+)
 from tupli_mcap.mcap.source import Source, TemporarySource, open_source
-from tupli_mcap.mcap.summary import check_magic, foreign, has_summary, read_summary
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout

@@ -12,10 +12,18 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
-from tupli_mcap.mcap.container import CHUNK_ROWS, MAGIC, PROFILE
-from tupli_mcap.mcap.records import CDR_HEADER, check_crc, message_index, parse_record, records
+from tupli_mcap.mcap.container import CHUNK_ROWS
+from tupli_mcap.mcap.records import (
+    CDR_HEADER,
+    FOOTER,
+    MAGIC,
+    PROFILE,
+    check_crc,
+    message_index,
+    parse_record,
+    records,
+)
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import FOOTER_SIZE
 from tupli_mcap.mcap.walk import Chunk, Damage, Found, Walk
 from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.contents import (
@@ -321,7 +329,7 @@ class Structure:
         self._summary(self._tail.summary.start)
 
     def _summary(self, start: int) -> None:
-        end = self._source.size - len(MAGIC) - FOOTER_SIZE
+        end = self._source.size - len(MAGIC) - FOOTER.size
         data = self._source.read(start, end - start)
         parsed: dict[int, list[Any]] = {}
         groups: dict[int, list[int]] = {}

@@ -13,8 +13,8 @@ from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, Si
 from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.records import OTHER_TOOLS, has_summary
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import OTHER_TOOLS, has_summary
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO

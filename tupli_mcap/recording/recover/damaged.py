@@ -10,8 +10,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
-from tupli_mcap.mcap.container import MAGIC, PROFILE
-from tupli_mcap.mcap.records import check_crc, message_index, parse_record
+from tupli_mcap.mcap.records import MAGIC, PROFILE, check_crc, message_index, parse_record
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.walk import Chunk, ChunkClaim, Damage, Found, Walk
 from tupli_mcap.recording.contents import (

@@ -9,16 +9,20 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import COMPRESSIONS, MAGIC
+from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import (
+    FOOTER,
+    MAGIC,
+    Summary,
     attachment_index,
     checked_attachment,
+    has_summary,
     parse_record,
     read_attachment,
+    read_summary,
     records,
 )
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import FOOTER_SIZE, Summary, has_summary, read_summary
 from tupli_mcap.mcap.walk import ChunkClaim
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
 
@@ -83,7 +87,7 @@ def read_tail(source: Source) -> Tail:
 
 
 def _statistics(source: Source, summary: Summary) -> Statistics | None:
-    data = source.read(summary.start, source.size - len(MAGIC) - FOOTER_SIZE - summary.start)
+    data = source.read(summary.start, source.size - len(MAGIC) - FOOTER.size - summary.start)
     for opcode, position, body in records(data, summary.start, source.name):
         if opcode == Opcode.STATISTICS:
             statistics: Statistics = parse_record(opcode, body, position, source.name)

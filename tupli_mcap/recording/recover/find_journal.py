@@ -10,8 +10,8 @@ from typing import Any
 
 from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.file import EVENT_AREAS, JournalContents, journal_info, read_journal, recorded_journal
+from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.recording.recover.prefix import head
 
 STEPS_IN_JOURNAL = "steps that are not yet in a chunk are nowhere else"

@@ -10,10 +10,9 @@ from mcap.records import Metadata, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import chunk_records
-from tupli_mcap.mcap.container import MAGIC, PROFILE, Rows
-from tupli_mcap.mcap.records import parse_record
+from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.records import MAGIC, PROFILE, foreign, parse_record
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import foreign
 from tupli_mcap.mcap.walk import Chunk, Found, Walk
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata
 from tupli_mcap.recording.index import INDEX_NAME

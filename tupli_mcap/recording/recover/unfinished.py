@@ -16,8 +16,8 @@ from tupli_mcap.journal.committed import size_behind
 from tupli_mcap.journal.file import JournalContents, recorded_journal
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
+from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.frames import FRAME_LAYOUT
 from tupli_mcap.messages.step import StepLayout

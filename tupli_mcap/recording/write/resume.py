@@ -13,9 +13,8 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal
 from tupli_mcap.journal.seals import sync_file
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.records import CHUNK_HEAD
+from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import check_magic, has_summary
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError, warn
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import PathSource
-from tupli_mcap.mcap.summary import has_summary
 from tupli_mcap.recording import Recording, finish_recording, journal_path, recover_recording
 
 __all__ = ["finished", "note", "numbers_of", "sent_before", "state_of"]

@@ -27,10 +27,11 @@ from tupli_mcap.mcap.records import (
     MESSAGE_INDEX,
     RECORD,
     RECORD_HEADER,
+    has_summary,
     read_attachment,
+    read_summary,
 )
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import has_summary, read_summary
 from tupli_mcap.mcap.walk import Walk
 from tupli_mcap.messages.frames import EncodedFrame, camera_names, decode_frame
 from tupli_mcap.messages.images.codecs import image_codecs

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, os_reason
-from tupli_mcap.mcap.container import MAGIC, Container
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.records import MAGIC, OTHER_TOOLS
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.summary import OTHER_TOOLS
 from tupli_mcap.mcap.walk import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
