@@ -158,7 +158,7 @@ class TestTables:
 
     def test_index(self) -> None:
         builder = IndexBuilder()
-        builder.add(*EpisodeRow(1, 2, 0.5, 3, 4, 5, 6, 7, -1, 8, 9, 2), '{"a":1}')
+        builder.add(EpisodeRow(1, 2, 0.5, 3, 4, 5, 6, 7, -1, 8, 9, 2), '{"a":1}')
         chunk = np.array((1, 2, 3, 4, 5, 6, 7, 8, COMPRESSIONS.index("lz4"), 0), CHUNK_ROWS).tobytes()
         data = builder.encode(chunk)
         assert read_by_table("index-header", data) == {

@@ -248,9 +248,8 @@ class Forger(assemble.Assembler):
         super().__init__(container)
         add = self.index.add
 
-        def row(*facts: Any) -> None:
-            *values, metadata = facts
-            add(*self.changed_row(EpisodeRow(*values)), metadata)
+        def row(found: EpisodeRow, metadata: str) -> None:
+            add(self.changed_row(found), metadata)
 
         self.index.add = row  # type: ignore[method-assign]
 

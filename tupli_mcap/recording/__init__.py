@@ -2,7 +2,7 @@
 
 recording, episode, frames    `Recording`, its episodes and frames; `verbs` are the methods it shares with a dataset
 opened, contents              an open file, and its contents from the summary or from recovery
-index, limits                 the episode index, and its checks against the file's size
+index                         the episode index, and its checks against the file
 channels                      the channels that a layout needs
 description, series           the facts that `info` shows
 blocks                        whole episodes in bounded memory

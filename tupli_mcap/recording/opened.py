@@ -39,8 +39,15 @@ from tupli_mcap.recording.contents import (
     step_channels,
 )
 from tupli_mcap.recording.frames import Cameras
-from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.limits import EPISODE_TOPICS, StepClaims, check_chunks, check_episodes, check_rows
+from tupli_mcap.recording.index import (
+    EPISODE_TOPICS,
+    INDEX_NAME,
+    EpisodeIndex,
+    StepClaims,
+    check_chunks,
+    check_episodes,
+    check_rows,
+)
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.remote import is_url
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels

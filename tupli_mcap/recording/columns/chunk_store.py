@@ -25,7 +25,7 @@ from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, crc32
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.recording.limits import StepClaims
+from tupli_mcap.recording.index import StepClaims
 from tupli_mcap.remote import RemoteSource
 
 IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory

@@ -19,7 +19,7 @@ from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA
-from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
 
 _CHUNK = 256 * 1024
@@ -165,21 +165,11 @@ class Assembler:
         self.add_messages(ids[FINAL_STATE], ((time_ns, body()) for time_ns, _, body in with_final))
         for i, episode in enumerate(episodes):
             start, end = episode.starts[-1][1], episode.end[1]
-            self.index.add(
-                end.first_row,
-                end.length,
-                end.episode_return,
-                start_times[i],
-                end_times[i],
-                start.seed_number,
-                started[i],
-                ended[i],
-                finals.get(i, -1),
-                end.episode,
-                end.env,
-                end.end,
-                end.metadata,
-            )
+            row = EpisodeRow(
+                end.first_row, end.length, end.episode_return, start_times[i], end_times[i], start.seed_number,
+                started[i], ended[i], finals.get(i, -1), end.episode, end.env, end.end,
+            )  # fmt: skip
+            self.index.add(row, end.metadata)
 
     def finish(self, time_ns: int) -> None:
         """Writes the episode index and the summary."""

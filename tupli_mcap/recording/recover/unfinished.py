@@ -168,7 +168,7 @@ def _index(
             episode.run.row, end.length, end.episode_return, start_time, end_time, episode.start.start.seed_number,
             start_row, end_row, final, episode.number, end.env, end.end,
         )  # fmt: skip
-        builder.add(*row, end.metadata)
+        builder.add(row, end.metadata)
     return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
 
 

@@ -23,6 +23,7 @@ from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.channels import Channels, register_channels
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.repair.frames import OldCameras, kept_frames
+from tupli_mcap.recording.index import EpisodeRow
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 
@@ -215,12 +216,13 @@ class RepairWriter:
             text = self._metadata(episode, last[episode.run.episode] == episode.number)
             end = episode.end.end._replace(first_row=first, metadata=text)
             moved[episode.number] = end
-            self._target.index.add(
+            row = EpisodeRow(
                 first, end.length, end.episode_return, episode.start.time, episode.end.time,
                 episode.start.start.seed_number,
                 start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
-                end.episode, end.env, end.end, text,
+                end.episode, end.env, end.end,
             )  # fmt: skip
+            self._target.index.add(row, text)
         messages = (
             (time, start._replace(first_row=rows[e.number]).encode())
             for e in starts
