@@ -38,7 +38,7 @@ from tupli_mcap.journal.seals import checksum
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records, with_crc
 from tupli_mcap.messages.episodes import EpisodeStart
-from tupli_mcap.recording.recover import find_journal as recover
+from tupli_mcap.recording.recover import from_journal as recover
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 BOX = spaces.Box(-1, 1, (4,), np.float32)

@@ -372,7 +372,7 @@ def read_contents(source: Source) -> Contents:
 def _read_contents(source: Source) -> Contents:
     if not has_summary(source):
         check_magic(source)
-        from tupli_mcap.recording.recover.find_journal import find_journal
+        from tupli_mcap.recording.recover.from_journal import find_journal
         from tupli_mcap.recording.recover.unfinished import recover_contents
 
         journal = find_journal(source)  # a writer that closed in the meantime left a summary, and no journal

@@ -25,11 +25,10 @@ from tupli_mcap.messages.topics import parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
-from tupli_mcap.recording.recover.add_journal import take_journal
 from tupli_mcap.recording.recover.episodes import IN_A_HOLE, RUNNING, PlannedEpisode, final_state, make_plan
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, memory_entry
-from tupli_mcap.recording.recover.find_journal import belongs, find_journal, misplaced_journal
-from tupli_mcap.recording.recover.prefix import head, prefix
+from tupli_mcap.recording.recover.from_file import head, prefix
+from tupli_mcap.recording.recover.from_journal import belongs, find_journal, misplaced_journal, take_journal
 
 
 def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:

@@ -21,8 +21,8 @@ from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
 from tupli_mcap.recording.opened import read_contents
-from tupli_mcap.recording.recover.find_journal import belongs, misplaced_journal
-from tupli_mcap.recording.recover.prefix import head, metadata_at
+from tupli_mcap.recording.recover.from_file import head, metadata_at
+from tupli_mcap.recording.recover.from_journal import belongs, misplaced_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
     """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
     if contents.complete or source.size == contents.data_end:
         return
-    from tupli_mcap.recording.recover.add_journal import add_journal
-    from tupli_mcap.recording.recover.damaged import gather
     from tupli_mcap.recording.recover.file_end import read_tail
+    from tupli_mcap.recording.recover.from_file import gather
+    from tupli_mcap.recording.recover.from_journal import add_journal
 
     evidence = gather(source, read_tail(source))
     add_journal(evidence)
