@@ -12,7 +12,7 @@ viewer, plots              shows episodes in Rerun and Foxglove, live too; draws
 doctor, replay             finds defects of the data; steps an environment with recorded actions
 trust, signing             which code and keys this user trusts; signatures
 cli                        the commands
-errors, progress, files, cache, jsonvalue, arrays    what all of them use
+errors, progress, files, cache, jsonvalue, arrays, lazy    what all of them use
 """
 
 from __future__ import annotations

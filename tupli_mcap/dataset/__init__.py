@@ -13,8 +13,9 @@ curate, display    writes a recording of fewer episodes; shows datasets as text 
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tupli_mcap.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.columns.convert import (
@@ -31,22 +32,18 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.tupli import TupliDataset
 
 # Imported on first use: a process that only reads items, such as a worker of a DataLoader, needs no storage.
-_HOMES = {
-    "BaseTupleParser": "columns.convert",
-    "Dataset": "dataset",
-    "DatasetError": "sources",
-    "FilterReport": "curate",
-    "NumpyTupleParser": "columns.convert",
-    "SavedColumns": "columns.saved",
-    "TensorflowTupleParser": "columns.convert",
-    "TorchTupleParser": "columns.convert",
-    "TupliDataset": "tupli",
-    "filter_recording": "curate",
-    "merge_recordings": "curate",
-    "open": "opening",
-    "open_columns": "columns.saved",
-    "split_recording": "curate",
-}
+__getattr__ = imported_on_use(
+    globals(),
+    {
+        "columns.convert": "BaseTupleParser NumpyTupleParser TensorflowTupleParser TorchTupleParser",
+        "columns.saved": "SavedColumns open_columns",
+        "curate": "FilterReport filter_recording merge_recordings split_recording",
+        "dataset": "Dataset",
+        "opening": "open",
+        "sources": "DatasetError",
+        "tupli": "TupliDataset",
+    },
+)
 
 __all__ = [
     "BaseTupleParser",
@@ -64,11 +61,3 @@ __all__ = [
     "open_columns",
     "split_recording",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value

@@ -14,10 +14,10 @@ write/, edit/, check/, sign/  makes recordings; makes them of others; verifies t
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from tupli_mcap.journal.file import journal_path
+from tupli_mcap.lazy import imported_on_use
 from tupli_mcap.recording.about.run import Run
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.episode import Episode, Episodes, Step
@@ -37,19 +37,21 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
 # Imported on first use: recording and reading need none of them.
-_HOMES = {
-    "check.report": "Problem VerifyReport",
-    "check.verify": "verify_recording",
-    "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
-    "edit.made_of": "made_of say_made_of",
-    "edit.merge": "MergeReport merge_recordings",
-    "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
-    "edit.rewrite": "rewrite_recording",
-    "edit.split": "Part split_recording",
-    "edit.trim": "trim_recording",
-    "write.from_values": "EpisodeData write_recording",
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
+__getattr__ = imported_on_use(
+    globals(),
+    {
+        "check.report": "Problem VerifyReport",
+        "check.verify": "verify_recording",
+        "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
+        "edit.made_of": "made_of say_made_of",
+        "edit.merge": "MergeReport merge_recordings",
+        "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
+        "edit.rewrite": "rewrite_recording",
+        "edit.split": "Part split_recording",
+        "edit.trim": "trim_recording",
+        "write.from_values": "EpisodeData write_recording",
+    },
+)
 
 __all__ = [
     "Columns",
@@ -81,11 +83,3 @@ __all__ = [
     "verify_recording",
     "write_recording",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
-    globals()[name] = value
-    return value

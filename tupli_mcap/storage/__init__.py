@@ -16,8 +16,9 @@ atomic, texts    atomic writes, the lock between processes, and the texts in fil
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from tupli_mcap.lazy import imported_on_use
 
 if TYPE_CHECKING:
     from tupli_mcap.storage.api import TupliAPIClient
@@ -26,20 +27,14 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 # Imported on first use: what reads files needs no database and no client.
-_HOMES = {
-    "FileStorage": "files",
-    "TupliAPIClient": "api",
-    "TupliStorage": "base",
-    "TupliStorageError": "base",
-    "storage_at": "at",
-}
+__getattr__ = imported_on_use(
+    globals(),
+    {
+        "api": "TupliAPIClient",
+        "at": "storage_at",
+        "base": "TupliStorage TupliStorageError",
+        "files": "FileStorage",
+    },
+)
 
 __all__ = ["FileStorage", "TupliAPIClient", "TupliStorage", "TupliStorageError", "storage_at"]
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
