@@ -79,10 +79,9 @@ class Contents:
     @property
     def next_episode(self) -> int:
         """The number of the next episode. No number is used twice, not even that of an episode that was left out."""
-        told = self.metadata.get("next_episode", "0")
         numbers = self.index.episodes["episode"]
-        free = max(self.used_episodes, int(numbers.max()) + 1 if len(numbers) else 0)
-        return max(free, int(told)) if re.fullmatch("[0-9]{1,10}", told) else free
+        free = int(numbers.max()) + 1 if len(numbers) else 0
+        return max(free, self.used_episodes, int(self.metadata.get("next_episode") or 0))
 
 
 def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue, signing
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.journal.file import recorded_journal
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
@@ -311,11 +311,7 @@ def nan_text(count: int, episodes: int) -> str:
     """Says for people how many of the episodes have NaN; empty if none has."""
     if not count:
         return ""
-    return (
-        "NaN in every episode"
-        if count == episodes
-        else f"NaN in {count:,} episode{'' if count == 1 else 's'}, left out"
-    )
+    return "NaN in every episode" if count == episodes else f"NaN in {plural(count, 'episode')}, left out"
 
 
 def _channels(contents: Contents) -> list[ChannelFacts]:

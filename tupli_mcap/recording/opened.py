@@ -154,15 +154,7 @@ class OpenedRecording:
         self._cameras = Cameras(contents, self._store, self.is_vector, len(steps), self.name)
         if steps:
             self._layout = StepLayout.from_metadata(steps[0].metadata)
-            description = _spaces_of(steps[0])
-            for channel in steps:
-                self._check_schema(channel, STEP_SCHEMA, self._layout.step_schema)
-                if _spaces_of(channel) != description:
-                    raise FormatError(
-                        f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
-                    )
-            if FINAL_STATE in topics:
-                self._check_schema(topics[FINAL_STATE], FINAL_STATE_SCHEMA, self._layout.final_schema)
+            self._check_schemas(topics, steps, self._layout)
             self._images = {
                 leaf.name: {
                     channel.id: self._topics.get(Topics.of_step(channel.topic).image(leaf.name), 0)
@@ -170,7 +162,6 @@ class OpenedRecording:
                 }
                 for leaf in self._layout.images
             }
-            self._check_others(topics)
             self._store.codecs = image_codecs(self._layout, contents.channels)
             if contents.complete:
                 self._check_sizes(self._layout, rows)
@@ -179,13 +170,25 @@ class OpenedRecording:
             }
             self._columns = ColumnReader(self._layout, self._store, self._images)
 
-    def _check_others(self, topics: Mapping[str, Channel]) -> None:
-        """Checks the schemas of the channels of episodes."""
-        for topic, name, text in (
-            (EPISODE_START, START_NAME, START_SCHEMA), (EPISODE_END, END_NAME, END_SCHEMA),
-        ):  # fmt: skip
-            if topic in topics:
-                self._check_schema(topics[topic], name, text)
+    def _check_schemas(
+        self, topics: Mapping[str, Channel], steps: Sequence[Channel], layout: StepLayout
+    ) -> None:
+        """Checks that the channels have the schemas of the layout, and that all steps have the same spaces."""
+        for channel in steps:
+            if _spaces_of(channel) != _spaces_of(steps[0]):
+                raise FormatError(
+                    f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"
+                )
+        expected = {
+            **{channel.topic: (STEP_SCHEMA, layout.step_schema) for channel in steps},
+            FINAL_STATE: (FINAL_STATE_SCHEMA, layout.final_schema),
+            EPISODE_START: (START_NAME, START_SCHEMA),
+            EPISODE_END: (END_NAME, END_SCHEMA),
+        }
+        for topic, (name, text) in expected.items():
+            schema = self._contents.schemas.get(topics[topic].schema_id) if topic in topics else None
+            if topic in topics and (schema is None or (schema.name, schema.data) != (name, text.encode())):
+                raise FormatError(f"{self.name}: the schema of {topic} is not that of its spaces")
 
     def _check_sizes(self, layout: StepLayout, steps: Sequence[int]) -> None:
         """Checks that the chunks have room for the rows in the index, and that each step has its images."""
@@ -207,11 +210,6 @@ class OpenedRecording:
                     sizes[channel] = (layout.image_messages[leaf.name].dtype.itemsize, True)
         check_rows(self._contents.table, sizes, self.name)
 
-    def _check_schema(self, channel: Channel, name: str, text: str) -> None:
-        schema = self._contents.schemas.get(channel.schema_id)
-        if schema is None or schema.name != name or schema.data != text.encode():
-            raise FormatError(f"{self.name}: the schema of {channel.topic} is not that of its spaces")
-
     # ---- facts
 
     @property
@@ -232,8 +230,7 @@ class OpenedRecording:
     @property
     def created_ns(self) -> int:
         """Wall clock (ns) when the recording was made."""
-        text = self.metadata.get("created_ns", "0")
-        return int(text) if text.isdecimal() and len(text) <= 19 else 0
+        return int(self.metadata["created_ns"])
 
     @property
     def layout(self) -> StepLayout:
