@@ -27,6 +27,7 @@ from tupli_mcap import (
     TupliEnvWrapper,
     recover_recording,
 )
+from tupli_mcap.journal.file import RowArea
 from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.write import writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -215,7 +216,7 @@ def test_a_row_that_was_being_written_over_does_not_pass_for_the_old_one(
     env.reset(seed=1)
     files, journals = {}, {}
     env.step(env.action_space.sample())
-    area = env._writer.journal.row_area("steps")
+    area = env._writer.journal.area("steps", RowArea)
     start, size = env._writer.journal.offsets["steps"], area.row_size
     for n in range(1, 2 * area.rows + 12):
         if n < 12:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea
+from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea, RowArea
 from tupli_mcap.journal.logs import as_rows
 from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
@@ -49,6 +49,11 @@ class Committed(Protocol[Taken_co]):
         """Copies of consecutive rows, given by their places in `numbers`."""
         ...
 
+    @property
+    def end(self) -> int:
+        """The number after that of the last committed row; 0 if there is none."""
+        return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
+
 
 def rows_of(committed: Committed[Taken], in_file: int, stop: int | None = None) -> Taken | None:
     """Applies the reader's rule to a channel that has `in_file` rows in the file.
@@ -82,7 +87,7 @@ def rows_among(committed: Committed[Taken], wanted: Array) -> list[Taken]:
     return [committed.take(part) for part in np.split(places, edges) if len(part)]
 
 
-class CommittedRows:
+class CommittedRows(Committed[Array]):
     """The committed rows of one channel in an area of rows, in both halves.
 
     In a torn journal, a row is whole if its checksum is right. Without checksums it is whole if the disk has something
@@ -102,7 +107,7 @@ class CommittedRows:
         *,
         rewritten: bool = False,
     ) -> None:
-        area = journal.row_area(name)
+        area = journal.area(name, RowArea)
         shape = (2, area.channels, area.rows + 1, area.row_size)
         if area.row_size != dtype.itemsize or journal.data[name].size != np.prod(shape):
             raise FormatError(
@@ -132,11 +137,6 @@ class CommittedRows:
         """Copies of the rows at `places`. They are copied as bytes: NumPy may not copy the padding between fields."""
         copies: Array = self._bytes[self._halves[places], self._places[places]].view(self.rows.dtype)[:, 0]
         return copies
-
-    @property
-    def end(self) -> int:
-        """The number after that of the last committed row; 0 if there is none."""
-        return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
 
     def row(self, sequence: int) -> Array | None:
         """The committed row with `sequence`; None if it is missing or torn."""
@@ -220,7 +220,7 @@ class CommittedRows:
         return bool(later and hole["episode"] == row["episode"] and (row["terminal"] or row["timeout"]))
 
 
-class CommittedRecords:
+class CommittedRecords(Committed[Rows]):
     """The committed records of one channel in a log, in the order of `numbers`."""
 
     def __init__(self, channel: int, records: Mapping[int, bytes]) -> None:
@@ -236,11 +236,6 @@ class CommittedRecords:
         first = int(self.numbers[places[0]])
         return as_rows(self._channel, first, bytearray().join(chosen), sizes, sealed=True)
 
-    @property
-    def end(self) -> int:
-        """The number after that of the last committed record; 0 if there is none."""
-        return int(self.numbers[-1]) + 1 if len(self.numbers) else 0
-
 
 def committed_records(
     journal: JournalContents, name: str, in_file: Mapping[int, int] | None = None
@@ -250,7 +245,7 @@ def committed_records(
     A half is read up to a record whose checksum is wrong.
     """
     found: dict[int, dict[int, bytes]] = {}
-    area = journal.log_area(name)
+    area = journal.area(name, LogArea)
     for half in range(area.halves):
         data = _half(journal, area, half)
         for start, end, channel, sequence, _ in _whole_records(journal, data, in_file or {}):
@@ -276,7 +271,7 @@ def _whole_records(
 
 def size_behind(journal: JournalContents) -> int:
     """Size of the file (bytes) after the log of events last went into it; 0 if the journal does not say."""
-    return int(journal.data[journal.log_area("events").name][8:16].view("<u8")[0])
+    return int(journal.data[journal.area("events", LogArea).name][8:16].view("<u8")[0])
 
 
 def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
@@ -291,7 +286,7 @@ def _half(contents: JournalContents, area: LogArea, half: int) -> memoryview:
 def running_record(contents: JournalContents, name: str, sequence: int, layout: StepLayout) -> bytes | None:
     """The state (CDR bytes after `episode` and `env`) of the running record, which will have `sequence`; None if it is
     not here."""
-    area = contents.log_area(name)
+    area = contents.area(name, LogArea)
     for half in range(area.halves):
         start = half * area.half + LOG_HEADER + len(_half(contents, area, half))
         raw = memoryview(contents.data[area.name].data)[start : (half + 1) * area.half]

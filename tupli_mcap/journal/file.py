@@ -21,7 +21,7 @@ import struct
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 from uuid import uuid4
 
 import numpy as np
@@ -123,6 +123,7 @@ class LogArea(NamedTuple):
 
 
 Area = RowArea | LogArea
+A = TypeVar("A", RowArea, LogArea)
 
 
 def _aligned(n: int) -> int:
@@ -177,18 +178,11 @@ class Journal:
         start = self.offsets[name]
         return memoryview(self._map)[start : start + self.areas[name].size]
 
-    def row_area(self, name: str) -> RowArea:
-        """The area `name`, which holds rows."""
+    def area(self, name: str, kind: type[A]) -> A:
+        """The area `name`, of the kind that the caller has planned."""
         area = self.areas[name]
-        if not isinstance(area, RowArea):
-            raise TypeError(f"the area {name!r} holds records, not rows")
-        return area
-
-    def log_area(self, name: str) -> LogArea:
-        """The area `name`, which holds records of variable size."""
-        area = self.areas[name]
-        if not isinstance(area, LogArea):
-            raise TypeError(f"the area {name!r} holds rows, not records")
+        if not isinstance(area, kind):
+            raise TypeError(f"expected the area {name!r} to be a {kind.__name__}, found {area!r}")
         return area
 
     def sync(self) -> None:
@@ -297,18 +291,12 @@ class JournalContents(NamedTuple):
     areas: dict[str, Area]
     data: dict[str, np.ndarray[Any, np.dtype[np.uint8]]]
 
-    def row_area(self, name: str) -> RowArea:
-        """The area `name`; raises FormatError if there is none, or if it holds records."""
+    def area(self, name: str, kind: type[A]) -> A:
+        """The area `name`; raises FormatError if there is none of this kind."""
         area = self.areas.get(name)
-        if not isinstance(area, RowArea):
-            raise FormatError(f"expected an area of rows {name!r} in the journal, found none")
-        return area
-
-    def log_area(self, name: str) -> LogArea:
-        """The area `name`; raises FormatError if there is none, or if it holds rows."""
-        area = self.areas.get(name)
-        if not isinstance(area, LogArea):
-            raise FormatError(f"expected an area of records {name!r} in the journal, found none")
+        if not isinstance(area, kind):
+            what = "rows" if kind is RowArea else "records"
+            raise FormatError(f"expected an area of {what} {name!r} in the journal, found none")
         return area
 
     @property

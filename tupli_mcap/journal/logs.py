@@ -14,7 +14,7 @@ from zlib import crc32
 
 import numpy as np
 
-from tupli_mcap.journal.file import LOG_HEADER, Journal
+from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 
@@ -100,7 +100,7 @@ class EventLog:
 
     def move(self, journal: Journal, name: str) -> None:
         """Goes on in the area `name` of another journal. All records must be in the file."""
-        area, buffer = journal.log_area(name), journal.buffer(name)
+        area, buffer = journal.area(name, LogArea), journal.buffer(name)
         self._records = buffer[LOG_HEADER : LOG_HEADER + area.capacity]
         self._commit, self._behind = buffer[:8].cast("Q"), buffer[8:16].cast("Q")
         self._capacity = area.capacity

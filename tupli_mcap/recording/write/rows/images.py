@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.seals import seal
 from tupli_mcap.mcap.container import Rows
@@ -62,7 +62,7 @@ class ImageRows:
     def move(self, journal: Journal, name: str) -> None:
         """Goes on in the area `name` of another journal, with the rows before the running one in the file."""
         running = self._rows[self._half, self._row].copy() if hasattr(self, "_rows") else None
-        self._area = area = journal.row_area(name)
+        self._area = area = journal.area(name, RowArea)
         buffer = journal.buffer(name)
         self._full, self._row_size = area.rows, area.row_size
         self._buffer = buffer

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeDeriver, RowDeriver, StartedEpisode, even_rows
-from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import Sink
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.records import BODY
@@ -48,7 +48,7 @@ class SingleRows:
         self._sealed = sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
-        self._area = area = journal.row_area(name)
+        self._area = area = journal.area(name, RowArea)
         self._buffer = buffer = journal.buffer(name)
         rows: Array = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
         self._rows = rows[:, block]

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
-from tupli_mcap.journal.file import LOG_HEADER, Journal
+from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.journal.logs import FRONT, Sink, as_rows, group_records
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
@@ -122,7 +122,7 @@ class StepLog:
 
     def move(self, journal: Journal, name: str) -> None:
         """Goes on in the area `name` of another journal, with everything committed in the file."""
-        self._area = area = journal.log_area(name)
+        self._area = area = journal.area(name, LogArea)
         buffer = journal.buffer(name)
         self._records = [buffer[h * area.half + LOG_HEADER : (h + 1) * area.half] for h in range(2)]
         self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]

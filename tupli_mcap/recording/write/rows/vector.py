@@ -16,7 +16,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
-from tupli_mcap.journal.file import Journal
+from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.seals import STATE, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
@@ -67,7 +67,7 @@ class VectorRows:
     ) -> None:
         self._durable, self._sealed = durable, sealed
         self._layout = layout
-        self._area = area = journal.row_area(name)
+        self._area = area = journal.area(name, RowArea)
         self._buffer = journal.buffer(name)
         self._start_chunks = start_chunks
         self._images = list(zip(images, layout.images, strict=True))
