@@ -90,6 +90,30 @@ def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
         film(episodes, tmp_path / "c.gif", camera="front")
 
 
+def test_some_pictures_of_a_size(tmp_path: Path) -> None:
+    recording = Recording(record(tmp_path / "r.mcap", Camera(), frames=True))
+    episodes = list(recording.episodes)
+    assert film(episodes, tmp_path / "a.gif", every=3).pictures == 6
+    np.testing.assert_allclose(shown(tmp_path / "a.gif"), [0, 30, 50] * 2, atol=3)
+    film(episodes, tmp_path / "b.gif", width=40)
+    sizes = []
+    for name in ("a.gif", "b.gif"):
+        with Image.open(tmp_path / name) as image:
+            sizes.append(image.size)
+    assert sizes[0][0] >= 240 and sizes[0][0] % recording.frames(0)[0].shape[1] == 0
+    assert sizes[1][0] == 40
+    for wrong in ({"every": 0}, {"width": 0}):
+        with pytest.raises(RecordingError, match="expected every >= 1 and a width"):
+            film(episodes, tmp_path / "c.gif", **wrong)  # type: ignore[arg-type]
+    words = ["render", str(tmp_path / "r.mcap"), "-e", "all", "--width", "40", "--every", "3"]
+    told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "d.gif"), "--camera", "state['wrist']"])
+    assert "d.gif: 6 recorded pictures" in told.output
+    with Image.open(tmp_path / "d.gif") as image:
+        assert image.size[0] == 40
+    told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "e.gif"), "--camera", "front"])
+    assert (told.exit_code, "it has render, state" in told.output) == (1, True)
+
+
 @pytest.mark.parametrize("target", [None, "film.mp4", "film.gif"])
 def test_a_notebook_shows_it(target: str | None, tmp_path: Path) -> None:
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[0]

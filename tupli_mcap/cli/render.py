@@ -33,6 +33,13 @@ _Source = Annotated[
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]
 _Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Width of the frames, in pixels.")]
+_Camera = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Which recorded pictures, if there are several: a camera, or an image such as \"state['wrist']\".",
+    ),
+]
 _FrameFormat = Annotated[
     Literal["png", "jpeg"], typer.Option("--format", help="Format of the frames in a .mcap; png is exact.")
 ]
@@ -51,6 +58,7 @@ def render(
     filter_text: FilterText = None,
     every: _Every = 1,
     width: _Width = None,
+    camera: _Camera = None,
     frame_format: _FrameFormat = "png",
     trust: _Trust = False,
     rerun: _Rerun = False,
@@ -81,9 +89,13 @@ def render(
         _chosen(source, episodes or "best", filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
-        if output.suffix.lower() != ".mcap" and not rerun and all(map(has_pictures, chosen)):
-            _print_film(output, film(chosen, output, overwrite=force).pictures, as_json=as_json)
+        recorded = output.suffix.lower() != ".mcap" and not rerun
+        if recorded and (camera is not None or all(map(has_pictures, chosen))):
+            made = film(chosen, output, camera=camera, every=every, width=width, overwrite=force)
+            _print_film(output, made.pictures, as_json=as_json)
             return
+        if camera is not None:
+            raise typer.BadParameter("--camera is for recorded pictures; leave it out to run episodes again")
         report = render(
             recording,
             output,

@@ -288,6 +288,8 @@ class Episode(GymnasiumNames):
         *,
         camera: str | None = None,
         fps: float | None = None,
+        every: int = 1,
+        width: int | None = None,
         overwrite: bool = False,
     ) -> Film:
         """A film of recorded pictures (frames, or an image of the states), which a notebook shows; nothing is executed.
@@ -296,7 +298,7 @@ class Episode(GymnasiumNames):
         """
         from tupli_mcap.replay import film
 
-        return film([self], target, camera=camera, fps=fps, overwrite=overwrite)
+        return film([self], target, camera=camera, fps=fps, every=every, width=width, overwrite=overwrite)
 
     @cached_property
     def frames(self) -> Frames:

@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.messages.images.pictures import Picture
+from tupli_mcap.messages.images.pictures import Picture, resized
 from tupli_mcap.recording import Episode
 from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.replay.movie import check_movie, write_movie
@@ -21,6 +21,7 @@ from tupli_mcap.spaces.leaves import Leaf
 
 _KINDS = (".mp4", ".gif")
 _FPS = 30.0
+_SMALL = 240  # pixels of the longer side: what is smaller can hardly be seen, and its colours blur in an MP4
 _BLOCK = 256  # most states in memory at a time
 
 
@@ -56,6 +57,8 @@ def film(
     *,
     camera: str | None = None,
     fps: float | None = None,
+    every: int = 1,
+    width: int | None = None,
     overwrite: bool = False,
 ) -> Film:
     """Make a film of the recorded pictures of episodes, one episode after another.
@@ -64,7 +67,9 @@ def film(
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
         camera: a camera, or the path of an image in the states, such as `state['wrist']`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
-        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30.
+        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`.
+        every: only every n-th picture of an episode, and its last one.
+        width: of the film (pixels). By default as recorded; small pictures become larger, by a whole number.
 
     Raises:
         RecordingError: an episode has no such pictures, the target exists (without `overwrite`), or cannot be written.
@@ -72,12 +77,23 @@ def film(
     """
     with tempfile.TemporaryDirectory() as folder:
         goal = Path(folder) / "film.mp4" if target is None else Path(target)
-        count = _write(episodes, goal, camera, fps, overwrite=overwrite)
+        if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
+            raise RecordingError(
+                f"expected every >= 1 and a width of 1 to 16384, found {every!r:.40} and {width!r:.40}"
+            )
+        count = _write(episodes, goal, camera, fps, every, width, overwrite=overwrite)
         return Film(count, goal.suffix.lower(), None if target is None else goal, goal.read_bytes())
 
 
 def _write(
-    episodes: Sequence[Episode], goal: Path, camera: str | None, fps: float | None, *, overwrite: bool
+    episodes: Sequence[Episode],
+    goal: Path,
+    camera: str | None,
+    fps: float | None,
+    every: int,
+    width: int | None,
+    *,
+    overwrite: bool,
 ) -> int:
     """Returns how many pictures there are."""
     kind = goal.suffix.lower()
@@ -94,12 +110,25 @@ def _write(
         raise RecordingError("expected episodes to film, found none")
     recording = episodes[0].recording
     parts = [_pictures(episode, camera) for episode in episodes]
-    count = sum(number for number, _ in parts)
+    count = sum(-(-(number - 1) // every) + 1 for number, _ in parts)
     seconds = recording.labels.step_seconds
-    pictures = (picture for _, drawn in parts for picture in drawn)
+    pictures = (
+        _scaled(picture, width)
+        for number, drawn in parts
+        for i, picture in enumerate(drawn)
+        if i % every == 0 or i == number - 1
+    )
     with replacing(goal) as (_, path):
-        write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS))
+        write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS) / every)
     return count
+
+
+def _scaled(picture: Picture, width: int | None) -> Picture:
+    """The picture as wide as wanted; a small one as large as `_SMALL`, with sharp pixels."""
+    if width is not None:
+        return resized(picture, width)
+    times = -(-_SMALL // max(picture.shape[:2]))
+    return picture.repeat(times, axis=0).repeat(times, axis=1) if times > 1 else picture
 
 
 def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Picture]]:
