@@ -1,10 +1,11 @@
 """Sends a server requests that its OpenAPI document allows, and others, as users of each role.
 
-    python tools/server_fuzz.py --examples 200 --seed 1 --engine postgresql
+    python tools/server_fuzz.py --examples 200 --seed 1 --engine postgresql [--role admin | --role each]
 
 Schemathesis makes the requests from the document; tests/page_fuzz.py draws requests to pages and their forms. Half of
 them use names and ids of existing items instead of made-up ones, so that they get further than "there is no such
-thing". A random user sends each. Findings are:
+thing". A random user sends each request; with `--role`, a user of that role sends all, or one of each role in turn.
+Findings are:
 
 - a failure of the server: a status of 500 or more, except a full quota (507);
 - an answer that the document does not describe: its status, its media type or its JSON;
@@ -25,7 +26,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -215,17 +216,17 @@ class Fuzzer:
         self.statuses: Counter[str] = Counter()
         self.findings: dict[str, str] = {}
 
-    def run(self, examples: int, only: str = "") -> None:
-        """Sends requests to each route, or only to one, such as `GET /v1/me`."""
+    def run(self, examples: int, only: str = "", roles: Sequence[str] = ROLES) -> None:
+        """Sends requests to each route, or only to one, such as `GET /v1/me`. roles: of the users who send them."""
         names: dict[str, list[Any]] = {}
         for number, found in enumerate(self.schema.get_all_operations()):
             if number % _RENEWED_EVERY == 0:
                 names = self._stock.renew()
             if only in ("", found.ok().label):
-                self._ask(found.ok(), names, examples)
+                self._ask(found.ok(), names, examples, roles)
 
-    def run_pages(self, examples: int, only: str = "") -> None:
-        """Gets each page and sends each form, or only those of one path."""
+    def run_pages(self, examples: int, only: str = "", roles: Sequence[str] = ROLES) -> None:
+        """Gets each page and sends each form, or only those of one path. roles: see `run`."""
         for number, route in enumerate(page_routes()):
             if number % _RENEWED_EVERY == 0:
                 names = self._stock.renew()
@@ -233,17 +234,17 @@ class Fuzzer:
                 known = {**names, "key": keys, "dataset": keys, "uri": episodes, "uris": episodes}
                 known |= {"filter": _TEXTS, "name": names["group"]}
             if only in ("", route.path):
-                self._ask_page(route, known, examples)
+                self._ask_page(route, known, examples, roles)
 
-    def _ask_page(self, route: Any, known: dict[str, list[Any]], examples: int) -> None:
+    def _ask_page(self, route: Any, known: dict[str, list[Any]], examples: int, roles: Sequence[str]) -> None:
         rng = random.Random(f"{self._seed} {route.methods} {route.path}")
         with contextlib.ExitStack() as stack:
             browsers = {
                 role: stack.enter_context(Browser(self._url, person.name))
                 for role, person in self._stock.askers.items()
-                if role != "reader"  # a token, which no page takes
+                if role in roles and role != "reader"  # a token, which no page takes
             }
-            for _ in range(examples):
+            for _ in range(examples if browsers else 0):
                 role = rng.choice(list(browsers))
                 answer = browsers[role].ask(route, known, rng)
                 self.statuses[f"page {answer.status_code}"] += 1
@@ -252,7 +253,7 @@ class Fuzzer:
                     told = f"as {role or 'nobody'}: {sent[:1500]}\n    {answer.content[:500]!r}"
                     self.findings.setdefault(f"{route.path}: {what}", told)
 
-    def _ask(self, operation: Any, names: dict[str, list[Any]], examples: int) -> None:
+    def _ask(self, operation: Any, names: dict[str, list[Any]], examples: int, roles: Sequence[str]) -> None:
         rng = random.Random(f"{self._seed} {operation.label}")
         known = Known(names, rng)
         modes = [operation.as_strategy(generation_mode=mode) for mode in GenerationMode]
@@ -266,7 +267,7 @@ class Fuzzer:
         @hypothesis.given(case=cases)
         def ask(case: Any) -> None:
             known.put(case)
-            role = rng.choice(ROLES)
+            role = rng.choice(roles)
             headers = self._stock.askers[role].headers
             answer = case.call(self._url, self.session, headers=headers, timeout=120, allow_redirects=False)
             self._judge(case, role, answer)
@@ -305,6 +306,13 @@ def fuzzer(engine: str, folder: Path, seed: int, *, guests: bool = True) -> Iter
             yield made
 
 
+def _turns(role: str | None) -> list[Sequence[str]]:
+    """The roles of those who send requests at the same time, one group after another."""
+    if role is None:
+        return [ROLES]
+    return [[name] for name in ROLES] if role == "each" else [["" if role == "nobody" else role]]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -312,14 +320,16 @@ def main() -> None:
     parser.add_argument("--engine", choices=ENGINES, default="sqlite")
     parser.add_argument("--examples", type=int, default=100, help="requests to each route")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--role", choices=("each", "nobody", *ROLES[1:]), help="who sends all requests")
     parser.add_argument("--no-guests", action="store_true", help="who is not signed in is shown nothing")
     chosen = parser.parse_args()
     with (
         tempfile.TemporaryDirectory() as folder,
         fuzzer(chosen.engine, Path(folder), chosen.seed, guests=not chosen.no_guests) as made,
     ):
-        made.run(chosen.examples)
-        made.run_pages(chosen.examples)
+        for roles in _turns(chosen.role):
+            made.run(chosen.examples, roles=roles)
+            made.run_pages(chosen.examples, roles=roles)
     for what, first in made.findings.items():
         print(f"{what}\n    {first}\n")
     print(f"{made.statuses.total()} requests, {json.dumps(dict(made.statuses.most_common()))}")
