@@ -39,16 +39,18 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 import jwt
+import numpy as np
 import psutil
 import pytest
 import zstandard
 from crafted import Model
+from gymnasium import spaces
 from pages import EVIL, robot
-from persons import Person, announced
+from persons import Person, announced, cart_benchmark
 from served import served
 from serving import ENGINES, serving, settings_of
 
-from tupli_mcap import Recording
+from tupli_mcap import EpisodeWriter, Recording
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
@@ -534,6 +536,42 @@ class TestSizes:
                 assert sorted(pool.map(store, range(8))) == [200, *[507] * 7]
             assert eve.ask("GET", "/v1/me")["used"] == 900_000
         assert len(list((tmp_path / "served" / "artifacts").iterdir())) == 1
+
+    def test_a_quota_holds_for_episodes_at_once(self, tmp_path: Path) -> None:
+        with serving(Settings(tmp_path / "served")) as url:
+            (eve,) = people(admin := Person(url, "admin"), "eve")
+            benchmark = eve.ask("POST", "/v1/benchmarks", cart_benchmark())["id"]
+            step = {"state": [0.0] * 4, "action": 0, "reward": 1.0}
+            told = {"benchmark_id": benchmark, "metadata": {}, "tuples": [{**step, "terminal": True}]}
+
+            def record(_: object) -> int:
+                return eve.call("POST", "/episodes/record", told).status_code
+
+            used = eve.ask("GET", "/v1/me")["used"]
+            assert record(None) == 200
+            size = eve.ask("GET", "/v1/me")["used"] - used
+            quota = {"bytes": used + 2 * size + size // 2}
+            admin.ask("PUT", "/v1/users/eve/quota", quota)
+            with ThreadPoolExecutor(8) as pool:
+                assert sorted(pool.map(record, range(8))) == [200, *[507] * 7]
+            assert eve.ask("GET", "/v1/me")["used"] <= quota["bytes"]
+            assert eve.ask("POST", "/v1/episodes/count", {}) == 2
+        assert len(list((tmp_path / "served" / "recordings").rglob("*.mcap"))) == 2
+
+    def test_long_metadata_of_episodes_and_runs(self, lab: Lab, tmp_path: Path) -> None:
+        """A list holds the metadata of a thousand episodes, and the facts of the run of each."""
+        box, long = spaces.Box(-1, 1, (1,)), {"text": "x" * 70_000}
+        for kind in ("episode", "run"):
+            path = tmp_path / f"{kind}.mcap"
+            of_run = long if kind == "run" else None
+            with EpisodeWriter(path, box, spaces.Discrete(2), metadata=of_run) as writer:
+                writer.begin(metadata=long if kind == "episode" else {})
+                writer.step(np.zeros(1, np.float32), 0, reward=1.0, terminal=True)
+                writer.end(np.zeros(1, np.float32))
+            begun = lab.eve.begin(path.read_bytes())
+            told = {"headers": {"Upload-Offset": "0"}, "content": path.read_bytes()}
+            refused = lab.eve.call("PATCH", begun.headers["Location"], **told)
+            assert refused.status_code == 413 and "at most 65536 characters" in refused.text, kind
 
     def test_a_head_without_an_end(self, lab: Lab) -> None:
         parts = urlsplit(lab.url)

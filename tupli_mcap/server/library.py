@@ -197,7 +197,7 @@ class Library:
             incoming.verify()
             with self.database.reading() as connection:
                 known = arrivals.stored_already(connection, caller, upload.digest)
-            name = known or self._keep(caller, upload.path, upload.digest, upload.sent_before)
+            name = known or self._keep(caller, upload.path, upload.digest, sent_before=upload.sent_before)
         except UnavailableError:
             raise
         except TupliError:
@@ -228,16 +228,20 @@ class Library:
             write_episodes(path, [episode], benchmark)
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
-            with self.database.reading() as connection:
-                quotas.demand_room(connection, self.settings, caller, path.stat().st_size)
-            return self._keep(caller, path, digest)
+            return self._keep(caller, path, digest, room=path.stat().st_size)
 
-    def _keep(self, caller: Caller, path: Path, digest: str, sent_before: int = 0) -> str:
-        """Moves a recording to the blobs, and catalogs its episodes; returns its name."""
+    def _keep(self, caller: Caller, path: Path, digest: str, *, sent_before: int = 0, room: int = 0) -> str:
+        """Moves a recording to the blobs, and catalogs its episodes; returns its name.
+
+        room: the bytes for which the caller's quota needs room; that of an upload is counted already.
+        """
         with Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
+            arrivals.demand_short(recording)
             with self.database.writing() as connection:
+                if room:
+                    quotas.demand_room(connection, self.settings, caller, room)
                 # before it becomes part of a path: an id in a file may hold anything
                 arrivals.demand_benchmark(connection, caller, recording.benchmark_id)
                 place = arrivals.new_place(recording.benchmark_id)
@@ -246,6 +250,8 @@ class Library:
                 self.blobs.keep(place, path)
                 with self.database.writing() as connection:
                     demand_pending(connection, place)
+                    if room:  # once more: what the user has sent at the same time may have taken it
+                        quotas.demand_room(connection, self.settings, caller, room)
                     name, replaced = arrivals.register(
                         connection, caller, recording, place, digest, sent_before=sent_before
                     )

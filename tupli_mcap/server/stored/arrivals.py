@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 from sqlalchemy import Connection, insert, select
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.server.database import audience, audit, settle
@@ -18,6 +19,7 @@ from tupli_mcap.server.people.access import Caller, Right, readable
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.stored.episodes import forget, whole_name
 from tupli_mcap.server.tables import CLAIM, FILE, ITEM
+from tupli_mcap.server.uploads import TooLargeError
 from tupli_mcap.storage.base import new_name
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of
@@ -26,8 +28,9 @@ from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = ["demand_benchmark", "new_place", "register", "stored_already"]
+__all__ = ["demand_benchmark", "demand_short", "new_place", "register", "stored_already"]
 
+_MOST_METADATA: Final = 64 << 10  # characters of JSON
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
 
 
@@ -41,6 +44,22 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
         raise NotFoundError(
             f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
         )
+
+
+def demand_short(recording: Recording) -> None:
+    """Raises TooLargeError for long metadata of an episode or a run: they are in everybody's lists, a run's with each
+    of its episodes."""
+    numbers = recording.index["episode"].tolist()
+    texts = [
+        *zip((f"episode {number}" for number in numbers), recording.all_metadata(), strict=True),
+        *(("a run", jsonvalue.dumps(run)) for run in jsonvalue.loads(runs_of(recording))),
+    ]
+    for what, text in texts:
+        if len(text) > _MOST_METADATA:
+            raise TooLargeError(
+                f"expected metadata of {what} of at most {_MOST_METADATA} characters of JSON, found {len(text)}; "
+                "record large values as infos, or store an artifact"
+            )
 
 
 def new_place(benchmark_id: str) -> str:
