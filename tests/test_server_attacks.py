@@ -5,6 +5,7 @@ tokens: forged, expired, of the wrong type          test_server.test_forged_toke
     used twice, guessed                             test_server (refresh tokens; passwords are throttled)
 every id of somebody else                           test_server_access, test_server (what_may_not_be_read_is_not_there)
 rights that one has not: given, taken, taken over   TestRights, test_server.test_nobody_gives_rights_that_they_lack
+names, keys and tokens that one user uses up         TestShares
 injection: SQL by ids, keys, filters, names, orders TestInjection
     paths, headers, log lines, terminal escapes     TestInjection
 numbers and texts that no database can hold         TestInjection
@@ -215,6 +216,36 @@ class TestRights:
         ]
         assert {each.status_code for each in tries} == {403}
         assert lab.admin.call("GET", "/v1/roles").status_code == 200
+
+
+class TestShares:
+    """What all users share: names, and indexes of keys. One user leaves enough for the others."""
+
+    def test_names_of_groups(self, lab: Lab) -> None:
+        made = [lab.eve.call("POST", "/v1/groups", {"name": f"squat{i}"}).status_code for i in range(100)]
+        assert made.count(200) > 90  # she may have made some before
+        for name in ("squat0", "squat1"):  # whose names stay taken
+            lab.eve.ask("DELETE", f"/v1/groups/{name}")
+        for path in ("/v1/groups", "/access/groups/create"):
+            refused = lab.eve.call("POST", path, {"name": "robots"})
+            assert refused.status_code == 400 and "at most 100 times create_group by eve" in refused.text
+        lab.ann.ask("POST", "/v1/groups", {"name": "robots"})
+
+    def test_declared_keys(self, lab: Lab) -> None:
+        for i in range(10):
+            lab.eve.ask("POST", "/v1/episodes/keys", {"key": f"metadata.squat{i}"})
+        refused = lab.eve.call("POST", "/v1/episodes/keys", {"key": "metadata.more"})
+        assert refused.status_code == 400 and "at most 10 times declare_key by eve" in refused.text
+        lab.eve.ask("POST", "/v1/episodes/keys", {"key": "metadata.squat3"})  # which is there
+        for person in (lab.ann, lab.admin):
+            person.ask("POST", "/v1/episodes/keys", {"key": f"metadata.of_{person.name}"})
+
+    def test_tokens_for_machines(self, lab: Lab) -> None:
+        made = [lab.eve.call("POST", "/v1/api-tokens", {"name": "robot"}) for _ in range(101)]
+        assert made[-1].status_code == 400 and "at most 100 tokens of eve" in made[-1].text
+        for each in made[:100]:
+            if each.status_code == 200:
+                lab.eve.ask("DELETE", f"/v1/api-tokens/{each.json()['id']}")
 
 
 class TestInjection:

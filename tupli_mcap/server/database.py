@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, delete, event, insert, select
+from sqlalchemy import Connection, Engine, create_engine, delete, event, func, insert, select
 from sqlalchemy.exc import (
     DataError,
     DBAPIError,
@@ -32,6 +32,7 @@ __all__ = [
     "UnavailableError",
     "audience",
     "audit",
+    "demand_few",
     "demand_pending",
     "pend",
     "pending",
@@ -124,6 +125,16 @@ def audit(connection: Connection, user: str, action: str, target: str) -> None:
     """Logs a change by a user in the audit table."""
     row = {"time": int(time.time()), "user": user, "action": action, "target": escape_text(target[:500])}
     connection.execute(insert(tables.AUDIT).values(**row))
+
+
+def demand_few(connection: Connection, user: str, action: str, most: int) -> None:
+    """Raises StorageError if a user has logged so many changes of one kind, of which all users share what there is."""
+    table = tables.AUDIT
+    done = select(func.count()).where(table.c.user == user, table.c.action == action)
+    if connection.execute(done).scalar_one() >= most:
+        raise StorageError(
+            f"expected at most {most} times {action} by {user}, who has done that; ask an admin to do it"
+        )
 
 
 def pend(connection: Connection, name: str) -> None:

@@ -182,4 +182,5 @@ AUDIT: Final = Table(
     Column("user", TEXT, nullable=False),
     Column("action", TEXT, nullable=False),
     Column("target", TEXT, nullable=False),
+    Index("ix_audit_user_action", "user", "action"),
 )

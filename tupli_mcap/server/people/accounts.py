@@ -13,7 +13,7 @@ from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import Connection, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.server.database import audit
+from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError, Right
 from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
 
@@ -50,6 +50,7 @@ _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
 _MOST_PASSWORD: Final = 1024
 _MOST_DESCRIPTION: Final = 1000
+_MOST_GROUPS: Final = 100  # of a user, with those that are deleted: names cannot be used again
 
 
 class ConflictError(StorageError):
@@ -192,8 +193,11 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
 
     Raises:
         ConflictError: a user or a group has or had this name.
+        StorageError: the name is not valid, or the caller has created too many groups.
     """
     caller.demand(Right.GROUP_CREATE)
+    if not caller.may(Right.ROLE_MANAGEMENT):
+        demand_few(connection, caller.name, "create_group", _MOST_GROUPS)
     _demand_short(description)
     if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name):
         raise StorageError(

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import jwt
-from sqlalchemy import Connection, delete, insert, or_, select, update
+from sqlalchemy import Connection, delete, func, insert, or_, select, update
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
@@ -30,6 +30,7 @@ __all__ = ["SignInError", "Tokens"]
 
 _API_PREFIX: Final = "tmcap_"
 _ALGORITHM: Final = "HS256"
+_MOST_API_TOKENS: Final = 100  # of a user
 
 
 class SignInError(TupliError):
@@ -133,6 +134,9 @@ class Tokens:
         """A new token for a machine: its listed fields, and the `token` itself, which is not stored."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
+        own = select(func.count()).select_from(API_TOKEN).where(API_TOKEN.c.user == caller.name)
+        if connection.execute(own).scalar_one() >= _MOST_API_TOKENS:
+            raise StorageError(f"expected at most {_MOST_API_TOKENS} tokens of {caller.name}; revoke some")
         token, number = _API_PREFIX + secrets.token_urlsafe(32), secrets.token_hex(8)
         now = int(time.time())
         expires = None if days is None else now + days * 24 * 3600

@@ -11,6 +11,8 @@ from pydantic import BaseModel, Field
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ
+from tupli_mcap.server.database import audit, demand_few
+from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
@@ -21,7 +23,7 @@ __all__ = ["router"]
 
 router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
 _LONGEST_KEY = 200
-_MOST_KEYS = 100  # each is a row for every episode that has it
+_MOST_KEYS, _MOST_KEYS_OF_A_USER = 100, 10  # each is a row for every episode that has it
 
 
 class Chosen(BaseModel):
@@ -86,11 +88,16 @@ def declare_key(library: Served, caller: Writer, told: Key) -> None:
     """Makes an index for a key of metadata, so that filters on it are fast."""
     with library.database.writing() as connection:
         known = queries.declared_keys(connection)
-        if told.key not in known and len(known) >= _MOST_KEYS:
+        if told.key in known:
+            return
+        if len(known) >= _MOST_KEYS:
             raise StorageError(
                 f"expected at most {_MOST_KEYS} keys that are declared; filter without this one"
             )
+        if not caller.may(Right.ROLE_MANAGEMENT):
+            demand_few(connection, caller.name, "declare_key", _MOST_KEYS_OF_A_USER)
         queries.declare_key(connection, told.key)
+        audit(connection, caller.name, "declare_key", told.key)
 
 
 @router.delete("/{uri}")
