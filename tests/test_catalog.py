@@ -295,7 +295,6 @@ class TestOrder:
         """By an index that names few; through the next episodes; by several indexes; by nothing of the kind."""
         for name, value in {
             "_FEW": few,
-            "_FEW_TO_SORT": few,
             "_NEAR": 9,
             "_MOST": 50,
             "_RECORDINGS": 1,
@@ -333,7 +332,7 @@ class TestOrder:
     def test_a_sorted_page_walks_an_index(
         self, catalog: Catalog, monkeypatch: pytest.MonkeyPatch, key: str, index: str
     ) -> None:
-        monkeypatch.setattr(pages, "_FEW_TO_SORT", 0)
+        monkeypatch.setattr(pages, "_FEW", 0)
         put(catalog, "a.mcap", [row(i, {"score": i}, episode_return=float(i)) for i in range(500)])
         catalog.declare_key("metadata.score")
         with catalog._read() as connection:

@@ -9,7 +9,7 @@ entries             reads the entry of a recording, here or in other processes
 rows                episodes as rows
 filter_sql          turns filters into SQL that finds all candidates; Python checks them again
 compare_sql         turns one comparison into SQL
-metadata_sql        looks into metadata with SQL
+metadata_sql        SQL that differs between databases: a look into metadata, one of many ids
 order               the order of episodes, and the condition for the next page
 tallies             sums over the episodes of each recording
 """

@@ -3,7 +3,7 @@
 Python looks again at rows of which SQL is not sure (`tupli_mcap.schema.predicate`), so that a filter means the same
 everywhere.
 
-Everything is SQL of any database, but looking into metadata without a declared key is not: see `metadata_sql`.
+Everything is SQL of any database, but for what is in `metadata_sql`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from sqlalchemy import (
     Select,
     Subquery,
     and_,
+    case,
     exists,
     false,
+    func,
     or_,
     select,
     true,
@@ -52,10 +54,13 @@ _MOST_COMPARISONS: Final = 64  # in a statement: databases limit them
 _NOT_INDEXED: Final = (FilterType.NE, FilterType.CONTAINS)
 
 
-def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
+def narrowed(
+    filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], *, by_index: bool = True
+) -> Narrowed:
     """The condition on rows of `EPISODE` joined with `RECORDING` of a filter that is `bound` to episode headers.
 
-    `indexed` has the paths of declared keys that `VALUE` holds, and their numbers there.
+    indexed: the paths of declared keys that `VALUE` holds, and their numbers there.
+    by_index: whether an index of `VALUE` has to find the episodes; else `VALUE` is asked about each episode.
     """
     parts = list(filter.filters) if filter.type is FilterType.AND else [filter]
     kept, room = [], _MOST_COMPARISONS
@@ -64,7 +69,7 @@ def narrowed(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narr
         if size <= room:
             kept.append(part)
             room -= size
-    found = _all(kept, indexed)
+    found = _all(kept, indexed, by_index)
     return found if len(kept) == len(parts) else found._replace(unsure=ALL.unsure)
 
 
@@ -189,37 +194,51 @@ def merged(filter: BaseFilter) -> BaseFilter:
     return filter.model_copy(update={"filters": tuple(parts)})
 
 
-def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
+def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], by_index: bool) -> Narrowed:
     if filter.type is FilterType.NOT:
-        return _narrow(filter.filters[0], {}).negated()  # no index leads to what does not match
+        return _narrow(filter.filters[0], indexed, False).negated()  # no index leads to what does not match
     if filter.type is FilterType.OR:
-        parts = [_narrow(part, indexed) for part in filter.filters]
+        parts = [_narrow(part, indexed, by_index) for part in filter.filters]
         either = or_(false(), *(part.may for part in parts))
         return Narrowed(either, _unsure(parts))
-    found = _all(filter.filters if filter.type is FilterType.AND else [filter], indexed)
+    found = _all(filter.filters if filter.type is FilterType.AND else [filter], indexed, by_index)
     if found.ids is None:
         return found
     both = tuple_(EPISODE.c.id, EPISODE.c.recording_id)
     return Narrowed(and_(found.may, both.in_(found.ids)), found.unsure)
 
 
-def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int]) -> Narrowed:
+def _all(
+    filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], by_index: bool
+) -> Narrowed:
     """The condition that all filters are true; comparisons of one key in `VALUE` are joined."""
     parts: list[Narrowed] = []
     values: dict[int, list[list[Condition]]] = {}
-    few = any(_names_few(part) for part in filters)
+    by_index = by_index and not any(_names_few(part) for part in filters)
     for part in filters:
         if part.type in COMBINING:
-            parts.append(_narrow(part, indexed))
+            parts.append(_narrow(part, indexed, by_index))
             continue
         path, narrow = path_of(part), compared(part)
-        if path in indexed and part.type not in _NOT_INDEXED and not few:
+        is_fact = path[0] != "metadata"  # which has a column of its own
+        if path in indexed and part.type not in _NOT_INDEXED and (by_index or not is_fact):
             values.setdefault(indexed[path], []).append(near_value(part))
-            if path[0] == "metadata":
-                narrow = Narrowed(true(), unsure_value(part, indexed[path]))
+            narrow = narrow if is_fact else Narrowed(true(), unsure_value(part, indexed[path]))
         parts.append(narrow)
-    ids = in_all([_of_values(key, values[key]) for key in values]) if values else None
-    return Narrowed(and_(true(), *(part.may for part in parts)), _unsure(parts), ids)
+    ids, held = None, []
+    if by_index and values:
+        ids = in_all([_of_values(key, values[key]) for key in values])
+    else:
+        held = [_held(key, values[key]) for key in values]
+    return Narrowed(and_(true(), *held, *(part.may for part in parts)), _unsure(parts), ids)
+
+
+def _held(key: int, parts: Sequence[Sequence[Condition]]) -> Condition:
+    """The condition that the `VALUE` of an episode at a key fulfils one of the alternatives of each part. A database
+    looks up what is asked for in this way, and does not read the values of all episodes instead."""
+    own = VALUE.c.episode_id == EPISODE.c.id, VALUE.c.key == key
+    met = case((and_(*(or_(*part) for part in parts)), 1), else_=0)
+    return func.coalesce(select(met).where(*own).correlate(EPISODE).scalar_subquery(), 0) == 1
 
 
 def _unsure(parts: Sequence[Narrowed]) -> list[Condition]:

@@ -1,16 +1,19 @@
-"""Finds values at a path of metadata, without a declared key: in SQLite with its JSON functions, in PostgreSQL as
-`jsonb`.
+"""SQL that differs between SQLite and PostgreSQL.
 
-Use it only on metadata that are `readable`: PostgreSQL raises an error for others.
+Values at a path of metadata, without a declared key, are found with the JSON functions of SQLite, and in PostgreSQL as
+`jsonb`. Look only into metadata that are `readable`: PostgreSQL raises an error for others.
+
+A list of ids is one value of a statement: as many values, they would have to be written and read one by one.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from typing import Any, Final
 
-from sqlalchemy import JSON, Dialect, Float, Text, literal
+from sqlalchemy import ARRAY, JSON, BigInteger, ColumnElement, Dialect, Float, Text, literal
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.compiler import SQLCompiler
@@ -19,7 +22,7 @@ from sqlalchemy.types import NullType, TypeDecorator, TypeEngine
 
 from tupli_mcap.storage.catalog.tables import EPISODE, TEXT
 
-__all__ = ["can_search", "kind_at", "number_at", "text_at", "value_at"]
+__all__ = ["among", "can_search", "kind_at", "number_at", "text_at", "value_at"]
 
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 
@@ -122,6 +125,39 @@ def _jsonb_number(element: _At, compiler: SQLCompiler, **options: Any) -> str:
 def _jsonb_text(element: _At, compiler: SQLCompiler, **options: Any) -> str:
     kind, value = (made(element, compiler, **options) for made in (_jsonb_kind, _jsonb_value))
     return f"CASE {kind} WHEN 'string' THEN {value} #>> '{{}}' END COLLATE \"C\""
+
+
+class _Ids(TypeDecorator[Any]):
+    impl = Text
+    cache_ok = True
+
+    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
+        return dialect.type_descriptor(ARRAY(BigInteger) if dialect.name == "postgresql" else Text())
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> Any:
+        return value if dialect.name == "postgresql" else json.dumps(value)
+
+
+class among(FunctionElement[bool]):  # noqa: N801
+    """Whether a row id is one of some ids. Not of the type Boolean: `= 1` would follow it in SQLite, which then uses no
+    index."""
+
+    inherit_cache = True
+
+    def __init__(self, row_id: ColumnElement[int], ids: Sequence[int]) -> None:
+        super().__init__(row_id, literal(ids, _Ids()))
+
+
+@compiles(among)
+def _among(element: among, compiler: SQLCompiler, **options: Any) -> str:
+    row_id, ids = (compiler.process(clause, **options) for clause in element.clauses)
+    return f"{row_id} IN (SELECT value FROM json_each({ids}))"
+
+
+@compiles(among, "postgresql")
+def _among_array(element: among, compiler: SQLCompiler, **options: Any) -> str:
+    row_id, ids = (compiler.process(clause, **options) for clause in element.clauses)
+    return f"{row_id} = ANY({ids})"
 
 
 def _in_sqlite(element: _At, compiler: SQLCompiler, options: dict[str, Any]) -> str:

@@ -33,8 +33,7 @@ from tupli_mcap.storage.texts import escape_text
 
 __all__ = ["Asked", "candidates"]
 
-_FEW: Final = 20_000
-_FEW_TO_SORT: Final = 5_000  # by a value, which has to be fetched for each
+_FEW: Final = 5_000
 _MOST: Final = 200_000
 _NEAR: Final = 10_000
 _RECORDINGS: Final = 100  # at once
@@ -74,10 +73,7 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
     are at most: if they are fewer, all that match are among them. If those were not enough, others that start anew."""
     given = [] if asked.filter is None else sources(asked.filter, asked.indexed)
     near = wanted if asked.filter is None and asked.sort is None else max(wanted, _NEAR)
-    if asked.sort is None:
-        fewest = _fewest(connection, given, _FEW)
-    else:
-        fewest = _fewest(connection, [*given, _of_recordings(asked)], _FEW_TO_SORT)
+    fewest = _fewest(connection, given if asked.sort is None else [*given, _of_recordings(asked)])
     if fewest is not None:
         yield _ids(connection, asked, fewest, _FEW + 1), _FEW + 1
         return
@@ -89,11 +85,11 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
         yield _ids(connection, asked, in_all(given).subquery(), _MOST), _MOST
 
 
-def _fewest(connection: Connection, given: Iterable[Source], few: int) -> Subquery | None:
+def _fewest(connection: Connection, given: Iterable[Source]) -> Subquery | None:
     """The source that has the fewest ids, if they are few."""
-    fewest, least = None, few + 1
+    fewest, least = None, _FEW + 1
     for source in given:
-        some = source.first(few + 1)
+        some = source.first(_FEW + 1)
         count = connection.execute(select(func.count()).select_from(some)).scalar_one()
         if count < least:
             fewest, least = some, count

@@ -38,6 +38,7 @@ from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.compare_sql import Condition, Narrowed
 from tupli_mcap.storage.catalog.filter_sql import merged, narrowed, recordings_of
+from tupli_mcap.storage.catalog.metadata_sql import among
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.pages import Asked, candidates
 from tupli_mcap.storage.catalog.rows import (
@@ -79,8 +80,9 @@ __all__ = [
 
 _ROWS_AT_ONCE: Final = 20_000
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
-_FIRST_ROWS: Final = 100
-_ROWS_OF_ANSWER: Final = 500  # as many recordings are named in a statement at most
+_GROWTH: Final = 4  # how many times as many episodes are looked at next, where too few have matched
+_MOST_AT_ONCE: Final = 4_000
+_ROWS_OF_ANSWER: Final = 500
 _STREAMED: Final = {"yield_per": _ROWS_OF_ANSWER}
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
@@ -140,9 +142,9 @@ def find_episodes(
     if wanted <= (_ROWS_AT_ONCE if in_file_order else _MOST_NEAR):
         for ids, most in candidates(connection, asked, wanted):
             if in_file_order:
-                return _looked_at(connection, asked, itertools.islice(ids, offset, None))
+                return _looked_at(connection, asked, itertools.islice(ids, offset, None), wanted)
             counted = _Counted(ids)
-            found = list(itertools.islice(_looked_at(connection, asked, counted), wanted))
+            found = list(itertools.islice(_looked_at(connection, asked, counted, 2 * wanted), wanted))
             if len(found) == wanted or counted.count < most:
                 return iter(found[offset:])
     return _all_of_them(connection, asked, limit, offset)
@@ -251,12 +253,11 @@ def _asked(
 
 
 def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
-    """The condition on rows of EPISODE and RECORDING; by_index: with the conditions by which an index finds the
-    rows."""
+    """The condition on rows of EPISODE and RECORDING; by_index: see `filter_sql.narrowed`."""
     also = and_(asked.only, asked.of)
     if asked.filter is None:
         return Narrowed(also)
-    found = narrowed(asked.filter, asked.indexed if by_index else {})
+    found = narrowed(asked.filter, asked.indexed, by_index=by_index)
     return found._replace(may=and_(found.may, recordings_of(asked.filter), also))
 
 
@@ -287,20 +288,18 @@ class _Counted:
             yield item
 
 
-def _looked_at(connection: Connection, asked: Asked, ids: Iterable[int]) -> Iterator[EpisodeHeader]:
-    """The matching episodes among those with some ids, in the same order."""
+def _looked_at(
+    connection: Connection, asked: Asked, ids: Iterable[int], size: int
+) -> Iterator[EpisodeHeader]:
+    """The matching episodes among those with some ids, in the same order. `size`: how many to ask for at first."""
     found = _narrowed(asked, by_index=False)
     of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
-    ids, size = iter(ids), _FIRST_ROWS
+    ids = iter(ids)
     while some := list(itertools.islice(ids, size)):
-        least, largest = min(some), max(some)
-        these = EPISODE.c.id.between(least, largest)  # cheaper to ask for; it may name some more
-        if largest - least >= 2 * len(some):
-            these = EPISODE.c.id.in_(some)
-        rows = connection.execute(of_them.where(these, found.may))
+        rows = connection.execute(of_them.where(among(EPISODE.c.id, some), found.may))
         known = {row.id: row for row in rows}
         yield from _headers(connection, asked, found, [known[number] for number in some if number in known])
-        size = _ROWS_OF_ANSWER
+        size = min(_GROWTH * size, _MOST_AT_ONCE)
 
 
 def _all_of_them(
@@ -319,9 +318,8 @@ def _all_of_them(
 
     if limit is not None and not found.unsure:  # a database puts ids in order quicker than whole rows
         each = (connection.execute(query).scalars() for query in queries(EPISODE.c.id))
-        return _looked_at(
-            connection, asked, itertools.islice(itertools.chain.from_iterable(each), first, last)
-        )
+        ids = itertools.islice(itertools.chain.from_iterable(each), first, last)
+        return _looked_at(connection, asked, ids, _ROWS_OF_ANSWER)
     rows = (
         connection.execute(query, execution_options=_STREAMED) for query in queries(*_COLUMNS, *_OF_RECORDING)
     )
@@ -359,7 +357,7 @@ def _headers(
 
 def _runs(connection: Connection, recordings: Collection[int]) -> dict[int, list[dict[str, Any]]]:
     """The runs that the episodes of recordings are of, by their places."""
-    found = select(RECORDING.c.id, RECORDING.c.runs).where(RECORDING.c.id.in_(recordings))
+    found = select(RECORDING.c.id, RECORDING.c.runs).where(among(RECORDING.c.id, list(recordings)))
     return {number: jsonvalue.loads(runs) for number, runs in connection.execute(found)}
 
 
