@@ -23,13 +23,21 @@ from sqlalchemy import event
 from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
-from tupli_mcap.schema import EpisodeHeader, F, FilterAND, FilterOR, parse_filter
+from tupli_mcap.schema import (
+    EpisodeHeader,
+    F,
+    FilterAND,
+    FilterEQ,
+    FilterOR,
+    compile_predicate,
+    parse_filter,
+)
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
-from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
+from tupli_mcap.storage.catalog.tables import FLAGGED_KEYS, RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -476,6 +484,38 @@ class TestDeclaredKeys:
         with sqlite3.connect(catalog.path) as connection:
             assert connection.execute("SELECT count(*) FROM value").fetchone() == (2 * len(rows) + 1,)
         connection.close()
+
+    def test_flags_are_with_the_values_of_each_key(self, any_catalog: Catalog | ServerCatalog) -> None:
+        """Also for keys that are declared later, and for those that have no place among the flags."""
+        values: list[Any] = [True, False, 1, 0, None, "x", [True], [False], {"x": True}, math.nan]
+        rows = [row(n, {"score": n, "good": value, "late": value}) for n, value in enumerate(values)]
+        put(any_catalog, "before.mcap", [*rows, row(len(values), {"score": len(values)})])
+        keys = ["score", "good", *(f"k{n}" for n in range(FLAGGED_KEYS)), "late"]
+        for key in keys:
+            any_catalog.declare_key(f"metadata.{key}")
+        put(any_catalog, "after.mcap", rows)
+        score = F("metadata.score")
+        for name in ("good", "late"):
+            key = F(f"metadata.{name}")
+            true, false = FilterEQ(key=key.key, value=True), FilterEQ(key=key.key, value=False)
+            for flag in (true, false, true & false, key == 1, key.isin([True, False]), key.isin([True, "x"])):
+                for wanted in (flag, flag & (score < 9), flag & (score >= 1) & (score < 7), ~flag):
+                    matches = compile_predicate(wanted, EpisodeHeader)
+                    expected = [header.id for header in any_catalog.episodes() if matches(header)]
+                    assert any_catalog.count(wanted) == len(expected), wanted
+                    assert [h.id for h in any_catalog.episodes(wanted, limit=100)] == expected, wanted
+
+    def test_an_index_rules_out_what_is_never_together(self, catalog: Catalog) -> None:
+        catalog.declare_key("metadata.score")
+        catalog.declare_key("metadata.good")
+        put(catalog, rows=[row(n, {"score": n, "good": n >= 50}) for n in range(100)])
+        wanted = FilterEQ(key="metadata.good", value=True) & (F("metadata.score") < 50)
+        asked: list[str] = []
+        with catalog._read() as connection:
+            event.listen(connection, "before_cursor_execute", lambda *told: asked.append(told[2]))
+            assert list(find_episodes(connection, wanted, limit=10)) == []
+        assert [sql for sql in asked if "flags" in sql] == [sql for sql in asked if "count" in sql]
+        assert len(asked) == 2, asked  # the declared keys, and how many the index finds
 
     def test_they_last(self, catalog: Catalog) -> None:
         put(catalog, rows=[row(0, {"score": 1})])

@@ -116,6 +116,27 @@ def test_the_last_revision_makes_the_tables_that_the_code_says(url: str) -> None
     assert different == []
 
 
+def test_declared_keys_get_the_flags_of_episodes(url: str) -> None:
+    fill_first(url)
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        migrations.upgrade(connection, "5")
+        told = json.dumps({"score": 1, "good": True, "bad": {"x": False}, "all": [True]})
+        connection.execute(text("UPDATE episode SET metadata = :told WHERE episode = 0"), {"told": told})
+        number = connection.execute(text("SELECT count(*) FROM declared")).scalar_one()
+        for n, key in enumerate(("metadata.good", "metadata.bad.x", "metadata.all")):
+            row = {"key": key, "number": number + n}
+            connection.execute(text("INSERT INTO declared (key, number) VALUES (:key, :number)"), row)
+    engine.dispose()
+    database = Database(url)
+    with database.reading() as connection:
+        found = connection.execute(
+            text("SELECT flags FROM value WHERE episode_id = (SELECT min(id) FROM episode WHERE episode = 0)")
+        )
+        assert set(found.scalars()) == {0b111001 << 2 * number}
+    database.close()
+
+
 def test_several_start_at_once(url: str) -> None:
     fill_first(url)
     opened: list[Database] = []

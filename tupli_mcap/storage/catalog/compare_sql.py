@@ -36,7 +36,7 @@ from tupli_mcap.schema.filters import ORDERING, path_of
 from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import can_search, kind_at, text_at, value_at
-from tupli_mcap.storage.catalog.rows import indexed_text, is_whole, nearest_float
+from tupli_mcap.storage.catalog.rows import flag_bits, indexed_text, is_whole, nearest_float
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
     RECORDING,
@@ -46,7 +46,9 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["ALL", "Condition", "Narrowed", "compared", "near_value", "of_runs", "recorded", "unsure_value"]
+__all__ = [
+    "ALL", "Condition", "Narrowed", "compared", "flagged", "near_value", "of_runs", "recorded", "unsure_value",
+]  # fmt: skip
 
 Condition = ColumnElement[bool]
 
@@ -215,13 +217,27 @@ def near_value(filter: BaseFilter) -> list[Condition]:
     return conditions
 
 
+def flagged(filter: BaseFilter, key: int) -> Condition | None:
+    """A comparison with flags alone, by the flags that each row of `VALUE` has; None for any other, or for a key that
+    has no place there. It is true of all episodes that match, and where the value is neither a number nor a text,
+    maybe of others."""
+    wanted = [classify(value) for value in _values(filter)]
+    if filter.type in ORDERING or any(scalar.kind != "bool" for scalar in wanted):
+        return None
+    bits = flag_bits((scalar.value for scalar in wanted), key)
+    return VALUE.c.flags.bitwise_and(bits) != 0 if bits else None
+
+
 def unsure_value(filter: BaseFilter, key: int) -> Sequence[Condition]:
-    """Where what `VALUE` holds at a key does not tell whether a comparison, other than NE, is true: see `Narrowed`."""
+    """Where what `VALUE` holds at a key, and `flagged`, do not tell whether a comparison, other than NE, is true: see
+    `Narrowed`."""
     number, text = VALUE.c.number, VALUE.c.text
     numbers, texts = _wanted(filter)
     if filter.type in ORDERING:
         unsure = [*_ordered(filter, number, numbers).unsure, *_ordered(filter, text, texts).unsure]
         unsure += [number.in_(_FLAGS)] if numbers else []
+    elif flagged(filter, key) is not None:
+        unsure = [_neither()]
     elif not _FLAGS.isdisjoint(numbers):
         return ALL.unsure
     else:

@@ -8,6 +8,7 @@ Everything is SQL of any database, but for what is in `metadata_sql`.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -36,6 +37,7 @@ from tupli_mcap.storage.catalog.compare_sql import (
     Condition,
     Narrowed,
     compared,
+    flagged,
     near_value,
     of_runs,
     recorded,
@@ -128,7 +130,7 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
         parts = [*_leaves(filter)]
     else:
         parts = [] if filter.type in COMBINING else [filter]
-    values: dict[int, list[list[Condition]]] = {}
+    values: list[BaseFilter] = []
     facts: dict[str, list[Condition]] = {}
     for part in parts:
         path = path_of(part)
@@ -137,10 +139,10 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
         if path[0] in INDEXED_FACTS:
             facts.setdefault(path[0], []).append(compared(part).may)
         elif path in indexed:
-            values.setdefault(indexed[path], []).append(near_value(part))
+            values.append(part)
     row_id = EPISODE.c.id
     of_facts = (Source(row_id, found, [true()], (EPISODE.c[name], row_id)) for name, found in facts.items())
-    return [*of_facts, *(_of_values(key, values[key]) for key in values)]
+    return [*of_facts, *_by_values(values, indexed)]
 
 
 def in_all(given: Sequence[Source]) -> Select[Any]:
@@ -161,12 +163,24 @@ def _recording(row_id: ColumnElement[int]) -> ColumnElement[int]:
     return row_id // (1 << EPISODE_BITS)
 
 
-def _of_values(key: int, parts: Sequence[Sequence[Condition]]) -> Source:
-    """The episodes whose `VALUE` at a key fulfils one of the alternatives of each part."""
-    most = max(parts, key=len)
-    others = [or_(*part) for part in parts if part is not most]
+def _by_values(parts: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
+    """What the index of `VALUE` finds for comparisons that must all be true. Flags are in each of its rows, and lead
+    to episodes by themselves only if nothing else does."""
+    values: dict[int, list[Sequence[Condition]]] = {}
+    flags: dict[int, list[Sequence[Condition]]] = {}
+    also = []
+    for part in parts:
+        key = indexed[path_of(part)]
+        flag = flagged(part, key)
+        (values if flag is None else flags).setdefault(key, []).append(near_value(part))
+        also += [] if flag is None else [flag]
     by = (VALUE.c.number, VALUE.c.text, VALUE.c.episode_id)
-    return Source(VALUE.c.episode_id, [VALUE.c.key == key, *others], most, by)
+    found = []
+    for key, alternatives in (values or dict(itertools.islice(flags.items(), 1))).items():
+        most = max(alternatives, key=len)
+        others = [or_(*each) for each in alternatives if each is not most]
+        found.append(Source(VALUE.c.episode_id, [VALUE.c.key == key, *also, *others], most, by))
+    return found
 
 
 def _leaves(filter: BaseFilter) -> Iterator[BaseFilter]:
@@ -208,12 +222,10 @@ def _narrow(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int], by_index
     return Narrowed(and_(found.may, both.in_(found.ids)), found.unsure)
 
 
-def _all(
-    filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], by_index: bool
-) -> Narrowed:
+def _all(filters: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int], by_index: bool) -> Narrowed:
     """The condition that all filters are true; comparisons of one key in `VALUE` are joined."""
     parts: list[Narrowed] = []
-    values: dict[int, list[list[Condition]]] = {}
+    values: list[BaseFilter] = []
     by_index = by_index and not any(_names_few(part) for part in filters)
     for part in filters:
         if part.type in COMBINING:
@@ -222,22 +234,23 @@ def _all(
         path, narrow = path_of(part), compared(part)
         is_fact = path[0] != "metadata"  # which has a column of its own
         if path in indexed and part.type not in _NOT_INDEXED and (by_index or not is_fact):
-            values.setdefault(indexed[path], []).append(near_value(part))
+            values.append(part)
             narrow = narrow if is_fact else Narrowed(true(), unsure_value(part, indexed[path]))
         parts.append(narrow)
     ids, held = None, []
     if by_index and values:
-        ids = in_all([_of_values(key, values[key]) for key in values])
+        ids = in_all(_by_values(values, indexed))
     else:
-        held = [_held(key, values[key]) for key in values]
+        held = [_held(part, indexed[path_of(part)]) for part in values]
     return Narrowed(and_(true(), *held, *(part.may for part in parts)), _unsure(parts), ids)
 
 
-def _held(key: int, parts: Sequence[Sequence[Condition]]) -> Condition:
-    """The condition that the `VALUE` of an episode at a key fulfils one of the alternatives of each part. A database
-    looks up what is asked for in this way, and does not read the values of all episodes instead."""
+def _held(part: BaseFilter, key: int) -> Condition:
+    """The condition that an episode's `VALUE` at a key may be as a comparison says. A database looks up what is asked
+    for in this way, and does not read the values of all episodes instead."""
     own = VALUE.c.episode_id == EPISODE.c.id, VALUE.c.key == key
-    met = case((and_(*(or_(*part) for part in parts)), 1), else_=0)
+    flag = flagged(part, key)
+    met = case((and_(or_(*near_value(part)), true() if flag is None else flag), 1), else_=0)
     return func.coalesce(select(met).where(*own).correlate(EPISODE).scalar_subquery(), 0) == 1
 
 

@@ -75,7 +75,8 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
     near = wanted if asked.filter is None and asked.sort is None else max(wanted, _NEAR)
     fewest = _fewest(connection, given if asked.sort is None else [*given, _of_recordings(asked)])
     if fewest is not None:
-        yield _ids(connection, asked, fewest, _FEW + 1), _FEW + 1
+        source, count = fewest
+        yield _ids(connection, asked, source, _FEW + 1) if count else (), _FEW + 1
         return
     if asked.sort is None:
         yield _next(connection, asked, near), near
@@ -85,14 +86,14 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
         yield _ids(connection, asked, in_all(given).subquery(), _MOST), _MOST
 
 
-def _fewest(connection: Connection, given: Iterable[Source]) -> Subquery | None:
-    """The source that has the fewest ids, if they are few."""
+def _fewest(connection: Connection, given: Iterable[Source]) -> tuple[Subquery, int] | None:
+    """The source that has the fewest ids, and how many, if they are few."""
     fewest, least = None, _FEW + 1
     for source in given:
         some = source.first(_FEW + 1)
         count = connection.execute(select(func.count()).select_from(some)).scalar_one()
         if count < least:
-            fewest, least = some, count
+            fewest, least = (some, count), count
     return fewest
 
 

@@ -28,6 +28,7 @@ from sqlalchemy import (
     or_,
     select,
     true,
+    update,
 )
 from sqlalchemy.exc import DBAPIError
 
@@ -44,10 +45,10 @@ from tupli_mcap.storage.catalog.pages import Asked, candidates
 from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
     StoredRow,
+    flag_bits,
     header,
-    indexed_value,
+    indexed_values,
     is_indexed,
-    load_metadata,
     store_row,
 )
 from tupli_mcap.storage.catalog.tables import (
@@ -211,11 +212,12 @@ def declare_key(connection: Connection, key: str) -> None:
     number = connection.execute(select(func.count()).select_from(DECLARED)).scalar_one()
     connection.execute(insert(DECLARED).values(key=escape_text(key), number=number))
     if is_indexed(path):
+        indexed = _indexed(connection)
         all_rows = select(*_COLUMNS).order_by(EPISODE.c.id)
         for chunk in connection.execute(
             all_rows, execution_options={"yield_per": _ROWS_AT_ONCE}
         ).partitions():
-            _index(connection, [StoredRow(*row) for row in chunk], {path: number})
+            _index_anew(connection, [StoredRow(*row) for row in chunk], indexed, number)
 
 
 def declared_keys(connection: Connection) -> list[str]:
@@ -370,15 +372,28 @@ def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
 
 def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:
     """Puts the values of rows at declared keys into `VALUE`."""
-    values = []
-    for row in rows if indexed else ():
-        metadata = load_metadata(row.metadata)
-        for path, number in indexed.items():
-            value = indexed_value(row, metadata, path)
-            if value is not None:
-                values.append((row.id, number, *value))
+    if indexed:
+        _insert_values(connection, [value for row in rows for value in indexed_values(row, indexed)])
+
+
+def _index_anew(
+    connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int], key: int
+) -> None:
+    """Puts the values of rows, which are in the order of their ids, at one more key into `VALUE`."""
+    values = [value for row in rows for value in indexed_values(row, indexed) if value[1] == key]
+    _insert_values(connection, values)
+    if not any(flags & flag_bits([True, False], key) for *_, flags in values):
+        return
+    new = VALUE.alias("new")
+    flags = select(new.c.flags).where(new.c.episode_id == VALUE.c.episode_id, new.c.key == key)
+    others = VALUE.c.episode_id.between(rows[0].id, rows[-1].id), VALUE.c.key != key
+    told = func.coalesce(flags.correlate(VALUE).scalar_subquery(), VALUE.c.flags)
+    connection.execute(update(VALUE).where(*others).values(flags=told))
+
+
+def _insert_values(connection: Connection, values: Sequence[tuple[Any, ...]]) -> None:
     if values:
-        insert_all(connection, VALUE, ("episode_id", "key", "number", "text"), values)
+        insert_all(connection, VALUE, ("episode_id", "key", "number", "text", "flags"), values)
 
 
 def _add_recording(

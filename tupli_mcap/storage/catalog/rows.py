@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from functools import lru_cache
+from collections.abc import Iterable, Mapping
+from functools import lru_cache, reduce
+from operator import or_
 from typing import Any, Final, NamedTuple
 
 from tupli_mcap import jsonvalue
@@ -15,17 +17,18 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.schema.times import iso_utc
-from tupli_mcap.schema.values import classify
+from tupli_mcap.schema.values import Scalar, classify
 from tupli_mcap.storage.base import episode_id
-from tupli_mcap.storage.catalog.tables import EPISODE_BITS
+from tupli_mcap.storage.catalog.tables import EPISODE_BITS, FLAGGED_KEYS
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
     "EpisodeRow",
     "StoredRow",
+    "flag_bits",
     "header",
     "indexed_text",
-    "indexed_value",
+    "indexed_values",
     "is_indexed",
     "is_whole",
     "nearest_float",
@@ -153,18 +156,45 @@ def is_indexed(path: tuple[str, ...]) -> bool:
     return len(path) > 1 if path[0] == "metadata" else path[0] in _INDEXED
 
 
-def indexed_value(row: StoredRow, metadata: object, path: tuple[str, ...]) -> tuple[Any, Any] | None:
-    """The entry of an episode at a path in `value` (number, text); None if it has none."""
-    if path[0] != "metadata":
-        stored = getattr(row, path[0])
-        return (None, indexed_text(stored)) if isinstance(stored, str) else (stored, None)
-    found = look_up(metadata, path[1:])
-    if found is MISSING:
-        return None
-    scalar = classify(found)
-    if scalar.kind == "text":
-        return None, indexed_text(scalar.value)
-    return (nearest_float(scalar.value), None) if scalar.kind in ("number", "bool") else (None, None)
+def indexed_values(row: StoredRow, indexed: Mapping[tuple[str, ...], int]) -> list[tuple[Any, ...]]:
+    """The rows of `value` of an episode: its id, a key, number and text at that key, and all flags.
+
+    indexed: the paths of keys, and their numbers.
+    """
+    metadata, flags, found = load_metadata(row.metadata), 0, []
+    for path, key in indexed.items():
+        if path[0] != "metadata":
+            stored = getattr(row, path[0])
+            found.append(
+                (key, None, indexed_text(stored)) if isinstance(stored, str) else (key, stored, None)
+            )
+            continue
+        value = look_up(metadata, path[1:])
+        if value is MISSING:
+            continue
+        scalar = classify(value)
+        if scalar.kind == "text":
+            found.append((key, None, indexed_text(scalar.value)))
+        elif scalar.kind in ("number", "bool"):
+            found.append((key, nearest_float(scalar.value), None))
+        else:
+            found.append((key, None, None))
+        flags |= _flags(scalar, key)
+    return [(row.id, *values, flags) for values in found]
+
+
+def _flags(scalar: Scalar, key: int) -> int:
+    if scalar.kind == "bool":
+        return flag_bits([scalar.value], key)
+    return flag_bits([True, False], key) if scalar.kind == "other" else 0
+
+
+def flag_bits(flags: Iterable[bool], key: int) -> int:
+    """The bits in `value.flags` which say that the value at a key may be one of some flags; 0 for one of the keys that
+    have no place there."""
+    if key >= FLAGGED_KEYS:
+        return 0
+    return reduce(or_, ((1 if flag else 2) << 2 * key for flag in flags), 0)
 
 
 def indexed_text(text: str) -> str:

@@ -25,6 +25,7 @@ __all__ = [
     "DECLARED",
     "EPISODE",
     "EPISODE_BITS",
+    "FLAGGED_KEYS",
     "INDEXED_FACTS",
     "LAST_EPISODE",
     "METADATA",
@@ -41,7 +42,7 @@ __all__ = [
 ]
 
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
-VERSION: Final = 8
+VERSION: Final = 9
 
 EPISODE_BITS: Final = 32
 """An episode's row id is its recording's id shifted left by this, plus its number: rows lie in file order."""
@@ -126,7 +127,12 @@ DECLARED: Final = Table(
     Column("number", NUMBER, nullable=False),
 )
 
+FLAGGED_KEYS: Final = 31
+"""So many declared keys, the first ones, have a place in `flags`: two bits each."""
+
 # What episodes hold at declared keys: the nearest float of a number or a flag, or a text; neither for anything else.
+# Each of an episode's rows has all of its flags, so that the index of one key finds what meets a condition on it and
+# on flags: either alone may be true of most episodes.
 VALUE: Final = Table(
     "value",
     METADATA,
@@ -134,7 +140,9 @@ VALUE: Final = Table(
     Column("key", NUMBER, primary_key=True, autoincrement=False),  # its number in `declared`
     Column("number", Float),
     Column("text", TEXT),
-    Index("ix_value", "key", "number", "text", "episode_id"),
+    # Of the declared key n, bit 2n says that it may be true, bit 2n + 1 that it may be false: a list may hold both.
+    Column("flags", NUMBER, nullable=False),
+    Index("ix_value", "key", "number", "text", "episode_id", "flags"),
     sqlite_with_rowid=False,
 )
 
