@@ -120,7 +120,7 @@ def test_declared_keys_get_the_flags_of_episodes(url: str) -> None:
     fill_first(url)
     engine = create_engine(url)
     with engine.begin() as connection:
-        migrations.upgrade(connection, "5")
+        migrations.upgrade(connection, "6")
         told = json.dumps({"score": 1, "good": True, "bad": {"x": False}, "all": [True]})
         connection.execute(text("UPDATE episode SET metadata = :told WHERE episode = 0"), {"told": told})
         number = connection.execute(text("SELECT count(*) FROM declared")).scalar_one()

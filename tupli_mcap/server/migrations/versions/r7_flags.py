@@ -12,8 +12,8 @@ from sqlalchemy import BigInteger, Column, Integer, Text, bindparam, column, sel
 from tupli_mcap.schema.keys import split_key
 from tupli_mcap.storage.texts import unescape_text
 
-revision = "6"
-down_revision = "5"
+revision = "7"
+down_revision = "6"
 
 _NUMBER = BigInteger().with_variant(Integer, "sqlite")
 _FLAGGED_KEYS = 31
