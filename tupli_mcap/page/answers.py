@@ -24,7 +24,17 @@ from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
-__all__ = ["FILE_NAME", "POLICY", "PageRoute", "Shown", "SignInNeededError", "address", "error_page", "page"]
+__all__ = [
+    "FILE_NAME",
+    "FOR_VIEWERS",
+    "POLICY",
+    "PageRoute",
+    "Shown",
+    "SignInNeededError",
+    "address",
+    "error_page",
+    "page",
+]
 
 POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
@@ -38,6 +48,13 @@ _HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "private, no-cache",
 }
+
+
+FOR_VIEWERS: Final = {
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
+}
+"""The headers of a recording that pages of other hosts may read: they need the ticket, and no cookie."""
 
 
 class _FileName(PathConvertor):

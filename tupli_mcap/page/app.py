@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.page.answers import FILE_NAME, error_page
+from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS, error_page
 from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
 from tupli_mcap.viewer.process import has_display
@@ -24,11 +24,6 @@ from tupli_mcap.viewer.process import has_display
 __all__ = ["browse", "create_app"]
 
 _HOST = "127.0.0.1"
-_FOR_VIEWERS = {
-    "Access-Control-Allow-Origin": "*",
-    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
-    "X-Content-Type-Options": "nosniff",
-}
 
 
 def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
@@ -36,7 +31,8 @@ def read_recording(request: Request, ticket: str, name: str) -> FileResponse:
     shelf: DirectoryShelf | FileShelf = request.app.state.shelf
     if not secrets.compare_digest(ticket.encode(), shelf.ticket.encode()):
         raise HTTPException(404, "there is no such file")
-    return FileResponse(shelf.path_of(name), media_type="application/octet-stream", headers=_FOR_VIEWERS)
+    headers = {**FOR_VIEWERS, "X-Content-Type-Options": "nosniff"}
+    return FileResponse(shelf.path_of(name), media_type="application/octet-stream", headers=headers)
 
 
 def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:

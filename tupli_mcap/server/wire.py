@@ -11,7 +11,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exception_handlers import request_validation_exception_handler
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import AfterValidator, BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
 
 from tupli_mcap import jsonvalue
@@ -26,7 +26,7 @@ from tupli_mcap.errors import (
     TupliError,
 )
 from tupli_mcap.recording.edit.merge import UnmergeableError
-from tupli_mcap.schema import BaseFilter, FilterType
+from tupli_mcap.schema import ArtifactMetadata, BaseFilter, FilterType
 from tupli_mcap.schema.facts import comparisons
 from tupli_mcap.server.blobs import LostError
 from tupli_mcap.server.database import TooLongError, UnavailableError
@@ -37,6 +37,7 @@ from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
+from tupli_mcap.storage.texts import first_defect
 
 __all__ = [
     "AskedFilter",
@@ -44,6 +45,7 @@ __all__ = [
     "Found",
     "Listing",
     "answer",
+    "artifact_metadata",
     "demand_short",
     "listed",
     "paged",
@@ -134,6 +136,18 @@ def demand_short(metadata: BaseModel) -> None:
         raise TooLargeError(
             f"expected metadata of at most {_MOST_METADATA} bytes, found {size}; store an artifact instead"
         )
+
+
+def artifact_metadata(data: str | bytes) -> ArtifactMetadata:
+    """The metadata of an artifact, from JSON."""
+    try:
+        found = ArtifactMetadata.model_validate(jsonvalue.loads(data))
+    except ValidationError as err:
+        raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
+    except ValueError as err:
+        raise StorageError(f"expected the metadata of an artifact as JSON: {err}") from err
+    demand_short(found)
+    return found
 
 
 def listed(items: Iterable[BaseModel], following: str | None = None) -> Response:

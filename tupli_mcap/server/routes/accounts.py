@@ -7,13 +7,14 @@ from typing import Any
 from fastapi import APIRouter
 from pydantic import BaseModel, Field
 
+from tupli_mcap.schema import Group, UserRole
 from tupli_mcap.server.database import audit
 from tupli_mcap.server.people import accounts, quotas
 from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, Writer
 
-__all__ = ["router"]
+__all__ = ["Credentials", "router"]
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
 
@@ -67,13 +68,6 @@ class Password(BaseModel):
     old: str | None = None
 
 
-class Group(BaseModel):
-    """A group of users."""
-
-    name: str
-    description: str | None = None
-
-
 class Member(BaseModel):
     """A user in a group."""
 
@@ -85,14 +79,6 @@ class GroupWithMembers(Group):
     """A group, and its members that the caller may see."""
 
     members: list[Member]
-
-
-class Role(BaseModel):
-    """A role and the rights that it gives."""
-
-    role: str
-    rights: list[Right]
-    description: str | None = None
 
 
 class NewToken(BaseModel):
@@ -235,7 +221,7 @@ def remove_member(library: Served, caller: Writer, name: str, user: str) -> None
 
 
 @router.post("/roles")
-def create_role(library: Served, caller: Writer, told: Role) -> Role:
+def create_role(library: Served, caller: Writer, told: UserRole) -> UserRole:
     """Creates a role."""
     with library.database.writing() as connection:
         accounts.create_role(connection, caller, told.role, told.rights, told.description)
@@ -243,11 +229,11 @@ def create_role(library: Served, caller: Writer, told: Role) -> Role:
 
 
 @router.get("/roles")
-def list_roles(library: Served, caller: Reader) -> list[Role]:
+def list_roles(library: Served, caller: Reader) -> list[UserRole]:
     """All roles."""
     caller.demand(Right.ROLE_MANAGEMENT)
     with library.database.reading() as connection:
-        return [Role.model_validate(role) for role in accounts.list_roles(connection)]
+        return [UserRole.model_validate(role) for role in accounts.list_roles(connection)]
 
 
 @router.delete("/roles/{role}")

@@ -111,16 +111,14 @@ def delete_episode(library: Served, caller: Writer, uri: str) -> None:
 def publish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
     """Lets a group see an episode."""
     with library.database.writing() as connection:
-        if not episodes.publish(connection, caller, FilterEQ(key="id", value=uri), group):
-            raise episodes.no_episode(uri)
+        episodes.publish_one(connection, caller, uri, group)
 
 
 @router.delete("/{uri}/published")
 def unpublish_episode(library: Served, caller: Writer, uri: str, group: str) -> None:
     """Hides an episode from a group."""
     with library.database.writing() as connection:
-        if not episodes.unpublish(connection, caller, FilterEQ(key="id", value=uri), group):
-            raise episodes.no_episode(uri)
+        episodes.publish_one(connection, caller, uri, group, published=False)
 
 
 def _cursor(recording: str, episode: int) -> str:

@@ -6,18 +6,15 @@ import base64
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Header, Request, Response
-from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
-from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StorageError
-from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, BenchmarkQuery
+from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored.items import artifact_key
-from tupli_mcap.server.wire import Found, Listing, answer, demand_short, paged
+from tupli_mcap.server.wire import Found, Listing, answer, artifact_metadata, demand_short, paged
 from tupli_mcap.storage.benchmark_json import restored
-from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]
 
@@ -78,12 +75,10 @@ async def store_artifact(
 ) -> Response:
     """Stores the bytes of the body, unless the caller has them already; answers with their metadata."""
     try:
-        told = ArtifactMetadata.model_validate(jsonvalue.loads(base64.b64decode(metadata)))
-    except ValidationError as err:
-        raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
+        text = base64.b64decode(metadata)
     except ValueError as err:
-        raise StorageError(f"expected the metadata of an artifact as JSON in base64: {err}") from err
-    demand_short(told)
+        raise StorageError(f"expected the metadata of an artifact in base64: {err}") from err
+    told = artifact_metadata(text)
     data = await request.body()
     return answer(await run_in_threadpool(library.store_artifact, caller, data, told))
 

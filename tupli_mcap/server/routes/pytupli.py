@@ -13,12 +13,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FilterError, NotFoundError, StorageError
+from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.schema import (
-    ArtifactMetadata,
     ArtifactMetadataItem,
     BaseFilter,
     Benchmark,
@@ -27,16 +26,20 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     FilterEQ,
+    Group,
+    GroupMembershipQuery,
+    UserRole,
 )
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.routes.accounts import Credentials
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
-from tupli_mcap.server.wire import AskedFilter, answer, demand_short
+from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]
@@ -46,42 +49,6 @@ _DENIED = "You do not have sufficient permissions for this operation."
 _BEARER = HTTPBearer(auto_error=False)
 _FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)
 _Filter = Annotated[dict[str, Any] | None, Body()]
-
-
-class Credentials(BaseModel):
-    """A user's name and password."""
-
-    username: str
-    password: str
-
-
-class Group(BaseModel):
-    """A group."""
-
-    name: str
-    description: str | None = None
-
-
-class Member(BaseModel):
-    """A user in a group."""
-
-    user: str
-    roles: list[str] | None = None
-
-
-class Members(BaseModel):
-    """Users of one group."""
-
-    group_name: str
-    members: list[Member]
-
-
-class Role(BaseModel):
-    """A role and its rights."""
-
-    role: str
-    rights: list[Right]
-    description: str | None = None
 
 
 def _changing(caller: Reader) -> Caller:
@@ -216,7 +183,7 @@ def delete_group(library: Served, caller: Changing, group_name: str) -> None:
 
 
 @router.post("/access/groups/add-members")
-def add_members(library: Served, caller: Changing, told: Members) -> dict[str, Any]:
+def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
     """Gives users roles in a group."""
     with library.database.writing() as connection:
         for member in told.members:
@@ -226,7 +193,7 @@ def add_members(library: Served, caller: Changing, told: Members) -> dict[str, A
 
 
 @router.post("/access/groups/remove-members")
-def remove_members(library: Served, caller: Changing, told: Members) -> dict[str, Any]:
+def remove_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
     """Takes users out of a group."""
     with library.database.writing() as connection:
         for member in told.members:
@@ -235,7 +202,7 @@ def remove_members(library: Served, caller: Changing, told: Members) -> dict[str
 
 
 @router.post("/access/roles/create")
-def create_role(library: Served, caller: Changing, told: Role) -> Role:
+def create_role(library: Served, caller: Changing, told: UserRole) -> UserRole:
     """Makes a role."""
     with library.database.writing() as connection:
         accounts.create_role(connection, caller, told.role, told.rights, told.description)
@@ -243,11 +210,11 @@ def create_role(library: Served, caller: Changing, told: Role) -> Role:
 
 
 @router.get("/access/roles/list")
-def list_roles(library: Served, caller: Reader) -> list[Role]:
+def list_roles(library: Served, caller: Reader) -> list[UserRole]:
     """All roles."""
     caller.demand(Right.ROLE_MANAGEMENT)
     with library.database.reading() as connection:
-        return [Role.model_validate(role) for role in accounts.list_roles(connection)]
+        return [UserRole.model_validate(role) for role in accounts.list_roles(connection)]
 
 
 @router.delete("/access/roles/delete")
@@ -319,14 +286,7 @@ def store_artifact(
     library: Served, caller: Changing, data: Annotated[bytes, File()], metadata: Annotated[str, Form()]
 ) -> Response:
     """Stores bytes."""
-    try:
-        told = ArtifactMetadata.model_validate(jsonvalue.loads(metadata))
-    except ValidationError as err:
-        raise StorageError(f"expected the metadata of an artifact: {first_defect(err)}") from err
-    except ValueError as err:
-        raise StorageError(f"expected the metadata of an artifact as JSON: {err}") from err
-    demand_short(told)
-    return answer(library.store_artifact(caller, data, told))
+    return answer(library.store_artifact(caller, data, artifact_metadata(metadata)))
 
 
 @router.get("/artifacts/download", response_class=Response, responses=BODY)
@@ -393,16 +353,14 @@ def list_episodes(library: Served, caller: Reader, told: _Filter = None) -> Resp
 def publish_episode(library: Served, caller: Changing, episode_id: str, publish_in: str) -> None:
     """Lets a group see an episode."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
-        if not episodes.publish(connection, caller, FilterEQ(key="id", value=episode_id), publish_in):
-            raise episodes.no_episode(episode_id)
+        episodes.publish_one(connection, caller, episode_id, publish_in)
 
 
 @router.put("/episodes/unpublish")
 def unpublish_episode(library: Served, caller: Changing, episode_id: str, unpublish_from: str) -> None:
     """Takes an episode away from a group."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
-        if not episodes.unpublish(connection, caller, FilterEQ(key="id", value=episode_id), unpublish_from):
-            raise episodes.no_episode(episode_id)
+        episodes.publish_one(connection, caller, episode_id, unpublish_from, published=False)
 
 
 @router.delete("/episodes/delete")

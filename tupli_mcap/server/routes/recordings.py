@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.page.answers import FILE_NAME
+from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, Right
 from tupli_mcap.server.routes.bodies import BODY, body_of
@@ -30,10 +30,6 @@ __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
 _TUS = {"Tus-Resumable": "1.0.0"}
-_FOR_VIEWERS = {
-    "Access-Control-Allow-Origin": "*",
-    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Range, ETag, Last-Modified",
-}
 _AT_ONCE = 1 << 20  # bytes that are written at a time
 
 
@@ -207,6 +203,6 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
         return Response() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]
     body = body_of(library, request, found.place, digest=found.digest, file_name=file_name)
-    if holder.ticket is not None:  # pages of other hosts may read it: they need the ticket, and no cookie
-        body.headers.update(_FOR_VIEWERS)
+    if holder.ticket is not None:
+        body.headers.update(FOR_VIEWERS)
     return body

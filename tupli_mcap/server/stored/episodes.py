@@ -32,7 +32,7 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
     "StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "forget", "forget_unseen",
-    "names_of", "no_episode", "publish", "unpublish", "whole_name",
+    "names_of", "no_episode", "publish", "publish_one", "unpublish", "whole_name",
 ]  # fmt: skip
 
 _MOST_VALUES: Final = 1000
@@ -171,6 +171,15 @@ def unpublish(
     _set_audiences(connection, found, lambda groups: [name for name in groups if name != group])
     _note(connection, caller, "unpublish_episodes", found, f" from {group}")
     return len(found)
+
+
+def publish_one(
+    connection: Connection, caller: Caller, uri: str, group: str, *, published: bool = True
+) -> None:
+    """Publishes one episode in a group, or unpublishes it. Raises NotFoundError if there is none of this id."""
+    change = publish if published else unpublish
+    if not change(connection, caller, FilterEQ(key="id", value=uri), group):
+        raise no_episode(uri)
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
