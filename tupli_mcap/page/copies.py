@@ -17,7 +17,7 @@ from starlette.background import BackgroundTask
 from starlette.types import Receive, Scope, Send
 
 from tupli_mcap.errors import NotFoundError, RecordingError
-from tupli_mcap.page.shelf import Shelf
+from tupli_mcap.page.shelf import Shelf, opened
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
@@ -104,15 +104,14 @@ def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
 
     Raises:
         MissingExtraError: PyAV is not installed.
-        NotFoundError: the episode has no pictures.
+        NotFoundError: the episode is gone, or has no pictures.
     """
     from tupli_mcap.replay import film
 
-    recording = shelf.open(header.recording)
-    position = int(recording.index["episode"].searchsorted(header.episode))
+    episode = opened(shelf, header)
     with _folder() as folder:
         try:
-            film([recording.episodes[position]], folder / "episode.mp4")
+            film([episode], folder / "episode.mp4")
         except RecordingError as err:
             raise NotFoundError(str(err)) from err
         return folder / "episode.mp4"

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.page.texts import said
-from tupli_mcap.plots.measure import numbers_in, thinned
+from tupli_mcap.plots.measure import numbers_in, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
@@ -157,10 +157,7 @@ def _tracks(field: str, leaf: Leaf, labels: Labels, column: Array, notes: list[s
 def _track(
     field: str, name: str, at: Array, values: Array, names: Sequence[str] = (), start: int = 0
 ) -> Track:
-    width = 1 if len(at) <= _POINTS else -(-len(at) // (_POINTS // 2))
-    return Track(
-        field, name, thinned(at[:, None], width)[:, 0], thinned(values[:, None], width)[:, 0], names, start
-    )
+    return Track(field, name, thinned_to(_POINTS, at), thinned_to(_POINTS, values), names, start)
 
 
 def _few_infos(recording: Recording) -> bool:

@@ -8,12 +8,12 @@ from typing import Protocol, TypeVar
 from sqlalchemy import ColumnElement, Connection, and_
 
 from tupli_mcap.errors import NotFoundError
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 from tupli_mcap.storage.catalog.tallies import recordings_seen
 
-__all__ = ["Shelf", "find_episode", "find_some", "python_line", "seen_episodes", "seen_recordings"]
+__all__ = ["Shelf", "find_episode", "find_some", "opened", "python_line", "seen_episodes", "seen_recordings"]
 
 T = TypeVar("T")
 
@@ -82,6 +82,19 @@ def seen_episodes(
 def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
     """The recordings of which some episodes may be read, and that all conditions are true of."""
     return and_(recordings_seen(shelf.seen), *conditions)
+
+
+def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
+    """Opens the episode of a header.
+
+    Raises:
+        NotFoundError: the episode is gone.
+    """
+    recording = shelf.open(header.recording)
+    found = recording.index["episode"].searchsorted(header.episode)
+    if found == len(recording.index) or recording.index["episode"][found] != header.episode:
+        raise NotFoundError(f"episode {header.id} is gone")
+    return recording.episodes[int(found)]
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:

@@ -12,7 +12,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.charts import line_path
 from tupli_mcap.page.shelf import Shelf
-from tupli_mcap.plots.measure import thinned
+from tupli_mcap.plots.measure import thinned_to
 from tupli_mcap.plots.statistics import drawable_numbers
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
@@ -43,8 +43,7 @@ def sparks_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Sparks:
     for uri, values in found.items():
         known = values[np.isfinite(values)]
         if len(known):
-            width = 1 if len(values) <= _POINTS else -(-len(values) // (_POINTS // 2))
-            thin = thinned(values[:, None], width)[:, 0]
+            thin = thinned_to(_POINTS, values)
             at = np.arange(len(thin), dtype=np.float64)
             up = float(known.min()), float(known.max())
             lines[uri] = line_path(at, thin, (0.0, max(1.0, len(thin) - 1.0)), up)

@@ -273,6 +273,12 @@ def thinned(values: Array, width: int) -> Array:
     return np.stack(ends, axis=1).reshape(-1, values.shape[1])
 
 
+def thinned_to(most: int, values: Array) -> Array:
+    """At most about `most` of many values (steps), as `thinned`."""
+    width = 1 if len(values) <= most else -(-len(values) // (most // 2))
+    return thinned(values[:, None], width)[:, 0]
+
+
 def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> list[tuple[str, Array]]:
     """Frames of an episode at even distances, and the mean of more of them."""
     shown, averaged = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -21,7 +21,7 @@ from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import of_dataset
-from tupli_mcap.page.routes.episode import Seen, look
+from tupli_mcap.page.routes.episode import FIELDS, Seen, look
 from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes, seen_recordings
 from tupli_mcap.page.sparks import sparks_of
 from tupli_mcap.schema import EpisodeHeader, parse_bound
@@ -49,16 +49,13 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
     seen = [look(shelf, header, 0) for header in headers]
     steps = max(len(one.episode) for one in seen)
-    groups = [(title, _compared(seen, field, steps)) for field, title in _FIELDS.items()]
+    groups = [(title, _compared(seen, field, steps)) for field, title in FIELDS.items()]
     keys = list(dict.fromkeys(chain.from_iterable(header.metadata for header in headers)))
     facts = {"episodes": [dict(header) for header in headers]}
     return page(
         request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
         groups=[(title, tracks) for title, tracks in groups if tracks],
     )  # fmt: skip
-
-
-_FIELDS: Final = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
 
 
 def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:

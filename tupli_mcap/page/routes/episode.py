@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Request, Response
@@ -17,15 +17,19 @@ from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
 from tupli_mcap.page.datasets import Dataset, dataset_of, of_dataset, of_recording
 from tupli_mcap.page.pictures import Camera, cameras_of
-from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
+from tupli_mcap.page.shelf import Shelf, find_episode, opened, python_line, seen_episodes, seen_recordings
 from tupli_mcap.page.texts import iso
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_bound
 from tupli_mcap.storage.catalog.queries import After, Sort, find_episodes
 
-__all__ = ["Seen", "look", "opened", "router"]
+__all__ = ["FIELDS", "Seen", "look", "router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
+
+
+FIELDS: Final = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
+"""The fields of tracks, with their titles, in the order in which they are shown."""
 
 
 class Neighbours(NamedTuple):
@@ -86,19 +90,6 @@ def one_step(shelf: Shown, uri: str, step: int) -> Response:
     return Response(jsonvalue.dumps(values_at(shown, step)), media_type="application/json")
 
 
-def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
-    """Opens the episode of a header.
-
-    Raises:
-        NotFoundError: the episode is gone.
-    """
-    recording = shelf.open(header.recording)
-    found = recording.index["episode"].searchsorted(header.episode)
-    if found == len(recording.index) or recording.index["episode"][found] != header.episode:
-        raise NotFoundError(f"episode {header.id} is gone")
-    return recording.episodes[int(found)]
-
-
 def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Episode) -> str:
     """A link that opens the recording in Foxglove, where the episode begins."""
     place = shelf.address_of(header.recording)
@@ -121,8 +112,7 @@ class Seen(NamedTuple):
     @property
     def groups(self) -> list[tuple[str, Sequence[Track]]]:
         """The titles of the fields that have tracks, each with its tracks."""
-        names = {"reward": "Reward", "action": "Actions", "state": "States", "info": "Infos"}
-        found = ((title, self.curves.of(field)) for field, title in names.items())
+        found = ((title, self.curves.of(field)) for field, title in FIELDS.items())
         return [(title, tracks) for title, tracks in found if tracks]
 
     @property

@@ -15,8 +15,7 @@ from tupli_mcap.page.curves import curves_of
 from tupli_mcap.page.datasets import find_dataset
 from tupli_mcap.page.pictures import cameras_of, picture_at
 from tupli_mcap.page.routes.dataset import shown_first
-from tupli_mcap.page.routes.episode import opened
-from tupli_mcap.page.shelf import find_episode
+from tupli_mcap.page.shelf import find_episode, opened
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader
 
