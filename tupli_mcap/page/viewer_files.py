@@ -52,29 +52,14 @@ def viewer_file(name: str) -> Path:
 
 
 def _take(folder: Path) -> None:
-    from tupli_mcap.viewer.process import (
-        LOCAL,
-        end,
-        free_port,
-        scratch,
-        start,
-        viewer_program,
-        wait_for_ports,
-    )
+    from tupli_mcap.viewer.process import LOCAL, viewer_program, web_viewer
 
     try:
         make_private(folder)
-        with scratch() as place, (place / "log").open("wb") as log:
-            ports = [free_port(), free_port()]
-            words = ["--serve-web", "--port", str(ports[0]), "--web-viewer-port", str(ports[1])]
-            process = start(viewer_program(), *words, log=log)
-            try:
-                wait_for_ports(process, ports[1:], place / "log")
-                for name in NAMES:
-                    with urllib.request.urlopen(f"http://{LOCAL}:{ports[1]}/{name}", timeout=60) as answer:
-                        data = gzip.compress(answer.read(), 6, mtime=0)
-                    files.write_bytes(folder / f"{name}.gz", data, permissions=0o600)
-            finally:
-                end(process)
+        with web_viewer(viewer_program()) as (_, _, page):
+            for name in NAMES:
+                with urllib.request.urlopen(f"http://{LOCAL}:{page}/{name}", timeout=60) as answer:
+                    data = gzip.compress(answer.read(), 6, mtime=0)
+                files.write_bytes(folder / f"{name}.gz", data, permissions=0o600)
     except OSError as err:
         raise StorageError(f"the viewer's files cannot be kept in {folder}: {os_reason(err)}") from err

@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
+from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Episode, Recording, rewrite_recording
@@ -22,7 +23,6 @@ from tupli_mcap.replay.certify import Certifier
 from tupli_mcap.replay.movie import RenderedFrames, check_movie, write_movie
 from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.starts import EpisodePlan
-from tupli_mcap.storage.sidecar import Notes
 
 _KINDS: Final = (".mcap", ".mp4", ".gif")
 _FPS: Final = 30.0  # if neither the recording nor the environment has the duration of a step
@@ -145,8 +145,7 @@ def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
 
 
 def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> list[int]:
-    deleted = _deleted(recording)
-    known = [number for number in recording.index["episode"].tolist() if number not in deleted]
+    known = _known(recording)
     if not known:
         raise RecordingError(f"{recording.name} has no episodes to render")
     if episodes is None:
@@ -160,16 +159,18 @@ def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> 
     return list(dict.fromkeys(numbers))
 
 
-def _deleted(recording: Recording) -> set[int]:
-    return set() if recording.path is None else Notes.read(recording.path).about(recording.metadata).deleted
+def _known(recording: Recording) -> list[int]:
+    """The numbers of the episodes that are not deleted."""
+    numbers: list[int] = recording.index["episode"][candidates(recording)].tolist()
+    return numbers
 
 
 def _write(
     recording: Recording, goal: Path, kind: str, frames: RenderedFrames, order: list[int], fps: float
 ) -> None:
     if kind == ".mcap":
-        deleted = _deleted(recording)
-        kept = [n for n in recording.index["episode"].tolist() if n not in deleted] if deleted else None
+        known = _known(recording)
+        kept = None if len(known) == len(recording) else known
         rewrite_recording(recording, goal, episodes=kept, frames=frames)
         return
     with replacing(goal) as (_, temporary):

@@ -141,6 +141,24 @@ def scratch() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
+def web_viewer(program: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], int, int]]:
+    """The web viewer within the block: its process, the port that takes data, the port of its page.
+
+    Raises:
+        ViewerError: it does not start.
+    """
+    data, page = free_port(), free_port()
+    ports = ["--serve-web", "--port", str(data), "--web-viewer-port", str(page)]
+    with scratch() as folder, (folder / "log").open("wb") as log:
+        process = start(program, *ports, *arguments, log=log)
+        try:
+            wait_for_ports(process, [data, page], folder / "log")
+            yield process, data, page
+        finally:
+            end(process)
+
+
+@contextlib.contextmanager
 def stopped_by_signals() -> Iterator[None]:
     """SIGTERM and SIGHUP raise KeyboardInterrupt within the block, as Ctrl-C does; only in the main thread."""
 

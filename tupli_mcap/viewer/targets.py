@@ -27,6 +27,7 @@ from tupli_mcap.viewer.process import (
     stopped_by_signals,
     viewer_program,
     wait_for_ports,
+    web_viewer,
 )
 from tupli_mcap.viewer.sdk import ViewerError
 
@@ -184,17 +185,11 @@ def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
     program = viewer_program()
     with scratch() as folder, stopped_by_signals():
         path = to_file(plans, folder / "replay.rrd")
-        ports = [free_port(), free_port()]
-        words = ["--serve-web", "--port", str(ports[0]), "--web-viewer-port", str(ports[1])]
-        with (folder / "log").open("wb") as log:
-            process = start(program, *words, "--server-memory-limit", "100%", str(path), log=log)
-        try:
-            wait_for_ports(process, ports, folder / "log")
-            data = quote(f"rerun+http://{LOCAL}:{ports[0]}/proxy", safe="")
-            tell(f"http://{LOCAL}:{ports[1]}/?url={data}")
+        with (
+            contextlib.suppress(KeyboardInterrupt),
+            web_viewer(program, "--server-memory-limit", "100%", str(path)) as (process, data, page),
+        ):
+            source = quote(f"rerun+http://{LOCAL}:{data}/proxy", safe="")
+            tell(f"http://{LOCAL}:{page}/?url={source}")
             process.wait()
             raise ViewerError(f"the web viewer ended unexpectedly, with exit code {process.returncode}")
-        except KeyboardInterrupt:
-            return
-        finally:
-            end(process)
