@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
-from tupli_mcap.cli.share import account, browse, bundle, exchange, people, serve, trust, upkeep
+from tupli_mcap.cli.share import account, bundle, exchange, people, serve, trust
 from tupli_mcap.cli.terminal import (
     fail,
     fetch_progress,
@@ -261,7 +261,7 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "info": info.info,
         "episodes": lists.episodes,
         "view": replay.replay,
-        "browse": browse.browse,
+        "browse": serve.browse,
         "plot": render.plot,
         "render": render.render,
     },
@@ -295,8 +295,8 @@ _COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
         "pull": exchange.pull,
         "publish": exchange.publish,
         "unpublish": exchange.unpublish,
-        "backup-server": upkeep.backup_server,
-        "restore-server": upkeep.restore_server,
+        "backup-server": serve.backup_server,
+        "restore-server": serve.restore_server,
     },
     "People": {
         "list-users": people.list_users,

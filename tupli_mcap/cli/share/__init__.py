@@ -4,8 +4,6 @@ bundle     bundle, import, export: files
 exchange   push, pull, publish, unpublish: between a directory and a server
 account    login, logout, whoami, signup, password
 people     users, groups, roles, tokens for machines
-browse     browse: recordings in a browser
-serve      serve: the server
-upkeep     backup-server, restore-server
+serve      browse: on this machine; serve, backup-server, restore-server: the server
 trust      trust, untrust: whose code may run
 """

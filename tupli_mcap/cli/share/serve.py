@@ -1,4 +1,4 @@
-"""The command serve: starts a server on a directory."""
+"""Commands that serve recordings: browse, on this machine; serve, to others; and copies of all data of a server."""
 
 from __future__ import annotations
 
@@ -7,13 +7,44 @@ from typing import Annotated
 
 import typer
 
-from tupli_mcap.cli.terminal import say
+from tupli_mcap.cli.options import Json, local_path
+from tupli_mcap.cli.output import bytes_of, counted, print_result
+from tupli_mcap.cli.terminal import flush, say
 from tupli_mcap.errors import missing_extra
 
-__all__ = ["Blobs", "Database", "Served", "serve"]
+__all__ = ["backup_server", "browse", "restore_server", "serve"]
 
-Served = Annotated[Path, typer.Argument(metavar="DIR", help="The directory of the server's data.")]
-Database = Annotated[
+
+def browse(
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="PATH", help="A directory, a storage, or a recording.", parser=local_path),
+    ] = Path(),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="The port; 0 takes a free one.")] = 0,
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="Only print the address, and open no browser.")
+    ] = False,
+) -> None:
+    """Look through recordings in a browser.
+
+    Shows datasets, tables of episodes, films and curves. Its pages are served on 127.0.0.1
+    until Ctrl-C. They change no file, and load nothing from other servers. Reload a page to
+    see new recordings, also running ones. With ?format=json, a page is JSON.
+    """
+    try:
+        from tupli_mcap.page.app import browse as show_pages
+    except ImportError as err:
+        raise missing_extra("`tupli-mcap browse` needs FastAPI, Jinja2 and uvicorn", "browse") from err
+
+    def tell(address: str) -> None:
+        say(f"{path} at {address} (Ctrl-C ends it)")
+        flush()
+
+    show_pages(path, port, tell, show=not no_open)
+
+
+_Served = Annotated[Path, typer.Argument(metavar="DIR", help="The directory of the server's data.")]
+_Database = Annotated[
     str,
     typer.Option(
         envvar="TUPLI_MCAP_DATABASE",
@@ -21,7 +52,7 @@ Database = Annotated[
         help="The database's URL, such as postgresql+psycopg://…; by default, SQLite in DIR.",
     ),
 ]
-Blobs = Annotated[
+_Blobs = Annotated[
     str,
     typer.Option(
         envvar="TUPLI_MCAP_BLOBS",
@@ -69,15 +100,15 @@ _Accel = Annotated[
 
 
 def serve(
-    directory: Served,
+    directory: _Served,
     host: _Host = "127.0.0.1",
     port: _Port = 8080,
     open_signup: _Signup = False,
     min_password: _MinPassword = 8,
     guests: _Guests = False,
     workers: _Workers = 1,
-    database: Database = "",
-    blobs: Blobs = "",
+    database: _Database = "",
+    blobs: _Blobs = "",
     presigned: _Presigned = False,
     quota: _Quota = None,
     query_seconds: _Seconds = 30,
@@ -119,3 +150,58 @@ def serve(
         open_metrics=open_metrics,
     )
     run(settings, Listening(host, port, workers, certificate, key, trusted_proxy or ()), tell)
+
+
+def backup_server(
+    directory: _Served,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="The backup's directory: a new one, or an earlier backup."),
+    ],
+    database: _Database = "",
+    blobs: _Blobs = "",
+    as_json: Json = False,
+) -> None:
+    """Back up a server's data into a directory, while it runs.
+
+    Into an earlier backup, only new files are copied. `serve` can serve a backup as it is.
+    """
+    _copy(directory, output, database, blobs, "backed up", as_json=as_json)
+
+
+def restore_server(
+    backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The directory that backup-server wrote.")],
+    directory: _Served,
+    database: _Database = "",
+    blobs: _Blobs = "",
+    as_json: Json = False,
+) -> None:
+    """Restore a server's data from a backup.
+
+    DIR, the database and the bucket have to be empty. They may be others than those of the
+    backup: this is how to move a server.
+    """
+    _copy(directory, backup, database, blobs, "restored", as_json=as_json)
+
+
+def _copy(directory: Path, backup: Path, database: str, blobs: str, done: str, *, as_json: bool) -> None:
+    try:
+        from tupli_mcap.server.backup import back_up, restore
+        from tupli_mcap.server.settings import Settings
+    except ImportError as err:
+        raise missing_extra("a server's data need SQLAlchemy and Alembic", "server") from err
+    settings = Settings(directory.absolute(), database=database, blobs=blobs)
+    copied = restore(backup, settings) if done == "restored" else back_up(settings, backup)
+    contents = ", ".join(
+        counted(count, what)
+        for count, what in (
+            (copied.users, "user"),
+            (copied.recordings, "recording"),
+            (copied.artifacts, "artifact"),
+        )
+    )
+    print_result(
+        {"directory": str(directory), "backup": str(backup), **copied._asdict()},
+        f"{done} {contents} ({bytes_of(copied.bytes)}); {counted(copied.copied, 'file')} copied",
+        as_json=as_json,
+    )
