@@ -21,7 +21,6 @@ from tupli_mcap.server.pages.session import shelf_of
 from tupli_mcap.server.routes import (
     accounts,
     episodes,
-    foxglove,
     items,
     operation,
     pytupli,
@@ -74,7 +73,7 @@ def create_app(library: Library) -> FastAPI:
     app.state.library = library
     app.state.metrics = Metrics()
     app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
-    for routes in (operation, accounts, items, episodes, query, recordings, viewers, foxglove):
+    for routes in (operation, accounts, items, episodes, query, recordings, viewers):
         app.include_router(routes.router, responses=_REFUSALS)
     app.include_router(pytupli.router, responses=_REFUSALS_OF_PYTUPLI)
     tell_errors(app)

@@ -8,7 +8,6 @@ query        episodes of any recordings as one recording
 recordings   recordings: sent, fetched
 bodies       the bytes of an answer, whole or a range
 operation    health and metrics
-viewers      an episode as a file for the Rerun viewer
-foxglove     the routes for Foxglove's remote data loader
+viewers      an episode as a file for Rerun; the routes for Foxglove's remote data loader
 pytupli      PyTupli's own routes
 """
