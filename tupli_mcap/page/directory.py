@@ -17,8 +17,8 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import Catalog
-from tupli_mcap.storage.catalog.entries import entry_of
-from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
+from tupli_mcap.storage.catalog.entries import entry_of, put_entry
+from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 
 __all__ = ["CACHE_BYTES", "DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
 
@@ -148,14 +148,7 @@ class FileShelf(_OpenToAll):
         if self._known is not None and self._known == _stamp(self._path.parent, name):
             return
         with entry_of(self._path.parent, name) as entry:
-            self._catalog.put_recording(
-                name,
-                entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
-                uuid=entry.uuid,
-                benchmark_id=entry.benchmark_id,
-                runs=entry.runs,
-                rows=entry.rows,
-            )
+            put_entry(self._catalog, name, entry)
         self._known = None if entry.live else entry.stamp
 
     def open(self, recording: str) -> Recording:

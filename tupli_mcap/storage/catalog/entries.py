@@ -28,11 +28,12 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.base import LOCAL_USER
+from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.rows import EpisodeRow
-from tupli_mcap.storage.listing import RecordingStamp, stamp_of
+from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
-__all__ = ["Entry", "entry_of", "read_ahead", "rows_of", "runs_of"]
+__all__ = ["Entry", "entry_of", "put_entry", "read_ahead", "rows_of", "runs_of"]
 
 _MOST_EPISODES = 50_000  # of a recording that another process reads, since its rows are in memory twice
 _TRIAL = 1.0  # seconds of reading in this process, to estimate whether more processes pay
@@ -73,6 +74,18 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
         numbers = recording.index["episode"].tolist()
         rows = rows_of(recording, notes.about(recording.metadata), live=live)
         yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
+
+
+def put_entry(catalog: Catalog, relative: str, entry: Entry) -> None:
+    """Catalogues a recording; while somebody writes to it, its stamp says that it must be read again."""
+    catalog.put_recording(
+        relative,
+        entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
+        uuid=entry.uuid,
+        benchmark_id=entry.benchmark_id,
+        runs=entry.runs,
+        rows=entry.rows,
+    )
 
 
 def runs_of(recording: Recording) -> str:

@@ -25,9 +25,9 @@ from tupli_mcap.storage.catalog.catalog import (
     CatalogUnusableError,
     RecordingStamp,
 )
-from tupli_mcap.storage.catalog.entries import Entry, entry_of, read_ahead
+from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry, read_ahead
 from tupli_mcap.storage.catalog.place import catalog_path
-from tupli_mcap.storage.listing import LIVE, scan, stamp_of
+from tupli_mcap.storage.listing import scan, stamp_of
 
 __all__ = ["SyncedCatalog"]
 
@@ -263,14 +263,7 @@ class SyncedCatalog:
     def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue a recording unless it is a copy; returns its number of episodes."""
         if not self._is_copy(relative, entry):
-            self._catalog.put_recording(
-                relative,
-                entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
-                uuid=entry.uuid,
-                benchmark_id=entry.benchmark_id,
-                runs=entry.runs,
-                rows=entry.rows,
-            )
+            put_entry(self._catalog, relative, entry)
         return len(entry.numbers)
 
     def _is_copy(self, relative: str, entry: Entry) -> bool:
