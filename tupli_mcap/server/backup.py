@@ -23,12 +23,13 @@ from sqlalchemy import Connection, func, inspect, select, text
 
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.progress import Progress, progress
-from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, DirectoryBlobs, LostError
+from tupli_mcap.server.blobs import PIECE, Blobs, LostError, blobs_of
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, METADATA, PENDING, UPLOAD, USER
 from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.database import remove_database
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
 from tupli_mcap.storage.texts import unescape_text
 
@@ -72,7 +73,7 @@ def back_up(settings: Settings, target: Path) -> Copied:
     kept.sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.closing(Database(place.database, _UNLIMITED)) as source:
         for attempt in range(_ATTEMPTS):
-            _remove(new)
+            remove_database(new)
             with contextlib.closing(Database(f"sqlite:///{new}", _UNLIMITED)) as made:
                 _copy_tables(source, made)
                 contents = _contents(made)
@@ -126,11 +127,7 @@ class _Place(NamedTuple):
 
 
 def _place_of(settings: Settings) -> _Place:
-    sqlite = settings.own / "server.sqlite"
-    blobs: Blobs = (
-        BucketBlobs(settings.blobs) if settings.blobs else DirectoryBlobs(settings.directory, settings.making)
-    )
-    return _Place(settings.database or f"sqlite:///{sqlite}", sqlite, blobs)
+    return _Place(settings.database_url, settings.own / "server.sqlite", blobs_of(settings))
 
 
 # --- tables ---
@@ -220,8 +217,3 @@ def _copy_file(
         if found.hexdigest() != digest:
             raise FormatError(f"{name} is damaged: expected the SHA-256 {digest}, found {found.hexdigest()}")
         target.keep(name, Path(file.name))
-
-
-def _remove(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)

@@ -16,9 +16,10 @@ from tupli_mcap import files
 from tupli_mcap.errors import StorageError
 from tupli_mcap.remote import open_store, shown, why
 from tupli_mcap.server.database import UnavailableError
+from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["PIECE", "Blobs", "BucketBlobs", "DirectoryBlobs", "LostError"]
+__all__ = ["PIECE", "Blobs", "BucketBlobs", "DirectoryBlobs", "LostError", "blobs_of"]
 
 PIECE: Final = 4 << 20
 """The size of the pieces in which a body is fetched (bytes)."""
@@ -60,6 +61,13 @@ class Blobs(Protocol):
     def delete(self, name: str) -> None:
         """Deletes a name; nothing happens if there is no such name."""
         ...
+
+
+def blobs_of(settings: Settings) -> Blobs:
+    """Where a server keeps its bytes."""
+    if settings.blobs:
+        return BucketBlobs(settings.blobs)
+    return DirectoryBlobs(settings.directory, settings.making)
 
 
 class DirectoryBlobs:

@@ -24,6 +24,7 @@ from sqlalchemy.exc import (
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server import migrations, tables
+from tupli_mcap.storage.catalog.database import BUSY_MS, prepared_sqlite
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = [
@@ -39,7 +40,6 @@ __all__ = [
     "settle",
 ]
 
-_BUSY_MS = 30_000
 _STEPS = 20_000  # instructions of SQLite between two looks at the clock
 _CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
 # A writer on PostgreSQL holds this lock; no time limit is set for its statements.
@@ -175,32 +175,18 @@ def _engine(url: str, seconds: float) -> Engine:
             "give a URL such as postgresql+psycopg://…"
         )
     if engine.dialect.name == "sqlite":
-        _prepare_sqlite(engine)
+        # acknowledged changes survive a power loss
+        prepared_sqlite(engine, "journal_mode = WAL", "synchronous = FULL")
     else:
         _prepare_postgresql(engine, seconds)
     return engine
-
-
-def _prepare_sqlite(engine: Engine) -> None:
-    @event.listens_for(engine, "connect")
-    def _settings(connection: sqlite3.Connection, _: object) -> None:
-        connection.isolation_level = None  # transactions are begun below
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
-        connection.execute("PRAGMA synchronous = FULL")  # acknowledged changes survive a power loss
-
-    @event.listens_for(engine, "begin")
-    def _begin(connection: Connection) -> None:
-        # A writing transaction takes the lock at its start: SQLite lets no transaction that has read wait for it.
-        write = connection.get_execution_options().get("tupli_write")
-        connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
 
 def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     @event.listens_for(engine, "do_connect")
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
-        limits = f"-c lock_timeout={_BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
+        limits = f"-c lock_timeout={BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
         # To compile a statement (JIT) takes longer than to run it.
         kwargs["options"] = f"{kwargs.get('options', '')} {limits} -c jit=off"
 

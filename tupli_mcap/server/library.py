@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     EpisodeItem,
     FilterEQ,
 )
-from tupli_mcap.server.blobs import Blobs, BucketBlobs, DirectoryBlobs
+from tupli_mcap.server.blobs import blobs_of
 from tupli_mcap.server.database import (
     Database,
     UnavailableError,
@@ -71,14 +71,8 @@ class Library:
         self.settings = settings
         settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
         settings.making.mkdir(exist_ok=True)
-        self.database = Database(
-            settings.database or f"sqlite:///{settings.own / 'server.sqlite'}", settings.query_seconds
-        )
-        self.blobs: Blobs = (
-            BucketBlobs(settings.blobs)
-            if settings.blobs
-            else DirectoryBlobs(settings.directory, settings.making)
-        )
+        self.database = Database(settings.database_url, settings.query_seconds)
+        self.blobs = blobs_of(settings)
         self.items = Items(settings)
         self.tokens = Tokens(settings)
         self.uploads = Uploads(settings.own / "uploads")

@@ -56,6 +56,11 @@ class Settings:
         return self.directory / "server"
 
     @property
+    def database_url(self) -> str:
+        """The SQLAlchemy URL of the database."""
+        return self.database or f"sqlite:///{self.own / 'server.sqlite'}"
+
+    @property
     def making(self) -> Path:
         """The directory of files in the making; leftovers of killed processes are deleted later."""
         return self.own / "making"

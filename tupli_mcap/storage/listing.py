@@ -16,12 +16,12 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError, RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.from_file import metadata_at
 from tupli_mcap.remote import is_url, matching, shown
-from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
+from tupli_mcap.schema import EpisodeHeader, EpisodeItem
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
@@ -32,6 +32,7 @@ __all__ = [
     "ListedRecording",
     "RecordingStamp",
     "compactable",
+    "each_opened",
     "find_recordings",
     "is_storage",
     "list_recordings",
@@ -300,12 +301,13 @@ def _listed(
         return ListedRecording(name, error=str(err))
 
 
-def with_tuples(
-    headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
-) -> Iterator[EpisodeItem]:
-    """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
+def each_opened(
+    headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
+) -> Iterator[tuple[EpisodeHeader, Episode]]:
+    """The episodes of headers that are sorted by recording; each recording is open while its episodes are given.
 
-    A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
+    Raises:
+        NotFoundError: an episode was deleted meanwhile.
     """
     for name, same in itertools.groupby(headers, key=lambda header: header.recording):
         group = list(same)
@@ -314,10 +316,16 @@ def with_tuples(
             for header in group:
                 if header.episode not in positions:
                     raise NotFoundError(f"episode {header.id} was deleted meanwhile")
-                episode = recording.episodes[positions[header.episode]]
-                tuples = [
-                    RLTuple.from_env_step(s.state, s.action, s.reward, s.terminal, s.timeout, s.info or {})
-                    for s in episode
-                ]
-                # Header and steps are valid already.
-                yield EpisodeItem.model_construct(**dict(header), tuples=tuples)
+                yield header, recording.episodes[positions[header.episode]]
+
+
+def with_tuples(
+    headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
+) -> Iterator[EpisodeItem]:
+    """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
+
+    A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
+    """
+    for header, episode in each_opened(headers, open_recording):
+        # Header and steps are valid already.
+        yield EpisodeItem.model_construct(**dict(header), tuples=episode.tuples)

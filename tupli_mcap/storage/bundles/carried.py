@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
@@ -33,9 +32,6 @@ from tupli_mcap.storage.benchmark_json import (
     unpack,
 )
 from tupli_mcap.storage.texts import first_defect
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["carried_artifacts", "carried_benchmark", "carried_environment", "checked_signature"]
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tupli_mcap.errors import FormatError, NotFoundError, StepError, StorageError
+from tupli_mcap.errors import FormatError, StepError, StorageError
 from tupli_mcap.messages.frames import EncodedFrame
-from tupli_mcap.recording import EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.recording import Episode, EpisodeData, Recording, rewrite_recording, write_recording
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA
@@ -36,6 +35,7 @@ from tupli_mcap.storage.benchmark_json import (
     unpack,
 )
 from tupli_mcap.storage.bundles.carried import carried_environment
+from tupli_mcap.storage.listing import each_opened
 from tupli_mcap.storage.sidecar import Notes
 
 if TYPE_CHECKING:
@@ -240,32 +240,26 @@ def _carried(recording: Recording) -> Attachments:
 
 def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
     """The episodes of several recordings as values, one recording open at a time."""
-    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        with storage.open_recording(name) as recording:
-            positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
-            for header in group:
-                if header.episode not in positions:
-                    raise NotFoundError(f"episode {header.id} was deleted meanwhile")
-                episode = recording.episodes[positions[header.episode]]
-                steps = list(episode)
-                yield EpisodeData(
-                    states=[step.state for step in steps],
-                    actions=[step.action for step in steps],
-                    rewards=[step.reward for step in steps],
-                    terminals=[step.terminal for step in steps],
-                    timeouts=[step.timeout for step in steps],
-                    final_state=episode.final_state,
-                    seed=episode.seed,
-                    options=episode.options,
-                    metadata=episode.metadata,
-                    infos=None if episode.infos is None else [info or {} for info in episode.infos],
-                    end=episode.end,
-                    frames=_frames(recording, positions[header.episode]),
-                )
+    for _, episode in each_opened(headers, storage.open_recording):
+        steps = list(episode)
+        yield EpisodeData(
+            states=[step.state for step in steps],
+            actions=[step.action for step in steps],
+            rewards=[step.reward for step in steps],
+            terminals=[step.terminal for step in steps],
+            timeouts=[step.timeout for step in steps],
+            final_state=episode.final_state,
+            seed=episode.seed,
+            options=episode.options,
+            metadata=episode.metadata,
+            infos=None if episode.infos is None else [info or {} for info in episode.infos],
+            end=episode.end,
+            frames=_frames(episode),
+        )
 
 
-def _frames(recording: Recording, position: int) -> list[tuple[int, EncodedFrame]]:
-    if CAMERA not in recording.cameras:
+def _frames(episode: Episode) -> list[tuple[int, EncodedFrame]]:
+    if CAMERA not in episode.recording.cameras:
         return []
-    frames = recording.frames(position, CAMERA)
+    frames = episode.recording.frames(episode.position, CAMERA)
     return [(step, frames.encoded(i)) for i, step in enumerate(frames.steps.tolist())]

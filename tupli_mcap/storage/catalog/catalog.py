@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final, TypeVar
@@ -186,12 +185,8 @@ class Catalog:
         with self._read() as connection:
             return queries.declared_keys(connection)
 
-    @contextlib.contextmanager
-    def _read(self) -> Iterator[Connection]:
-        with self._database.transaction() as connection:
-            yield connection
+    def _read(self) -> AbstractContextManager[Connection]:
+        return self._database.transaction()
 
-    @contextlib.contextmanager
-    def _write(self) -> Iterator[Connection]:
-        with self._database.transaction(write=True) as connection:
-            yield connection
+    def _write(self) -> AbstractContextManager[Connection]:
+        return self._database.transaction(write=True)

@@ -22,7 +22,7 @@ from tupli_mcap.storage.atomic import Lock, LockError, locked
 from tupli_mcap.storage.catalog.place import is_private
 from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
 
-_BUSY_MS: Final = 30_000
+BUSY_MS: Final = 30_000
 _ATTEMPTS: Final = 100  # to open a file that others replace
 _CACHE_KIB: Final = (
     32 * 1024
@@ -191,7 +191,7 @@ class Database:
         """Make an empty catalog beside the file and rename it, so that nobody opens an incomplete one."""
         self._engine.dispose()
         new = self.path.with_name(f"{self.path.name}.new")
-        _remove(new)
+        remove_database(new)
         os.close(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
         engine = _engine(new)
         try:
@@ -200,12 +200,12 @@ class Database:
             with contextlib.closing(engine.raw_connection()) as raw:
                 raw.cursor().execute("PRAGMA journal_mode = WAL")
             engine.dispose()
-            _remove(self.path)
+            remove_database(self.path)
             new.replace(self.path)
         except BaseException:
             engine.dispose()
             with contextlib.suppress(OSError):
-                _remove(new)
+                remove_database(new)
             raise
         self._identity = None  # until it is open
 
@@ -305,14 +305,18 @@ def _engine(path: Path, *, lock: Path | None = None) -> Engine:
 
 
 def _prepared(engine: Engine) -> Engine:
-    """An engine whose connections have the settings and functions of catalogs."""
+    """An engine whose connections have the settings of catalogs."""
+    return prepared_sqlite(engine, "synchronous = NORMAL", f"cache_size = -{_CACHE_KIB}")
+
+
+def prepared_sqlite(engine: Engine, *settings: str) -> Engine:
+    """An engine whose connections have these settings of SQLite, and begin transactions themselves."""
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
         connection.isolation_level = None  # transactions are begun below
-        connection.execute(f"PRAGMA busy_timeout = {_BUSY_MS}")
-        connection.execute("PRAGMA synchronous = NORMAL")
-        connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+        for setting in (f"busy_timeout = {BUSY_MS}", *settings):
+            connection.execute(f"PRAGMA {setting}")
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -369,7 +373,7 @@ def _create_tables(connection: Connection) -> None:
     connection.exec_driver_sql(f"PRAGMA user_version = {VERSION}")
 
 
-def _remove(path: Path) -> None:
+def remove_database(path: Path) -> None:
     """Delete a database and SQLite's files beside it, which would be taken for those of the next one."""
     for suffix in ("", "-wal", "-shm", "-journal"):  # the file first: nobody may open it without the others
         path.with_name(path.name + suffix).unlink(missing_ok=True)
