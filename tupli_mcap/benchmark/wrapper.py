@@ -119,9 +119,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         self._recording = True
         self._recorder: RecordEpisodes | None = None
         self._path: Path | None = None
-        self._benchmark: Benchmark | None = (
-            None  # as it is stored, so that recording need not ask the storage again
-        )
+        # as it is stored, so that recording need not ask the storage again
+        self._benchmark: Benchmark | None = None
         # resets without a step, in order: a later one goes on with the random stream of the one before
         self._pending: list[PendingReset] = []
 
@@ -314,9 +313,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             self._finish()
             self._path = None
         self.id = stored.id
-        self._benchmark = self.storage.load_benchmark(
-            stored.id
-        )  # whose text names the id, as recordings carry it
+        # whose text names the id, as recordings carry it
+        self._benchmark = self.storage.load_benchmark(stored.id)
         return stored.id
 
     @classmethod

@@ -35,9 +35,8 @@ __all__ = [
 JSON_VERSION: Final = 1
 """The version of what --json prints. It grows when a key goes away or changes its meaning, not when a key is added."""
 
-_OWN_LEVELS: Final = (
-    6  # nested lists and records of a result; deeper values are a user's, and stay as they are
-)
+# nested lists and records of a result; deeper values are a user's, and stay as they are
+_OWN_LEVELS: Final = 6
 _GAP = "  "
 _WIDEST = 100  # columns of running text
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")

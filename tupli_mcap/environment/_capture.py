@@ -213,9 +213,8 @@ def _told_of_many(envs: Any) -> tuple[str | None, dict[str, Any] | None]:
 def _plain_spec(spec: Any) -> dict[str, Any]:
     """Raises ValueError or TypeError where JSON has no form for it."""
     names = [field.name for field in dataclasses.fields(spec) if field.init]
-    names.remove(
-        "vector_entry_point"
-    )  # is for vector environments, and differs between versions of gymnasium
+    # is for vector environments, and differs between versions of gymnasium
+    names.remove("vector_entry_point")
     fields = {name: getattr(spec, name) for name in names}
     fields["entry_point"] = entry_point_name(spec.entry_point)
     fields["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]

@@ -25,11 +25,8 @@ READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most;
 MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
 _INFO_PLACES, _MOST_KEYS = 40, 64
-SUCCESS, INFO, METADATA = (
-    "success",
-    "info: ",
-    "metadata: ",
-)  # a key of `Measured.numbers`, and how others begin
+# a key of `Measured.numbers`, and how others begin
+SUCCESS, INFO, METADATA = "success", "info: ", "metadata: "
 _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 
 
@@ -163,9 +160,8 @@ def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
         if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
             if isinstance(value, np.floating):
                 value = float(value)  # a float32 cannot be compared with LARGEST
-            number = (
-                float(value) if -LARGEST <= value <= LARGEST else np.nan
-            )  # an integer may be too large for a float
+            # an integer may be too large for a float
+            number = float(value) if -LARGEST <= value <= LARGEST else np.nan
             if np.isfinite(number):
                 yield key, number
 

@@ -94,9 +94,8 @@ class Certifier:
         self._settled = False  # whether `_plain` is known
         self._deterministic: bool | None = None
         self._stopped = False
-        self._any_options: bool | None = (
-            None  # whether options that could run code are trusted; None: not asked yet
-        )
+        # whether options that could run code are trusted; None: not asked yet
+        self._any_options: bool | None = None
 
     def run(self) -> Certificate:
         """Runs and compares the episodes."""

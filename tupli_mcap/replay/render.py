@@ -199,9 +199,8 @@ class _Renderer(Certifier):
         self._fps: float | None = None
         self.size = (0, 0)
         self.divergence: Divergence | None = None
-        self._earlier: Divergence | None = (
-            None  # of an episode that is run only because chosen ones continue it
-        )
+        # of an episode that is run only because chosen ones continue it
+        self._earlier: Divergence | None = None
 
     @property
     def fps(self) -> float:

@@ -106,9 +106,8 @@ def restore(backup: Path, settings: Settings) -> Copied:
     settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))
-        copy = (
-            folder / "server.sqlite"
-        )  # a copy, because opening it upgrades the tables of an earlier version
+        # a copy, because opening it upgrades the tables of an earlier version
+        copy = folder / "server.sqlite"
         shutil.copyfile(kept.sqlite, copy)
         source = stack.enter_context(contextlib.closing(Database(f"sqlite:///{copy}", _UNLIMITED)))
         target = stack.enter_context(contextlib.closing(Database(place.database, _UNLIMITED)))

@@ -82,9 +82,8 @@ def _bars(values: Any) -> Any:
         return rr.BarChart(tensor_array([finite], ["episode"]), color=_BAR)
     means, bounds = pooled(finite, _MOST_BARS)
     bars, places = (tensor_array([column], ["episode"]) for column in (means, bounds[:-1]))
-    return rr.BarChart(
-        bars, abscissa=places, widths=np.diff(bounds), color=_BAR
-    )  # a bar is as wide as the episodes that it averages
+    # a bar is as wide as the episodes that it averages
+    return rr.BarChart(bars, abscissa=places, widths=np.diff(bounds), color=_BAR)
 
 
 def card(recording: Recording) -> str:

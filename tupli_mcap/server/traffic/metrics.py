@@ -17,9 +17,8 @@ from tupli_mcap.storage.catalog.tables import TALLY
 
 __all__ = ["Metrics"]
 
-_SHARED: Final = (
-    "PROMETHEUS_MULTIPROC_DIR"  # the directory in which the processes of one server count together
-)
+# the directory in which the processes of one server count together
+_SHARED: Final = "PROMETHEUS_MULTIPROC_DIR"
 _SECONDS: Final = (0.005, 0.02, 0.1, 0.5, 2, 10, 60, 600)
 
 

@@ -126,9 +126,8 @@ def _keyring() -> KeyringBackend | None:
     except ImportError:
         return None
     backend = keyring.get_keyring()
-    return (
-        backend if backend.priority >= 1 else None
-    )  # less are those that keep nothing, or without protection
+    # less are those that keep nothing, or without protection
+    return backend if backend.priority >= 1 else None
 
 
 def _into_keyring(account: str, tokens: dict[str, str]) -> bool:
