@@ -16,9 +16,9 @@ import shutil
 import tempfile
 import uuid
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 from unittest import mock
 
 import gymnasium as gym
@@ -45,6 +45,9 @@ START_NS = 1_700_000_000_000_000_000
 STEP_NS = 1_000_000
 BOOT = "00000000-0000-0000-0000-000000000000"  # none of any machine: what is not shown to be whole does not count
 BOOT_ID = "tupli_mcap.recording.write.writer.boot_id"
+
+PLAIN: Final[dict[str, Any]] = {"compression": "none", "attachments": {}, "capture": "none"}
+"""The options of recordings whose bytes are the same everywhere."""
 
 Log = dict[str, Any]
 Observe = Callable[[int, int], Any]
@@ -218,9 +221,7 @@ def stacked(path: Path, axis: int = 0, **options: Any) -> list[Log]:
         window = TransformObservation(
             window, lambda frames: np.moveaxis(frames, 0, axis), spaces.Box(0, 255, (2, 3, 3), np.uint8)
         )
-    with RecordEpisodes(
-        window, path, compression="none", attachments={}, capture="none", chunk_size=400, **options
-    ) as recorder:
+    with RecordEpisodes(window, path, **PLAIN, chunk_size=400, **options) as recorder:
         roll(recorder, env, [3, 4, 2], action)
     episodes = expected(env)
     for episode in episodes:
@@ -234,9 +235,7 @@ def png_images(path: Path) -> list[Log]:
     env = Played(CAMERA, picture, ENDS)
     with (
         mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png),
-        RecordEpisodes(
-            env, path, image_format="png", compression="none", attachments={}, capture="none", chunk_size=400
-        ) as recorder,
+        RecordEpisodes(env, path, image_format="png", **PLAIN, chunk_size=400) as recorder,
     ):
         roll(recorder, env, [3, 4, 2], action)
     return expected(env)
@@ -271,9 +270,7 @@ def dict_with_images(path: Path) -> list[Log]:
 
     actions = spaces.Tuple((spaces.Discrete(2), spaces.Box(-1, 1, (2, 2), np.float64)))
     env = Played(space, observe, [(3, "terminal"), (5, "timeout")], actions)
-    with RecordEpisodes(
-        env, path, compression="none", attachments={}, capture="none", chunk_size=300
-    ) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, chunk_size=300) as recorder:
         roll(recorder, env, [3, 5, 2], lambda t: (np.int64(t % 2), np.full((2, 2), t / 3)))
     return expected(env)
 
@@ -309,9 +306,7 @@ def variable(path: Path) -> list[Log]:
         }
 
     env = Played(space, observe, [(4, "terminal"), (3, "timeout")])
-    with RecordEpisodes(
-        env, path, compression="none", attachments={}, capture="none", chunk_size=700
-    ) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, chunk_size=700) as recorder:
         roll(recorder, env, [4, 3, 2], action)
     return expected(env)
 
@@ -330,7 +325,7 @@ def every_dtype(path: Path) -> list[Log]:
         return {key: values[key] for key in leaves}
 
     env = Played(spaces.Dict(list(leaves.items())), observe, [(3, "timeout")])
-    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none") as recorder:
+    with RecordEpisodes(env, path, **PLAIN) as recorder:
         roll(recorder, env, [3, 1], action)
     return expected(env)
 
@@ -347,13 +342,7 @@ def widened(path: Path) -> list[Log]:
         reward=lambda t: np.array([t / 4, -1.0], np.float32),
     )
     reward_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-    options: dict[str, Any] = {
-        "compression": "none",
-        "attachments": {},
-        "capture": "none",
-        "reward_space": reward_space,
-    }
-    with RecordEpisodes(env, path, **options) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, reward_space=reward_space) as recorder:
         roll(recorder, env, [3], action)
     return expected(env)
 
@@ -366,9 +355,7 @@ def infos(path: Path) -> list[Log]:
         return {**found, "score": np.arange(t, dtype=np.int8), "missing": None} if t == 2 else found
 
     env = Played(POLE, pole, [(3, "terminal")], info=info)
-    with RecordEpisodes(
-        env, path, compression="none", attachments={}, capture="none", record_info=names
-    ) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, record_info=names) as recorder:
         roll(recorder, env, [3, 2], action)
     return expected(
         env, infos=lambda log: [{k: v for k, v in one.items() if k in names} for one in log["infos"]]
@@ -382,9 +369,7 @@ def every_info(path: Path) -> list[Log]:
         [(3, "timeout")],
         info=lambda t: {} if t == 1 else {"a": (t, {2.5: b"\0"}), "n": np.float32(np.nan)},
     )
-    with RecordEpisodes(
-        env, path, compression="none", attachments={}, capture="none", record_info=True
-    ) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, record_info=True) as recorder:
         roll(recorder, env, [3], action)
     return expected(env, infos=lambda log: log["infos"])
 
@@ -397,9 +382,7 @@ def vector(
 ) -> list[Log]:
     envs = [Played(space, observe, [(2 + i, "terminal"), (3, "timeout")]) for i in range(3)]
     inner = gym.vector.SyncVectorEnv([lambda env=env: env for env in envs], autoreset_mode=mode)  # type: ignore[misc]
-    with recorded_vector.RecordEpisodes(
-        inner, path, compression="none", attachments={}, capture="none"
-    ) as recorder:
+    with recorded_vector.RecordEpisodes(inner, path, **PLAIN) as recorder:
         recorder.reset(seed=11)
         for t in range(9):
             recorder.step(np.array([-1, 0, 1]) if t % 2 else np.array([1, 1, 1]))
@@ -409,12 +392,7 @@ def vector(
 def appended(path: Path) -> list[Log]:
     env = Played(POLE, pole, [(3, "terminal"), (2, "timeout")])
     for mode, lengths in (("x", [3, 1]), ("a", [2, 2])):
-        options: Mapping[str, Any] = {
-            "compression": "none",
-            "attachments": {},
-            "capture": "none",
-            "mode": mode,
-        }
+        options: dict[str, Any] = {**PLAIN, "mode": mode}
         with RecordEpisodes(env, path, **options) as recorder:
             roll(recorder, env, lengths, action)
     return expected(env)
@@ -423,7 +401,7 @@ def appended(path: Path) -> list[Log]:
 def continued(path: Path) -> list[Log]:
     """Stepped on after an end, without a reset: another episode, which starts at the final state."""
     env = Played(POLE, pole, [(2, "terminal"), (3, "timeout")])
-    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none") as recorder:
+    with RecordEpisodes(env, path, **PLAIN) as recorder:
         roll(recorder, env, [5, 3], action)
     return expected(env)
 
@@ -443,7 +421,7 @@ def described(path: Path) -> list[Log]:
     """A run with a name and settings, and two annotations."""
     env = Played(POLE, pole, [(3, "terminal"), (2, "timeout")])
     run: dict[str, Any] = {"name": "ppo-3", "metadata": {"lr": 0.001}, "tags": ["a"], "split": "train"}
-    with RecordEpisodes(env, path, compression="none", attachments={}, capture="none", **run) as recorder:
+    with RecordEpisodes(env, path, **PLAIN, **run) as recorder:
         roll(recorder, env, [3, 2], action)
     with mock.patch("getpass.getuser", return_value="ada"):
         annotate_episodes(path, {"success": True, "note": "first"}, [0])
@@ -509,7 +487,7 @@ def named(path: Path) -> list[Log]:
 def frames(path: Path) -> list[Log]:
     """A picture of every second state and of each final one; an episode that was cut short, and one appended."""
     env = Painted(POLE, pole, [(3, "terminal"), (4, "timeout"), (9, "terminal")])
-    options: dict[str, Any] = {"compression": "none", "attachments": {}, "capture": "none", "chunk_size": 300}
+    options: dict[str, Any] = {**PLAIN, "chunk_size": 300}
     with mock.patch("tupli_mcap.recording.write.recorders.frames.encode_picture", stored_png):
         for mode, lengths in (("x", [3, 4, 3]), ("a", [2])):
             with RecordEpisodes(env, path, frames=2, mode=mode, **options) as recorder:  # type: ignore[arg-type]
@@ -526,12 +504,7 @@ def unfinished(path: Path, env: Played, **more: Any) -> list[Log]:
     """An unfinished recording: a file without a summary, and its journal."""
     with tempfile.TemporaryDirectory() as directory:
         live = Path(directory, path.name)
-        options: dict[str, Any] = {
-            "compression": "none",
-            "attachments": {},
-            "capture": "none",
-            "chunk_size": 400,
-        }
+        options: dict[str, Any] = {**PLAIN, "chunk_size": 400}
         with RecordEpisodes(env, live, durability="step", **options, **more) as recorder:
             roll(recorder, env, [3, 4, 2], action)
             keep(live, path)
@@ -560,9 +533,7 @@ def unfinished_holes(path: Path) -> list[Log]:
     env = Silent(POLE, pole, ENDS)
     with tempfile.TemporaryDirectory() as directory, mock.patch(BOOT_ID, return_value=""):
         live = Path(directory, path.name)
-        with RecordEpisodes(
-            env, live, compression="none", attachments={}, capture="none", chunk_size=400
-        ) as recorder:
+        with RecordEpisodes(env, live, **PLAIN, chunk_size=400) as recorder:
             recorder.reset(seed=7)
             for length in (3, 4, 9, 3, 4, 2):
                 for t in range(length):
