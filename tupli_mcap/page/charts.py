@@ -15,7 +15,7 @@ from markupsafe import Markup
 from tupli_mcap.arrays import Array
 from tupli_mcap.page.texts import number
 
-__all__ = ["Line", "histogram", "line_path", "lines", "over_time", "share", "track"]
+__all__ = ["Line", "histogram", "line_path", "lines", "over_time", "share"]
 
 _WIDE, _HIGH = 1000, 100  # size of a drawing before it is stretched
 _TICKS = 4
@@ -58,13 +58,8 @@ def line_path(at: Array, values: Array, across: tuple[float, float], up: tuple[f
     return "".join(parts)
 
 
-def track(line: Line, across: tuple[float, float], up: tuple[float, float], kind: str = "s0") -> Markup:
-    """One value of an episode over its steps, without axes."""
-    return _drawing(_PATH.format(f"line {kind}", line_path(*line, across, up)), "track")
-
-
 def lines(given: Sequence[Line], across: tuple[float, float], up: tuple[float, float]) -> Markup:
-    """The same value of several episodes, each in its colour."""
+    """The same value of some episodes over their steps, each in its colour, without axes."""
     paths = (_PATH.format(f"line s{i % 8}", line_path(*line, across, up)) for i, line in enumerate(given))
     return _drawing(Markup("").join(paths), "track")
 

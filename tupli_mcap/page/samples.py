@@ -32,6 +32,7 @@ _EPISODES: Final = 2_000
 _RECORDINGS: Final = 250  # most recordings that episodes are taken from
 _IDS_AT_ONCE: Final = 500
 _OPENED: Final = 5  # most recordings whose steps are read
+_OF_EACH: Final = 12  # about as many episodes of each of them are chosen
 _STEP_BYTES: Final = 2 << 20  # most bytes read of each of them
 
 
@@ -150,13 +151,11 @@ def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array
     return found, len(columns), len(positions)
 
 
-def sample_numbers(
-    shelf: Shelf, connection: Connection, dataset: Dataset, each: int = 12
-) -> list[tuple[str, list[int]]]:
-    """The numbers of about `each` episodes of a few recordings of a dataset, by recording."""
+def sample_numbers(shelf: Shelf, connection: Connection, dataset: Dataset) -> list[tuple[str, list[int]]]:
+    """The numbers of a few episodes of a few recordings of a dataset, by recording."""
     found = []
     for item in _evenly(dataset.recordings, _OPENED):
-        ids = _ids(shelf, connection, [item], min(1.0, each / max(1, item.episodes)))
+        ids = _ids(shelf, connection, [item], min(1.0, _OF_EACH / max(1, item.episodes)))
         chosen = seen_episodes(shelf, connection, EPISODE.c.id.in_(list(ids)))
         joined = EPISODE.join(RECORDING, of_one_recording())
         numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(chosen)).scalars()

@@ -37,6 +37,7 @@ __all__ = [
 PICKLE_NAME = "env.cloudpickle"
 DOCUMENT_NAME = "benchmark.json"
 ARTIFACT_PREFIX = "artifacts/"
+_MOST_PICKLE = 16 << 20  # bytes
 EDITABLE = ("name", "description")  # of a benchmark's metadata
 
 
@@ -176,10 +177,10 @@ def declared_spaces(serialized: str) -> list[gym.Space[Any]]:
         return []
 
 
-def recording_attachments(serialized: str, *, max_pickle: int = 16 << 20) -> dict[str, tuple[str, bytes]]:
+def recording_attachments(serialized: str) -> dict[str, tuple[str, bytes]]:
     """The attachments of a recording for its benchmark: name -> (media type, bytes).
 
-    A pickle of more than `max_pickle` bytes stays in the storage, and is added when a bundle is made.
+    A pickle of more than 16 MiB stays in the storage, and is added when a bundle is made.
     """
     try:
         record = unpack(serialized).record
@@ -187,7 +188,7 @@ def recording_attachments(serialized: str, *, max_pickle: int = 16 << 20) -> dic
         return {}
     attachments = {DOCUMENT_NAME: ("application/json", record.to_json())}
     if record.pickle is not None:
-        if len(record.pickle) > max_pickle:
+        if len(record.pickle) > _MOST_PICKLE:
             return {}
         attachments[PICKLE_NAME] = ("application/octet-stream", record.pickle)
     return attachments

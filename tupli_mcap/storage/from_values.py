@@ -16,7 +16,7 @@ from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.schema import Benchmark, Episode, EpisodeHeader
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 
-__all__ = ["conform", "episode_data", "infer_space", "record_each", "write_episodes"]
+__all__ = ["conform", "infer_space", "record_each", "write_episodes"]
 
 _NUMBERS = (bool, int, float, np.generic)
 _KINDS = "biuf"
@@ -79,7 +79,7 @@ def _same_numbers(given: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bo
     return np.array_equal(cast, given, equal_nan=True)
 
 
-def episode_data(
+def _episode_data(
     episode: Episode, space: tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]
 ) -> EpisodeData:
     """An episode's values in the form of its spaces (states, actions, rewards; None where rewards are
@@ -107,7 +107,7 @@ def episode_data(
     )
 
 
-def episode_spaces(
+def _episode_spaces(
     episodes: Sequence[Episode], declared: Sequence[gym.Space[Any]]
 ) -> tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]:
     """Spaces of the states, actions and rewards of episodes: the declared ones that fit, else inferred
@@ -134,10 +134,10 @@ def write_episodes(path: Path, episodes: Sequence[Episode], benchmark: Benchmark
         SpaceError: Values of one kind differ in structure from step to step, or have no space.
         StorageError: A value in the metadata has no JSON form.
     """
-    spaces = episode_spaces(episodes, declared_spaces(benchmark.serialized))
+    spaces = _episode_spaces(episodes, declared_spaces(benchmark.serialized))
     write_recording(
         path,
-        (episode_data(episode, spaces) for episode in episodes),
+        (_episode_data(episode, spaces) for episode in episodes),
         observation_space=spaces[0],
         action_space=spaces[1],
         reward_space=spaces[2],

@@ -29,6 +29,8 @@ from tupli_mcap.schema import EpisodeHeader
 
 __all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
 
+_MOST_OPEN = 64  # files; a few more while several threads read
+
 
 class ListedEpisodes(NamedTuple):
     """Episodes of one recording: the name that opens it, their numbers and listed lengths (int64, both)."""
@@ -242,13 +244,9 @@ class OpenFiles:
     """Opens files when they are read, and keeps those open that were read last. Thread-safe.
 
     A forked child, or a copy in another process, opens them itself.
-
-    Args:
-        limit: number of open files; a few more while several threads read.
     """
 
-    def __init__(self, limit: int = 64) -> None:
-        self._limit = limit
+    def __init__(self) -> None:
         self._forget()
 
     def _forget(self) -> None:
@@ -264,16 +262,13 @@ class OpenFiles:
             source = self._sources.get(where)
             if source is None:
                 source = self._sources[where] = open_source(where)
-                if len(self._sources) > self._limit:
+                if len(self._sources) > _MOST_OPEN:
                     self._sources.popitem(last=False)  # the last reader's reference closes it
             self._sources.move_to_end(where)
             return source
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"limit": self._limit}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        OpenFiles.__init__(self, state["limit"])
+    def __reduce__(self) -> tuple[type[OpenFiles], tuple[()]]:
+        return OpenFiles, ()
 
 
 class FileOfMany:

@@ -131,7 +131,7 @@ class Seen(NamedTuple):
         low, high = track.ends
         room = 0.04 * (high - low)
         across = (0.0, max(1.0, self.curves.read - 1.0))
-        return charts.track((track.at, track.values), across, (low - room, high + room))
+        return charts.lines([(track.at, track.values)], across, (low - room, high + room))
 
 
 def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:

@@ -130,7 +130,6 @@ def table_of(
     *,
     after: str = "",
     before: str = "",
-    most: int = _ROWS,
 ) -> Table:
     """A page of a table; by default, the first one. dataset: a key; empty for all datasets."""
     try:
@@ -143,7 +142,7 @@ def table_of(
             find_episodes(
                 connection,
                 wanted,
-                limit=most + 1,
+                limit=_ROWS + 1,
                 only=only,
                 of=of_some,
                 sort=order,
@@ -153,7 +152,7 @@ def table_of(
         )
     except FilterError as err:
         return Table((), str(err), err.position)
-    more, rows = len(found) > most, found[:most]
+    more, rows = len(found) > _ROWS, found[:_ROWS]
     if before:
         rows.reverse()
     count = len(rows)
