@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request, Response
@@ -39,7 +40,7 @@ def change_password(request: Request, visit: Code, old: _Text = "", new: _Text =
             accounts.change_password(connection, name, new, shortest=library.settings.min_password)
             audit(connection, name, "change_password", name)
 
-    response = tried(change, lambda wrong, status: _page(request, visit, wrong, status), "/account")
+    response = tried(change, partial(_page, request, visit), "/account")
     if response.status_code == 303:
         with library.database.writing() as connection:
             pair = library.tokens.pair(connection, name)
@@ -72,7 +73,7 @@ def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
             visit.library.tokens.delete_api_token(connection, visit.caller, token)
             audit(connection, visit.caller.name, "delete_api_token", token)
 
-    return tried(change, lambda wrong, status: _page(request, visit, wrong, status), "/account")
+    return tried(change, partial(_page, request, visit), "/account")
 
 
 @router.post("/account/access")

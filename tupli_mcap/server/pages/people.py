@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Form, Request, Response
@@ -35,7 +36,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
             accounts.create_user(connection, username, password, shortest=visit.library.settings.min_password)
             audit(connection, visit.caller.name, "create_user", username)
 
-    return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")
+    return tried(change, partial(_users, request, visit), "/users")
 
 
 @router.post("/users/delete")
@@ -45,7 +46,7 @@ def delete_user(request: Request, visit: Code, username: _Text = "") -> Response
     def change() -> None:
         visit.library.delete_user(visit.caller, username)
 
-    return tried(change, lambda wrong, status: _users(request, visit, wrong, status), "/users")
+    return tried(change, partial(_users, request, visit), "/users")
 
 
 def _users(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
@@ -70,9 +71,7 @@ def create_group(request: Request, visit: Code, name: _Text = "", description: _
         with visit.library.database.writing() as connection:
             accounts.create_group(connection, visit.caller, name, description or None)
 
-    return tried(
-        change, lambda wrong, status: _groups(request, visit, wrong, status), address("group", name=name)
-    )
+    return tried(change, partial(_groups, request, visit), address("group", name=name))
 
 
 def _groups(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
@@ -98,9 +97,7 @@ def add_member(
         with visit.library.database.writing() as connection:
             accounts.add_member(connection, visit.caller, name, user, [role])
 
-    return tried(
-        change, lambda wrong, status: _group(request, visit, name, wrong, status), address("group", name=name)
-    )
+    return tried(change, partial(_group, request, visit, name), address("group", name=name))
 
 
 @router.post("/group/members/delete")
@@ -111,9 +108,7 @@ def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text =
         with visit.library.database.writing() as connection:
             accounts.remove_member(connection, visit.caller, name, user)
 
-    return tried(
-        change, lambda wrong, status: _group(request, visit, name, wrong, status), address("group", name=name)
-    )
+    return tried(change, partial(_group, request, visit, name), address("group", name=name))
 
 
 @router.post("/group/delete")
@@ -124,7 +119,7 @@ def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
         with visit.library.database.writing() as connection:
             accounts.delete_group(connection, visit.caller, name)
 
-    return tried(change, lambda wrong, status: _group(request, visit, name, wrong, status), "/groups")
+    return tried(change, partial(_group, request, visit, name), "/groups")
 
 
 def _group(request: Request, visit: Visit, name: str, wrong: str = "", status: int = 200) -> Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Request, Response
@@ -62,7 +63,7 @@ def change(
                 raise DeniedError("nothing of this is yours; only the owners may publish it")
 
     again = address("share", dataset=dataset, filter=filter)
-    return tried(work, lambda wrong, status: _page(request, visit, dataset, filter, wrong, status), again)
+    return tried(work, partial(_page, request, visit, dataset, filter), again)
 
 
 def _turn_benchmark(
