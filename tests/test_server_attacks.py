@@ -1,7 +1,7 @@
 """What attackers try on a server, each really tried, on SQLite with a directory and on PostgreSQL with a bucket.
 
 tokens: forged, expired, of the wrong type          test_server.test_forged_tokens
-    swapped, and those of before a new password     TestTokens
+    swapped, revoked, those of before a new password, and those that make others TestTokens
     used twice, guessed                             test_server (refresh tokens; passwords are throttled)
 every id of somebody else                           test_server_access, test_server (what_may_not_be_read_is_not_there)
 rights that one has not: given, taken, taken over   TestRights, test_server.test_nobody_gives_rights_that_they_lack
@@ -163,6 +163,41 @@ class TestTokens:
         dan.ask("PUT", "/v1/users/dan/password", {"password": "new password", "old": "dan's password"})
         assert httpx.get(lab.url + path).status_code == 401
         lab.ann.ask("POST", "/v1/episodes/publish", {"group": "global", "published": False})
+
+    def test_the_end_of_a_sign_in_or_a_token_ends_tickets(self, lab: Lab) -> None:
+        pair = httpx.post(
+            f"{lab.url}/v1/tokens", json={"username": "ann", "password": "ann's password"}
+        ).json()
+        made = lab.ann.ask("POST", "/v1/api-tokens", {"name": "robot"})
+        for token, end in (
+            (pair["access_token"], ("POST", "/v1/tokens/end", {"refresh_token": pair["refresh_token"]})),
+            (made["token"], ("DELETE", f"/v1/api-tokens/{made['id']}", None)),
+        ):
+            paths = []
+            for address, told in (("/v1/tickets", {"recording": lab.recording}), ("/v1/query/tickets", {})):
+                answer = httpx.post(lab.url + address, json=told, headers=bearer(token))
+                paths.append(answer.json()["path"])
+            inner = httpx.get(lab.url + paths[1]).json()["sources"][0]["url"]
+            paths.append(f"/v1/{inner}")
+            assert [httpx.get(lab.url + path).status_code for path in paths] == [200] * 3
+            lab.ann.ask(*end)
+            assert [httpx.get(lab.url + path).status_code for path in paths] == [401] * 3
+
+    def test_a_machine_s_token_makes_no_more_of_itself(self, lab: Lab) -> None:
+        made = lab.ann.ask("POST", "/v1/api-tokens", {"name": "robot", "scope": "write"})
+        robot = Person(lab.url)
+        robot.headers = bearer(made["token"])
+        new = {"username": "ann", "password": "eve's password"}
+        for method, path, told in (
+            ("POST", "/v1/api-tokens", {"name": "another"}),
+            ("PUT", "/v1/users/ann/password", {"password": "eve's password", "old": "ann's password"}),
+            ("PUT", "/access/users/change-password", new),
+            ("DELETE", "/v1/users/ann", None),
+            ("DELETE", "/access/users/delete?username=ann", None),
+        ):
+            refused = robot.call(method, path, told)
+            assert refused.status_code == 403 and "sign in with the password" in refused.text, path
+        lab.ann.ask("DELETE", f"/v1/api-tokens/{made['id']}")
 
     def test_the_secret_is_the_server_s_alone(self, lab: Lab) -> None:
         secret = lab.directory / "server" / "secret"

@@ -66,13 +66,16 @@ DEFAULT_ROLES: Final[Mapping[str, frozenset[Right]]] = {
 class Caller(NamedTuple):
     """The user or guest who sends a request: the rights in each group, and whether the token allows writing.
 
-    epoch: how often the user's password was changed.
+    epoch: how often the user's password was changed. sign_in: the sign-in by which the caller is known, or the id of a
+    token for machines (`is_machine`).
     """
 
     name: str
     rights: Mapping[str, frozenset[Right]]
     may_write: bool = True
     epoch: int = 0
+    sign_in: str = ""
+    is_machine: bool = False
 
     @property
     def is_guest(self) -> bool:

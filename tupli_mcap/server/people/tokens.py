@@ -3,7 +3,8 @@
 access    signed (JWT), valid for a short time, void after a change of the password
 refresh   stored as a digest; exchanged once for a new pair; a second use ends the whole sign-in
 API       stored as a digest; for machines, to read, or to read and write
-ticket    signed; for one recording or query; void after a change of the password
+ticket    signed; for one recording or query; void after a change of the password, and with the sign-in or the API token
+          of the user who asked for it
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from sqlalchemy import Connection, delete, func, insert, or_, select, update
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
 from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.people.accounts import caller_named
+from tupli_mcap.server.people.accounts import caller_named, guest
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import API_TOKEN, REFRESH_TOKEN, USER
 
@@ -50,11 +51,12 @@ class Tokens:
         refresh = secrets.token_urlsafe(32)
         now = int(time.time())
         connection.execute(delete(REFRESH_TOKEN).where(REFRESH_TOKEN.c.expires < now))
-        row = {"digest": _digest(refresh), "user": user, "family": family or secrets.token_hex(16)}
+        family = family or secrets.token_hex(16)
+        row = {"digest": _digest(refresh), "user": user, "family": family}
         expires = now + self._settings.refresh_seconds
         connection.execute(insert(REFRESH_TOKEN).values(**row, used=False, expires=expires))
         return {
-            "access_token": self._access(user, epoch),
+            "access_token": self._access(user, epoch, family),
             "refresh_token": refresh,
             "token_type": "bearer",
             "expires_in": self._settings.access_seconds,
@@ -85,12 +87,13 @@ class Tokens:
         found = _of_refresh_token(connection, refresh)
         if found is None:
             raise SignInError("Could not validate credentials")
-        return self._access(found.user, found.epoch)
+        return self._access(found.user, found.epoch, found.family)
 
     def of_session(self, connection: Connection, refresh: str) -> Caller | None:
         """The caller of a browser, by the refresh token in its cookie, which stays valid; None if not signed in."""
         found = _of_refresh_token(connection, refresh)
-        return None if found is None else caller_named(connection, found.user)
+        caller = None if found is None else caller_named(connection, found.user)
+        return None if caller is None else caller._replace(sign_in=found.family)
 
     def form_code(self, refresh: str) -> str:
         """The code that a form of a signed-in browser has to send. Pages of other sites cannot know it."""
@@ -100,8 +103,8 @@ class Tokens:
         """Whether a form has sent the right code."""
         return hmac.compare_digest(self.form_code(refresh).encode(), code.encode())
 
-    def _access(self, user: str, epoch: int) -> str:
-        return self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch)
+    def _access(self, user: str, epoch: int, family: str) -> str:
+        return self._signed("access", self._settings.access_seconds, sub=user, epoch=epoch, by=family)
 
     def end(self, connection: Connection, refresh: str) -> None:
         """Ends the sign-in of a refresh token; nothing happens if it is not valid."""
@@ -124,7 +127,7 @@ class Tokens:
         )
         if caller is None:
             raise SignInError("the access token is not valid any more")
-        return caller
+        return caller._replace(sign_in=str(told.get("by", "")))
 
     # --- tokens of machines ---
 
@@ -165,15 +168,23 @@ class Tokens:
 
     def ticket(self, caller: Caller, **what: Any) -> str:
         """A ticket for a `recording`, or for the episodes of a `query`, with this caller's rights. It is valid for a
-        while, or until the caller's password is changed."""
-        return self._signed(
-            "ticket", self._settings.ticket_seconds, sub=caller.name, epoch=caller.epoch, **what
-        )
+        while, but no longer than what the caller has signed in with."""
+        told = {"sub": caller.name, "epoch": caller.epoch, "by": caller.sign_in}
+        return self._signed("ticket", self._settings.ticket_seconds, **told, **what)
 
-    def of_ticket(self, ticket: str) -> tuple[str, dict[str, Any]]:
-        """The user who was given a ticket, and what it opens. Raises SignInError if it is not valid, or has expired."""
+    def of_ticket(self, connection: Connection, ticket: str) -> tuple[Caller, dict[str, Any]]:
+        """The caller who was given a ticket, and what it opens.
+
+        Raises:
+            SignInError: it is not valid, has expired, or was revoked.
+        """
         told = self._told(ticket, "ticket")
-        return str(told.get("sub")), told
+        found = caller_named(connection, told["sub"]) or guest(connection)
+        if not found.is_guest:
+            found = found._replace(sign_in=str(told.get("by", "")))
+        if told.get("epoch") != found.epoch or not (found.is_guest or _lasts(connection, found)):
+            raise SignInError("the ticket is not valid any more")
+        return found, told
 
     def _signed(self, kind: str, seconds: int, **told: Any) -> str:
         return jwt.encode(
@@ -196,7 +207,7 @@ def _of_refresh_token(connection: Connection, refresh: str) -> Any:
     """The user and epoch of a refresh token; None if it is not valid."""
     table = REFRESH_TOKEN
     query = (
-        select(table.c.user, USER.c.epoch)
+        select(table.c.user, table.c.family, USER.c.epoch)
         .join(USER, USER.c.name == table.c.user)
         .where(table.c.digest == _digest(refresh), table.c.used.is_(False))
         .where(table.c.expires > int(time.time()))
@@ -209,9 +220,22 @@ def _of_api_token(connection: Connection, token: str) -> Caller:
     valid = or_(table.c.expires.is_(None), table.c.expires > int(time.time()))
     found = connection.execute(select(table).where(table.c.digest == _digest(token), valid)).first()
     caller = None if found is None else caller_named(connection, found.user, may_write=found.scope == "write")
-    if caller is None:
+    if found is None or caller is None:
         raise SignInError("the API token is not valid, or has expired; make another one")
-    return caller
+    return caller._replace(sign_in=found.id, is_machine=True)
+
+
+def _lasts(connection: Connection, caller: Caller) -> bool:
+    """Whether the sign-in or the API token of a caller is still valid."""
+    now = int(time.time())
+    family, token = REFRESH_TOKEN.c, API_TOKEN.c
+    ways = (
+        select(family.user).where(family.family == caller.sign_in, family.expires > now),
+        select(token.user).where(
+            token.id == caller.sign_in, or_(token.expires.is_(None), token.expires > now)
+        ),
+    )
+    return any(connection.execute(way.limit(1)).scalar() == caller.name for way in ways)
 
 
 def _digest(token: str) -> str:

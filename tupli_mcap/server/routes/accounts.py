@@ -12,7 +12,7 @@ from tupli_mcap.server.database import audit
 from tupli_mcap.server.people import accounts, quotas
 from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, Writer
+from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
 
 __all__ = ["Credentials", "router"]
 
@@ -149,7 +149,7 @@ def list_users(library: Served, caller: Reader) -> list[User]:
 
 
 @router.delete("/users/{username}")
-def delete_user(library: Served, caller: Writer, username: str) -> None:
+def delete_user(library: Served, caller: Person, username: str) -> None:
     """Deletes a user, and what only they could see; the name cannot be used again."""
     library.delete_user(caller, username)
 
@@ -164,7 +164,7 @@ def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> No
 
 
 @router.put("/users/{username}/password")
-def change_password(library: Served, caller: Writer, username: str, told: Password) -> None:
+def change_password(library: Served, caller: Person, username: str, told: Password) -> None:
     """Changes a password, and ends all sign-ins and tokens of the user."""
     caller.demand(Right.USER_UPDATE, username)
     with library.database.writing() as connection:
@@ -244,7 +244,7 @@ def delete_role(library: Served, caller: Writer, role: str) -> None:
 
 
 @router.post("/api-tokens")
-def create_api_token(library: Served, caller: Writer, told: NewToken) -> dict[str, Any]:
+def create_api_token(library: Served, caller: Person, told: NewToken) -> dict[str, Any]:
     """Creates a token for a machine. Only this answer contains it."""
     with library.database.writing() as connection:
         audit(connection, caller.name, "create_api_token", told.name)

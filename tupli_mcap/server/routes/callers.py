@@ -13,7 +13,17 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError
 
-__all__ = ["Address", "AnyCaller", "Holder", "Reader", "Served", "TicketHolder", "Writer"]
+__all__ = [
+    "Address",
+    "AnyCaller",
+    "Holder",
+    "Person",
+    "Reader",
+    "Served",
+    "TicketHolder",
+    "Writer",
+    "no_machine",
+]
 
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
@@ -67,6 +77,21 @@ def _writer(caller: AnyCaller) -> Caller:
 Writer = Annotated[Caller, Depends(_writer)]
 
 
+def no_machine(caller: Caller) -> Caller:
+    """The same caller. Raises DeniedError for a token for machines."""
+    if caller.is_machine:
+        raise DeniedError("a token for machines may not do this; sign in with the password")
+    return caller
+
+
+def _person(caller: Writer) -> Caller:
+    return no_machine(caller)
+
+
+Person = Annotated[Caller, Depends(_person)]
+"""A user who has signed in with the password: a stolen token cannot make more tokens, or lock out its user."""
+
+
 class Holder(NamedTuple):
     """The reader of an address: a signed-in caller, or the holder of a ticket, which names what it opens."""
 
@@ -88,10 +113,9 @@ def _holder(
 ) -> Holder:
     if ticket is None:
         return Holder(_reader(library, caller), None)
-    user, what = library.tokens.of_ticket(ticket)
     with library.database.reading() as connection:
-        found = accounts.caller_named(connection, user) or accounts.guest(connection)
-    if what.get("epoch") != found.epoch or (found.is_guest and not library.settings.guests):
+        found, what = library.tokens.of_ticket(connection, ticket)
+    if found.is_guest and not library.settings.guests:
         raise SignInError("the ticket is not valid any more")
     request.state.user = found.name
     return Holder(found, what)

@@ -36,7 +36,7 @@ from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.routes.accounts import Credentials
 from tupli_mcap.server.routes.bodies import BODY, body_of
-from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served
+from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
@@ -59,6 +59,13 @@ def _changing(caller: Reader) -> Caller:
 
 Changing = Annotated[Caller, Depends(_changing)]
 """A caller who changes something. A guest gets an error, as guests lack the rights."""
+
+
+def _person(caller: Changing) -> Caller:
+    return no_machine(caller)
+
+
+Person = Annotated[Caller, Depends(_person)]
 
 
 @contextlib.contextmanager
@@ -104,13 +111,13 @@ def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
 
 
 @router.delete("/access/users/delete")
-def delete_user(library: Served, caller: Changing, username: str) -> None:
+def delete_user(library: Served, caller: Person, username: str) -> None:
     """Deletes a user; nothing happens if there is none."""
     library.delete_user(caller, username)
 
 
 @router.put("/access/users/change-password")
-def change_password(library: Served, caller: Changing, told: Credentials) -> None:
+def change_password(library: Served, caller: Person, told: Credentials) -> None:
     """Changes a password, and ends all that was signed in with the old one."""
     caller.demand(Right.USER_UPDATE, told.username)
     with library.database.writing() as connection:
