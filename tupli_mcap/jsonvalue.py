@@ -45,6 +45,7 @@ _KINDS = "biufcSUMm"
 _BRACKETS_A_LEVEL = 3  # {"$dict": [[key, ...
 _MAX_CODE_POINT = 0x10FFFF
 _SCALARS = {type(None), bool, float, int, str}
+_PLAIN_OF: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__int__, float: float.__float__}
 # Few other JSON readers take integers of more than 64 bits.
 _EXACT_INT_BITS = 64
 _PLAIN_INT_BITS = 1024  # no integer may have more: Python does not print those beyond 4300 digits
@@ -125,7 +126,7 @@ def loads(text: str | bytes) -> Any:
         if isinstance(text, bytes):
             text = text.decode()
         brackets = _depth_of(text)
-        number = _from_decimal if _LONG_NUMBER.search(text) else None
+        number = (lambda digits: _bounded(int(digits))) if _LONG_NUMBER.search(text) else None
         value = json.loads(text, object_hook=_restore, parse_constant=_refuse_constant, parse_int=number)
         if brackets > MAX_DEPTH:  # each level takes at least one bracket
             _check_levels(value, 0)
@@ -202,12 +203,9 @@ class _Encoder:
             return {"$bytes" if isinstance(value, bytes) else "$bytearray": _base64(value)}
         if isinstance(value, complex):
             return {"$complex": [self.encode(value.real, depth + 1), self.encode(value.imag, depth + 1)]}
-        if isinstance(value, str):  # from here on subclasses, such as enumerations
-            return self.encode(str.__str__(value), depth + 1)
-        if isinstance(value, int):
-            return self.encode(int.__int__(value), depth + 1)
-        if isinstance(value, float):
-            return self.encode(float.__float__(value), depth + 1)
+        for base, plain in _PLAIN_OF.items():  # subclasses, such as enumerations
+            if isinstance(value, base):
+                return self.encode(plain(value), depth + 1)
         return self._fall_back(value, depth)
 
     def _fall_back(self, value: Any, depth: int) -> Any:
@@ -249,9 +247,8 @@ class _Encoder:
             if len(named) == len(items) and all(type(name) is str for name in named):
                 return named
         _check_hashes(list(value))
-        exact = _Encoder(
-            self.fallback, plain=False, max_depth=self.max_depth
-        )  # exact: a list cannot be a key
+        # exact: a list cannot be a key
+        exact = _Encoder(self.fallback, plain=False, max_depth=self.max_depth)
         return {"$dict": [[exact.encode(key, depth + 1), item] for key, item in items.items()]}
 
     def _numpy(self, value: Any, depth: int) -> Any:
@@ -321,8 +318,8 @@ def _depth_of(text: str) -> int:
 
 def _levels(value: Any) -> int:
     """The number of levels that a value adds by itself, without its contents."""
-    if value is None or isinstance(value, (bool, float, int, str)):
-        return 0 if type(value) in _SCALARS else 1
+    if type(value) in _SCALARS:
+        return 0
     return max(1, value.ndim) if isinstance(value, np.ndarray) else 1
 
 
@@ -380,18 +377,16 @@ def _list(value: Any) -> list[Any]:
     return value
 
 
-def _from_float(value: Any) -> float:
-    return {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}[value]
+def _str(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError("not a string")
+    return value
 
 
 def _from_int(value: Any) -> int:
     if not re.fullmatch(r"-?[0-9a-f]+", value):
         raise ValueError("not hexadecimal")
     return _bounded(int(value, 16))
-
-
-def _from_decimal(digits: str) -> int:
-    return _bounded(int(digits))
 
 
 def _bounded(value: int) -> int:
@@ -407,14 +402,8 @@ def _from_complex(value: Any) -> complex:
     return complex(real, imaginary)
 
 
-def _from_str(value: Any) -> str:
-    return "".join([chr(code) for code in _list(value)])
-
-
 def _from_base64(value: Any) -> bytes:
-    if not isinstance(value, str):
-        raise TypeError("not base64")
-    return base64.b64decode(value, validate=True)
+    return base64.b64decode(_str(value), validate=True)
 
 
 def _from_items(value: Any) -> list[Any]:
@@ -432,8 +421,8 @@ def _from_pairs(value: Any) -> dict[Any, Any]:
 
 
 def _from_numpy(value: Any) -> Any:
-    name, data = value["dtype"], _from_base64(value["data"])
-    if not isinstance(name, str) or not _DTYPE.fullmatch(name) or value.keys() - {"dtype", "data", "shape"}:
+    name, data = _str(value["dtype"]), _from_base64(value["data"])
+    if not _DTYPE.fullmatch(name) or value.keys() - {"dtype", "data", "shape"}:
         raise ValueError("not a dtype of numbers, strings, bytes or times")
     shape = _list(value.get("shape", []))
     if not all(type(length) is int and length >= 0 for length in shape):
@@ -443,28 +432,18 @@ def _from_numpy(value: Any) -> Any:
     if dtype.itemsize * math.prod(shape) != len(data):
         raise ValueError("bytes and shape do not agree")
     array = np.ndarray(tuple(shape), dtype, bytearray(data)).copy()
-    if (
-        dtype.kind == "U"
-        and array.size
-        and array.reshape(-1).view(dtype.byteorder + "u4").max() > _MAX_CODE_POINT
-    ):
+    if dtype.kind == "U" and array.reshape(-1).view(dtype.byteorder + "u4").max(initial=0) > _MAX_CODE_POINT:
         raise ValueError("a code point beyond Unicode")
-    if dtype.kind == "b" and array.size and array.view(np.uint8).max() > 1:
+    if dtype.kind == "b" and array.view(np.uint8).max(initial=0) > 1:
         raise ValueError("a boolean that is not 0 or 1")
     return array if "shape" in value else array[()]
 
 
-def _from_numpy_str(value: Any) -> np.str_:
-    if not isinstance(value, str):
-        raise TypeError("not a string")
-    return np.str_(value)
-
-
 _RESTORE: dict[str, Callable[[Any], Any]] = {
-    "$float": _from_float,
+    "$float": {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}.__getitem__,
     "$int": _from_int,
     "$complex": _from_complex,
-    "$str": _from_str,
+    "$str": lambda value: "".join([chr(code) for code in _list(value)]),
     "$bytes": _from_base64,
     "$bytearray": lambda value: bytearray(_from_base64(value)),
     "$tuple": lambda value: tuple(_list(value)),
@@ -472,6 +451,6 @@ _RESTORE: dict[str, Callable[[Any], Any]] = {
     "$frozenset": lambda value: frozenset(_from_items(value)),
     "$dict": _from_pairs,
     "$numpy": _from_numpy,
-    "$numpy_str": _from_numpy_str,
+    "$numpy_str": lambda value: np.str_(_str(value)),
     "$numpy_bytes": lambda value: np.bytes_(_from_base64(value)),
 }
