@@ -232,12 +232,12 @@ class Container:
         The channel's first chunk starts with its Schema and Channel records.
         """
         if len(rows.offsets):
-            codec = self.codecs.get(rows.channel)
-            chunk = self.prepare(rows if codec is None else codec.encode(rows))
-            self.place(chunk, self.pack(chunk.data))
+            self.finish_chunks(self.start_chunks([rows])())
 
     def prepare(self, rows: Rows) -> Prepared:
         """The records of a chunk and their CRC. The channel's earlier chunks must be in the file."""
+        codec = self.codecs.get(rows.channel)
+        rows = rows if codec is None else codec.encode(rows)
         head = b"" if rows.channel in self._announced else self.definitions(rows.channel)
         data = rows.data if not head else head + bytes(rows.data)
         return Prepared(rows, len(head), data, crc32(data))
@@ -289,24 +289,14 @@ class Container:
         found: zstandard.ZstdCompressor = self._local.zstd
         return found
 
-    def place(self, prepared: Prepared, packed: bytes) -> None:
-        """Writes a prepared chunk and its message index."""
-        self._place([prepared], [packed])
-
     def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], Packed]:
         """A function that compresses chunks of different channels, in any thread; `finish_chunks` takes its result.
 
         This method and `finish_chunks` do everything that needs the interpreter lock: the compressing thread takes
-        it only once.
+        it only once. Chunks with a codec are encoded in that thread.
         """
-        codecs = [self.codecs.get(rows.channel) for rows in chunks] if self.codecs else ()
-        if any(codecs):
-            return lambda: self._packed(
-                [
-                    self.prepare(rows if codec is None else codec.encode(rows))
-                    for rows, codec in zip(chunks, codecs, strict=True)
-                ]
-            )
+        if any(rows.channel in self.codecs for rows in chunks):
+            return lambda: self._packed([self.prepare(rows) for rows in chunks])
         return partial(self._packed, [self.prepare(rows) for rows in chunks])
 
     def _packed(self, chunks: Sequence[Prepared]) -> Packed:
@@ -314,7 +304,7 @@ class Container:
         return [(part, self.pack_all([chunk.data for chunk in part])) for part in parts]
 
     def finish_chunks(self, packed: Packed) -> None:
-        """Writes compressed chunks."""
+        """Writes compressed chunks and their message indexes."""
         for chunks, data in packed:
             self._place(chunks, data)
 
