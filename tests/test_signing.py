@@ -346,7 +346,8 @@ def with_another_step(bundle: Path, target: Path) -> Path:
         (chunk,) = store.chunks(recording._step_channels[0])
         body = bytearray(store.load(chunk))
         body[60] ^= 1
-        store.chunk(chunk).data = bytes(body)  # what a forger would write, with all CRCs and indexes right
+        # what a forger would write, with all CRCs and indexes right
+        store._chunk(chunk, None, keep=True).data = bytes(body)
         forged = {SIGNATURE_NAME: ("application/json", signature)}
         # compressed anew, so that no chunk is copied as it is in the file
         rewrite_recording(recording, target, attachments=forged, compression="lz4")

@@ -13,6 +13,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.chunk_records import headers_at
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.step import StepLayout
@@ -78,7 +79,6 @@ def _pair(body: memoryview) -> tuple[int, int]:
 
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`
 LOG_TIME = "#log_time"  # the column of times (ns), named as in rows of constant size
-_LOG_TIME_AT = 15  # offset in a record
 _BOOL, _U4 = np.dtype(np.bool_), np.dtype("<u4")
 
 
@@ -153,9 +153,7 @@ class BatchDecoder:
 
 def _log_times(data: Any, records: Array) -> Array:
     """The `log_time` (uint64, ns) of each message record."""
-    if not len(records):
-        return np.empty(0, np.uint64)
-    times: Array = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))[records[:, 0] + _LOG_TIME_AT]
+    times: Array = headers_at(data)[LOG_TIME][records[:, 0]]
     return times
 
 

@@ -23,7 +23,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunk_records import headers_at, message_places, messages
 from tupli_mcap.mcap.compression import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS
-from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAX_CHUNK, crc32
+from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.index import StepClaims
 from tupli_mcap.remote import RemoteSource
@@ -294,15 +294,19 @@ class ChunkStore:
 
     def load(self, i: int, *, keep: bool = True) -> Any:
         """The message records of chunk `i`; cached unless `keep` is False."""
-        return self.chunk(i, keep=keep).data
+        return self._chunk(i, None, keep=keep).data
 
-    def chunk(self, i: int, *, keep: bool = True) -> KeptChunk:
-        """A chunk and its checked views; cached unless `keep` is False."""
-        kept = self._cache.get((self._number, i))
+    def _chunk(self, i: int, codec: Decoder | None, *, keep: bool) -> KeptChunk:
+        """A chunk and its checked views; with a codec its decoded rows, and these are cached instead of it."""
+        key = self._number, i if codec is None else ~i
+        kept = self._cache.get(key)
         if kept is None:
-            kept = KeptChunk(self._read(i))
+            data = self._read(i)
+            if codec is not None:
+                data = codec.decode(data, int(self.table["rows"][i]), f"{self._source.name}: chunk {i}")
+            kept = KeptChunk(data)
             if keep:
-                self._cache.put((self._number, i), kept)
+                self._cache.put(key, kept)
         return kept
 
     def _read(self, i: int) -> Any:
@@ -310,15 +314,6 @@ class ChunkStore:
         if offset >= IN_MEMORY:
             return self._memory[offset - IN_MEMORY]
         where = f"{self._source.name}: chunk at offset {offset}"
-        if (
-            length < CHUNK_HEAD.size + 8
-            or size > MAX_CHUNK
-            or skip > size
-            or compression >= len(COMPRESSIONS)
-        ):
-            raise FormatError(
-                f"{where}: expected a chunk of at most {MAX_CHUNK} bytes, found {length} holding {size}"
-            )
         name = COMPRESSIONS[compression].replace("none", "")
         # data that is not compressed is used in place
         record = self._source.lend(offset, length) if name else self._source.view(offset, length)
@@ -338,8 +333,7 @@ class ChunkStore:
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
         _, _, _, _, n, _, _, channel, _, _ = self.table[i].item()
-        codec = self.codecs.get(channel)
-        kept = self.chunk(i, keep=keep) if codec is None else self._decoded(i, codec, keep=keep)
+        kept = self._chunk(i, self.codecs.get(channel), keep=keep)
         if kept.rows is not None:
             if kept.rows.dtype is not dtype:  # another view of the same bytes: `items_dtype`
                 kept.rows = kept.rows.view(dtype)
@@ -381,19 +375,9 @@ class ChunkStore:
             claims.check(first, len(records), lambda places: numbers[starts[places] + BODY], where)
         self._held[i] = True
 
-    def _decoded(self, i: int, codec: Decoder, *, keep: bool) -> KeptChunk:
-        """A chunk as rows of constant size; these are cached, not the encoded ones."""
-        kept = self._cache.get((self._number, ~i))
-        if kept is None:
-            where = f"{self._source.name}: chunk {i}"
-            kept = KeptChunk(codec.decode(self._read(i), int(self.table["rows"][i]), where))
-            if keep:
-                self._cache.put((self._number, ~i), kept)
-        return kept
-
     def records(self, i: int, *, keep: bool = True) -> tuple[Any, Array]:
         """A chunk of variable layout, and the offsets where each message record begins and ends: int64 (rows, 2)."""
-        kept = self.chunk(i, keep=keep)
+        kept = self._chunk(i, None, keep=keep)
         if kept.records is None:
             records = self._find_records(i, kept.data)
             if self.claims is not None and not self._held[i]:

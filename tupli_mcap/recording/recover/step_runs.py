@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -11,13 +10,12 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
+from tupli_mcap.mcap.chunk_records import headers_at
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
-
-_TIME, _BEFORE_TIME = struct.Struct("<q"), 15  # of a Message record
 
 
 class StepFacts(NamedTuple):
@@ -184,10 +182,9 @@ def _variable(data: memoryview, layout: StepLayout, places: Array) -> StepFacts:
     bad: dict[int, str] = {}
     decoder = MessageDecoder(layout)
     names = [leaf.name for leaf in layout.reward if leaf.kind != "variable" and leaf.size]
-    time = np.zeros(n, np.int64)
+    time = headers_at(data)["#log_time"][places[:, 0]].astype(np.int64)
     for i, (start, end) in enumerate(places.tolist()):
         body = data[start + BODY : end]
-        (time[i],) = _TIME.unpack_from(data, start + _BEFORE_TIME)
         try:
             values = decoder.step(body)
         except FormatError as err:
