@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import read_strings
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
-from tupli_mcap.messages.topics import Topics, parse
+from tupli_mcap.messages.topics import parse
 
 CAMERA_NAME = "sensor_msgs/msg/CompressedImage"
 CAMERA_SCHEMA = (
@@ -27,19 +27,6 @@ _STAMP = struct.Struct("<iI")
 _COUNT = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
 _NAME = re.compile("[a-z](?:_?[a-z0-9]+)*")  # of a camera
-
-
-class CameraTopics(NamedTuple):
-    """The two topics of a camera: pictures, and the episode and step that each shows."""
-
-    camera: str
-    frame: str
-
-    @classmethod
-    def of(cls, name: str, env: int | None) -> CameraTopics:
-        """`env` is the sub-environment of a vector recording, None in one of a single environment."""
-        topics = Topics.of(env)
-        return cls(topics.camera(name), topics.frame(name))
 
 
 def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:

@@ -16,12 +16,12 @@ from tupli_mcap.messages.frames import (
     FRAME_LAYOUT,
     FRAME_NAME,
     FRAME_SCHEMA,
-    CameraTopics,
     EncodedFrame,
     camera_names,
     decode_frame,
 )
 from tupli_mcap.messages.images.pictures import Picture, decode_picture
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents
 
@@ -56,7 +56,8 @@ class Cameras:
         self._tables: dict[tuple[str, int], _Table] = {}
         for camera in self.names:
             for env in range(num_envs):
-                pair = CameraTopics.of(camera, env if vector else None)
+                place = Topics.of(env if vector else None)
+                pair = place.camera(camera), place.frame(camera)
                 ids = [self._checked(topics.get(t), t, contents.schemas, i) for i, t in enumerate(pair)]
                 self._channels[camera, env] = (ids[0], ids[1])
 

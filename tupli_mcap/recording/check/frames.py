@@ -6,8 +6,9 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.frames import FRAME_LAYOUT, CameraTopics, decode_frame
+from tupli_mcap.messages.frames import FRAME_LAYOUT, decode_frame
 from tupli_mcap.messages.images.pictures import format_of
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.recording import Recording
@@ -28,23 +29,24 @@ class _Pair:
         self._findings = findings
         self._store: ChunkStore = recording.file.store
         self._camera = camera
-        self._topics = CameraTopics.of(camera, env if recording.is_vector else None)
+        topics = Topics.of(env if recording.is_vector else None)
+        self._picture_topic, self._pair_topic = topics.camera(camera), topics.frame(camera)
         self._channels = recording.file.cameras.channels(camera, env)
         self._rows = recording.index[recording.index["env"] == env]
 
     def run(self) -> None:
         pictures, pairs = (self._store.count(channel) for channel in self._channels)
         if pictures != pairs and self._recording.complete:
-            self._error(f"expected {pairs} frames, found {pictures}", self._topics.camera)
+            self._error(f"expected {pairs} frames, found {pictures}", self._picture_topic)
         try:
             times = self._pairs(self._channels[1])
         except FormatError as err:
-            self._error(self._plain(err), self._topics.frame)
+            self._error(self._plain(err), self._pair_topic)
             return
         try:
             self._pictures(self._channels[0], times)
         except FormatError as err:
-            self._error(self._plain(err), self._topics.camera)
+            self._error(self._plain(err), self._picture_topic)
 
     def _pairs(self, channel: int) -> Array:
         """Checks the rows of `/frame`; returns their times (int64, ns)."""
@@ -56,7 +58,7 @@ class _Pair:
         again = (episodes[1:] == episodes[:-1]) & (steps[1:] <= steps[:-1])
         for i in np.flatnonzero(again)[:_TOLD].tolist():
             self._error(
-                f"row {i + 1} is of an earlier step than the row before, or the same", self._topics.frame
+                f"row {i + 1} is of an earlier step than the row before, or the same", self._pair_topic
             )
         runs = (
             episodes[np.flatnonzero(np.append(True, episodes[1:] != episodes[:-1]))]
@@ -64,7 +66,7 @@ class _Pair:
             else episodes
         )
         if len(np.unique(runs)) != len(runs):
-            self._error("frames of an episode are not one after another", self._topics.frame)
+            self._error("frames of an episode are not one after another", self._pair_topic)
         order = np.argsort(self._rows["episode"], kind="stable")
         known = self._rows["episode"][order].astype(np.int64)
         lengths = np.append(self._rows["length"][order].astype(np.int64), -1)
@@ -83,7 +85,7 @@ class _Pair:
         for row, time, body in self._store.all_messages(channel):
             why = self._defect(body, time, int(times[row]) if row < len(times) else None)
             if why:
-                self._error(f"row {row} {why}", self._topics.camera)
+                self._error(f"row {row} {why}", self._picture_topic)
 
     def _defect(self, body: memoryview, log_time: int, pair_time: int | None) -> str:
         """What is wrong with a picture's message; empty if nothing is."""

@@ -13,10 +13,10 @@ from tupli_mcap.messages.frames import (
     FRAME_LAYOUT,
     FRAME_NAME,
     FRAME_SCHEMA,
-    CameraTopics,
     camera_names,
     encode_pair,
 )
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.recover.episodes import NewPlaces, PlannedEpisode
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore
 from tupli_mcap.recording.recover.step_runs import intersection
@@ -42,8 +42,8 @@ class OldCameras(NamedTuple):
         topics = {channel.topic: channel for channel in evidence.channels.values()}
         cameras: dict[str, tuple[tuple[int, int], ...]] = {}
         for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
-            pairs = [CameraTopics.of(name, env if vector else None) for env in range(num_envs)]
-            known = [(topics.get(pair.camera), topics.get(pair.frame)) for pair in pairs]
+            places = [Topics.of(env if vector else None) for env in range(num_envs)]
+            known = [(topics.get(place.camera(name)), topics.get(place.frame(name))) for place in places]
             ids = tuple((a.id, b.id) for a, b in known if a is not None and b is not None)
             if len(ids) == num_envs and all(_fits(evidence, *pair) for pair in known):
                 cameras[name] = ids

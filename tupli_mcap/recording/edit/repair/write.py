@@ -16,7 +16,6 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Container, library
-from tupli_mcap.messages.frames import CameraTopics
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
@@ -126,10 +125,9 @@ class RepairWriter:
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
         for name, pairs in zip(cameras.names, cameras.ids, strict=True):
             for env, pair in enumerate(pairs):
-                new_topics = CameraTopics.of(name, env if vector else None)
-                self._frames(
-                    store, pair, (topics[new_topics.camera], topics[new_topics.frame]), by_env.get(env, [])
-                )
+                place = Topics.of(env if vector else None)
+                new_pair = topics[place.camera(name)], topics[place.frame(name)]
+                self._frames(store, pair, new_pair, by_env.get(env, []))
 
     def _frames(
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
