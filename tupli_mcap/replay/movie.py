@@ -96,12 +96,33 @@ class RenderedFrames:
         self.close()
 
 
-def check_movie(suffix: str) -> None:
-    """Raises MissingExtraError if the package for films of this kind is not installed."""
-    if suffix == ".mp4":
+def check_goal(goal: Path, kinds: Sequence[str], *, overwrite: bool) -> str:
+    """The kind of a file that may be made: the end of its name, in lower case.
+
+    Raises:
+        RecordingError: it is none of `kinds`, or the file exists (without `overwrite`).
+        MissingExtraError: the package for films of this kind is not installed.
+    """
+    kind = goal.suffix.lower()
+    if kind not in kinds:
+        raise RecordingError(f"{goal}: expected a name that ends in {', '.join(kinds[:-1])} or {kinds[-1]}")
+    if goal.exists() and not overwrite:
+        raise RecordingError(
+            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
+        )
+    if kind == ".mp4":
         _av()
-    elif suffix == ".gif":
+    elif kind == ".gif":
         pillow()
+    return kind
+
+
+def check_pictures(every: int, width: int | None) -> None:
+    """Raises RecordingError unless every n-th picture can be taken, and be of this width (pixels)."""
+    if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
+        raise RecordingError(
+            f"expected every >= 1 and a width of 1 to 16384, found {every!r:.40} and {width!r:.40}"
+        )
 
 
 def _av() -> Any:

@@ -16,7 +16,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.images.pictures import Picture, resized
 from tupli_mcap.recording import Episode
 from tupli_mcap.recording.edit.replacing import replacing
-from tupli_mcap.replay.movie import check_movie, write_movie
+from tupli_mcap.replay.movie import check_goal, check_pictures, write_movie
 from tupli_mcap.spaces.leaves import Leaf
 
 _KINDS = (".mp4", ".gif")
@@ -77,10 +77,7 @@ def film(
     """
     with tempfile.TemporaryDirectory() as folder:
         goal = Path(folder) / "film.mp4" if target is None else Path(target)
-        if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
-            raise RecordingError(
-                f"expected every >= 1 and a width of 1 to 16384, found {every!r:.40} and {width!r:.40}"
-            )
+        check_pictures(every, width)
         count = _write(episodes, goal, camera, fps, every, width, overwrite=overwrite)
         return Film(count, goal.suffix.lower(), None if target is None else goal, goal.read_bytes())
 
@@ -96,16 +93,9 @@ def _write(
     overwrite: bool,
 ) -> int:
     """Returns how many pictures there are."""
-    kind = goal.suffix.lower()
-    if kind not in _KINDS:
-        raise RecordingError(f"{goal}: expected a name that ends in {' or '.join(_KINDS)}")
-    if goal.exists() and not overwrite:
-        raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
-        )
+    kind = check_goal(goal, _KINDS, overwrite=overwrite)
     if fps is not None and not 0 < fps <= 1000:
         raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
-    check_movie(kind)
     if not episodes:
         raise RecordingError("expected episodes to film, found none")
     recording = episodes[0].recording

@@ -20,7 +20,7 @@ from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier
-from tupli_mcap.replay.movie import RenderedFrames, check_movie, write_movie
+from tupli_mcap.replay.movie import RenderedFrames, check_goal, check_pictures, write_movie
 from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.starts import EpisodePlan
 
@@ -116,8 +116,7 @@ def render(
     began = time.perf_counter()
     goal = Path(target)
     kind = _check_target(recording, goal, overwrite=overwrite)
-    if every < 1 or (width is not None and not 1 <= width <= 1 << 14):
-        raise RecordingError(f"expected every >= 1 and a width of 1 to 16384, found {every} and {width}")
+    check_pictures(every, width)
     chosen = _numbers(recording, episodes)
     with RenderedFrames(CAMERA, check_format(frame_format if kind == ".mcap" else "png")) as frames:
         renderer = _Renderer(recording, trust, chosen, env, progress, frames, every, width)
@@ -129,18 +128,11 @@ def render(
 
 
 def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
-    kind = goal.suffix.lower()
-    if kind not in _KINDS:
-        raise RecordingError(f"{goal}: expected a name that ends in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
     if goal.exists() and recording.path is not None and goal.samefile(recording.path):
         raise RecordingError(f"{goal} is the recording itself, which is never overwritten; give another name")
-    if goal.exists() and not overwrite:
-        raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
-        )
+    kind = check_goal(goal, _KINDS, overwrite=overwrite)
     if not goal.absolute().parent.is_dir():
         raise RecordingError(f"{goal}: there is no directory {goal.parent}; make it first")
-    check_movie(kind)
     return kind
 
 
