@@ -18,9 +18,8 @@ dataset = tupli_mcap.open("all.mcap")
 print("recorded ", dataset)
 
 best = dataset.sort("return", descending=True)[0]
-best.annotate(
-    success=True, note="the longest one"
-)  # or: tupli-mcap tag all.mcap --episodes best success=true
+# the same as `tupli-mcap tag all.mcap --episodes best success=true note='the longest one'`
+best.annotate(success=True, note="the longest one")
 print("annotated", tupli_mcap.open("all.mcap").filter("metadata.success")[0].metadata)
 
 good = dataset.filter("return > 25 and end == 'terminal'")

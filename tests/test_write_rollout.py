@@ -207,6 +207,14 @@ def test_tensors_dicts_and_images_are_understood(tmp_path: Path) -> None:
             assert len(episode.infos) == 5
 
 
+def test_refuses_a_dtype_that_numpy_does_not_have(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    states = torch.zeros(5, 3, dtype=torch.bfloat16)
+    with pytest.raises(StepError, match=r"found Tensor of torch\.bfloat16 .*convert it first"):
+        write_rollout(tmp_path / "r.mcap", states, np.zeros(5), np.zeros(5))
+    assert not (tmp_path / "r.mcap").exists()
+
+
 def test_texts_need_their_space(tmp_path: Path) -> None:
     words = np.array([["pick", "it"], ["up", "now"]])
     with pytest.raises(StepError, match="states: expected numbers, found <U4; pass observation_space"):

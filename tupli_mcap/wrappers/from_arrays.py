@@ -386,7 +386,11 @@ def _array(value: Any) -> Array:
             pass  # an object that DLPack refuses may still be an array
         else:
             return found
-    return np.asarray(value)
+    try:
+        return np.asarray(value)
+    except (TypeError, RuntimeError, ValueError) as err:  # such as a tensor of torch.bfloat16
+        kind = f"{type(value).__name__} of {getattr(value, 'dtype', 'unknown dtype')}"
+        raise StepError(f"expected an array of numbers, found {kind} ({err}); convert it first") from err
 
 
 def _leaves(tree: Any) -> list[Array]:
