@@ -275,6 +275,16 @@ class TestShares:
         for person in (lab.ann, lab.admin):
             person.ask("POST", "/v1/episodes/keys", {"key": f"metadata.of_{person.name}"})
 
+    @pytest.mark.parametrize("path", ["/v1/users", "/access/users/create", "/sign-in"])
+    def test_sign_ups(self, path: str, tmp_path: Path) -> None:
+        """Each takes the time of a core; names that are taken stay so."""
+        with serving(Settings(tmp_path / "served", open_signup=True)) as url:
+            told = {"username": "squat", "password": "short", "new": "true"}
+            body = {"data": told} if path == "/sign-in" else {"json": told}
+            statuses = [httpx.post(url + path, **body).status_code for _ in range(61)]  # type: ignore[arg-type]
+            assert statuses == [400] * 60 + [429]
+            people(Person(url, "admin"), "ann")  # who has the right to make users
+
     def test_tokens_for_machines(self, lab: Lab) -> None:
         made = [lab.eve.call("POST", "/v1/api-tokens", {"name": "robot"}) for _ in range(101)]
         assert made[-1].status_code == 400 and "at most 100 tokens of eve" in made[-1].text

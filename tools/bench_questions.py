@@ -63,7 +63,7 @@ def fill(url: str, directory: Path, episodes: int) -> None:
     library.first_password()
     with library.database.writing() as connection:
         for name in READERS:
-            accounts.create_user(connection, name, PASSWORD, shortest=1)
+            accounts.create_user(connection, name, accounts.hash_password(PASSWORD, 1))
         ann = accounts.caller_named(connection, "ann")
         accounts.create_group(connection, ann or nobody(), "lab", None)
         ann = accounts.caller_named(connection, "ann")

@@ -58,6 +58,7 @@ __all__ = ["Library"]
 _ADMIN = "admin"
 _PASSWORD_VARIABLE = "TUPLI_MCAP_ADMIN_PASSWORD"
 _MOST_OF_A_USER, _MOST_OF_AN_ADDRESS = 10, 100  # failures a minute
+_MOST_SIGN_UPS = 60  # a minute from an address
 
 
 class Library:
@@ -87,7 +88,8 @@ class Library:
                 return None
             chosen = os.environ.get(_PASSWORD_VARIABLE)
             password = chosen or secrets.token_urlsafe(12)
-            accounts.create_user(connection, _ADMIN, password, shortest=self.settings.min_password)
+            hashed = accounts.hash_password(password, self.settings.min_password)
+            accounts.create_user(connection, _ADMIN, hashed)
             connection.execute(MEMBERSHIP.insert().values(user=_ADMIN, team="global", role=_ADMIN))
         return None if chosen else password
 
@@ -161,6 +163,48 @@ class Library:
                 return self.tokens.pair(connection, username)
             throttle.note_failure(connection, most)
         raise SignInError("Incorrect username or password")
+
+    def create_user(self, caller: Caller, name: str, password: str, address: str) -> None:
+        """Creates a user. It takes the right to, or a server that is open to sign-ups.
+
+        Raises:
+            StorageError: the name or the password is not valid.
+            ConflictError: a user or a group has or had this name.
+            TooManyError: there were too many sign-ups from this address.
+        """
+        if not caller.may(Right.USER_CREATE):
+            if not self.settings.open_signup:
+                caller.demand(Right.USER_CREATE)
+            most = {f"sign-up at {address}": _MOST_SIGN_UPS}
+            with self.database.writing() as connection:
+                wait = throttle.seconds_to_wait(connection, most)
+                throttle.note_failure(connection, {} if wait else most)
+            if wait:
+                raise TooManyError(wait)
+        hashed = accounts.hash_password(password, self.settings.min_password)
+        with self.database.writing() as connection:
+            accounts.create_user(connection, name, hashed)
+            audit(connection, name if caller.is_guest else caller.name, "create_user", name)
+
+    def change_password(self, caller: Caller, name: str, password: str, *, old: str | None) -> None:
+        """Changes a user's password, and ends all sign-ins and tokens of the user. old: to be checked before.
+
+        Raises:
+            DeniedError: it is another user, and the caller lacks the right, or a right of theirs.
+            SignInError: `old` is not the password.
+            StorageError: the new one is not valid.
+            NotFoundError: there is no such user.
+        """
+        caller.demand(Right.USER_UPDATE, name)
+        with self.database.reading() as connection:
+            accounts.demand_over(connection, caller, name)
+            if old is not None and not accounts.verify_password(connection, name, old):
+                raise SignInError("the old password is not right")
+        hashed = accounts.hash_password(password, self.settings.min_password)
+        with self.database.writing() as connection:
+            accounts.demand_over(connection, caller, name)
+            accounts.change_password(connection, name, hashed)
+            audit(connection, caller.name, "change_password", name)
 
     def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
         """A new upload, or the caller's unfinished upload of the same bytes; the name of the recording if the caller

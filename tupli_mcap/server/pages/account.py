@@ -13,7 +13,6 @@ from tupli_mcap.server.database import audit
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, begin
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.tokens import SignInError
 
 __all__ = ["router"]
 
@@ -34,11 +33,7 @@ def change_password(request: Request, visit: Code, old: _Text = "", new: _Text =
     library, name = visit.library, visit.caller.name
 
     def change() -> None:
-        with library.database.writing() as connection:
-            if not accounts.verify_password(connection, name, old):
-                raise SignInError("the old password is not right")
-            accounts.change_password(connection, name, new, shortest=library.settings.min_password)
-            audit(connection, name, "change_password", name)
+        library.change_password(visit.caller, name, new, old=old)
 
     response = tried(change, partial(_page, request, visit), "/account")
     if response.status_code == 303:

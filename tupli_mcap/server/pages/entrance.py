@@ -11,13 +11,11 @@ import tupli_mcap
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute, page
 from tupli_mcap.page.routes import lists
-from tupli_mcap.server.database import audit
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages import session
 from tupli_mcap.server.pages.forms import done
 from tupli_mcap.server.pages.session import Code, Visitor
 from tupli_mcap.server.people.access import DeniedError
-from tupli_mcap.server.people.accounts import create_user
 from tupli_mcap.server.wire import told
 
 __all__ = ["router"]
@@ -57,9 +55,11 @@ def sign_in(
     try:
         if not session.is_own_origin(request):
             raise DeniedError("this form is not of this server; open its page and sign in there")
-        if new:
-            _sign_up(library, username, password)
         address = request.client.host if request.client else ""
+        if new and not library.settings.open_signup:
+            raise DeniedError("only an administrator makes users here")
+        if new:
+            library.create_user(visit.caller, username, password, address)
         pair = library.sign_in(username, password, address)
     except TupliError as err:
         status, text = told(err)
@@ -77,14 +77,6 @@ def sign_out(visit: Code) -> Response:
     response = done("/sign-in")
     session.end(response)
     return response
-
-
-def _sign_up(library: Library, username: str, password: str) -> None:
-    if not library.settings.open_signup:
-        raise DeniedError("only an administrator makes users here")
-    with library.database.writing() as connection:
-        create_user(connection, username, password, shortest=library.settings.min_password)
-        audit(connection, username, "create_user", username)
 
 
 def _sign_in_page(

@@ -8,7 +8,6 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request, Response
 
 from tupli_mcap.page.answers import PageRoute, address
-from tupli_mcap.server.database import audit
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit
 from tupli_mcap.server.people import accounts
@@ -32,9 +31,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
 
     def change() -> None:
         visit.caller.demand(Right.USER_CREATE)
-        with visit.library.database.writing() as connection:
-            accounts.create_user(connection, username, password, shortest=visit.library.settings.min_password)
-            audit(connection, visit.caller.name, "create_user", username)
+        visit.library.create_user(visit.caller, username, password, "")
 
     return tried(change, partial(_users, request, visit), "/users")
 

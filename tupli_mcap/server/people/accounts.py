@@ -30,6 +30,7 @@ __all__ = [
     "delete_user",
     "demand_over",
     "guest",
+    "hash_password",
     "list_groups",
     "list_roles",
     "list_users",
@@ -70,18 +71,17 @@ def prepare(connection: Connection) -> None:
 # --- users ---
 
 
-def create_user(connection: Connection, name: str, password: str, *, shortest: int) -> None:
-    """Creates a user, with a password of `shortest` characters at least.
+def create_user(connection: Connection, name: str, hashed: str) -> None:
+    """Creates a user with the hash of a password, see `hash_password`.
 
     Raises:
-        StorageError: the name or the password is not valid.
+        StorageError: the name is not valid.
         ConflictError: a user or a group has or had this name.
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise StorageError(
             f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
         )
-    hashed = _hashed(password, shortest)
     if not _reserve(connection, name, "user"):
         raise ConflictError("User already exists")
     row = {"name": name, "password": hashed, "epoch": 0, "created_at": int(time.time())}
@@ -95,14 +95,12 @@ def verify_password(connection: Connection, name: str, password: str) -> bool:
     return valid and found is not None
 
 
-def change_password(connection: Connection, name: str, password: str, *, shortest: int) -> None:
-    """Changes a user's password, and ends all sign-ins and tokens of the user.
+def change_password(connection: Connection, name: str, hashed: str) -> None:
+    """Changes a user's password to one of this hash, and ends all sign-ins and tokens of the user.
 
     Raises:
-        StorageError: the password has fewer than `shortest` characters, or too many.
         NotFoundError: there is no such user.
     """
-    hashed = _hashed(password, shortest)
     changed = connection.execute(
         update(USER).where(USER.c.name == name).values(password=hashed, epoch=USER.c.epoch + 1)
     )
@@ -163,7 +161,12 @@ def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
     return found
 
 
-def _hashed(password: str, shortest: int) -> str:
+def hash_password(password: str, shortest: int) -> str:
+    """The hash of a new password. Takes a while, for which others would wait in a writing transaction.
+
+    Raises:
+        StorageError: the password has fewer than `shortest` characters, or too many.
+    """
     if not isinstance(password, str) or not shortest <= len(password) <= _MOST_PASSWORD:
         found = f"{len(password)} characters" if isinstance(password, str) else "no text"
         raise StorageError(

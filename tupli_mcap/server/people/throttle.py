@@ -18,10 +18,10 @@ _SECONDS: Final = 60
 
 
 class TooManyError(TupliError):
-    """There were too many failures; wait for `seconds`."""
+    """There were too many attempts; wait for `seconds`."""
 
     def __init__(self, seconds: float) -> None:
-        super().__init__("too many failed attempts; wait a minute")
+        super().__init__("too many attempts; wait a minute")
         self.seconds = seconds
 
 
@@ -39,4 +39,6 @@ def note_failure(connection: Connection, most: Mapping[str, int]) -> None:
     """Notes a failure of each key."""
     now = int(time.time())
     connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
-    connection.execute(insert(FAILURE), [{"key": escape_text(key), "time": now} for key in most])
+    rows = [{"key": escape_text(key), "time": now} for key in most]
+    if rows:
+        connection.execute(insert(FAILURE), rows)

@@ -127,13 +127,10 @@ def who_am_i(library: Served, caller: Reader) -> Me:
 
 
 @router.post("/users")
-def create_user(library: Served, caller: AnyCaller, told: Credentials) -> User:
+def create_user(library: Served, caller: AnyCaller, address: Address, told: Credentials) -> User:
     """Creates a user. Everybody may if the server is open to sign-ups; else it takes the right `user_create`."""
-    if not library.settings.open_signup:
-        caller.demand(Right.USER_CREATE)
-    with library.database.writing() as connection:
-        accounts.create_user(connection, told.username, told.password, shortest=library.settings.min_password)
-        audit(connection, caller.name, "create_user", told.username)
+    library.create_user(caller, told.username, told.password, address)
+    with library.database.reading() as connection:
         return User(username=told.username, memberships=accounts.memberships_of(connection, told.username))
 
 
@@ -166,13 +163,8 @@ def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> No
 @router.put("/users/{username}/password")
 def change_password(library: Served, caller: Person, username: str, told: Password) -> None:
     """Changes a password, and ends all sign-ins and tokens of the user."""
-    caller.demand(Right.USER_UPDATE, username)
-    with library.database.writing() as connection:
-        if username == caller.name and not accounts.verify_password(connection, username, told.old or ""):
-            raise SignInError("the old password is not right")
-        accounts.demand_over(connection, caller, username)
-        accounts.change_password(connection, username, told.password, shortest=library.settings.min_password)
-        audit(connection, caller.name, "change_password", username)
+    old = (told.old or "") if username == caller.name else None
+    library.change_password(caller, username, told.password, old=old)
 
 
 @router.post("/groups")
