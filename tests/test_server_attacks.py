@@ -6,6 +6,7 @@ tokens: forged, expired, of the wrong type          test_server.test_forged_toke
 every id of somebody else                           test_server_access, test_server (what_may_not_be_read_is_not_there)
 rights that one has not: given, taken, taken over   TestRights, test_server.test_nobody_gives_rights_that_they_lack
 names, keys and tokens that one user uses up         TestShares
+names that look like those of others                TestShares
 injection: SQL by ids, keys, filters, names, orders TestInjection
     paths, headers, log lines, terminal escapes     TestInjection
 numbers and texts that no database can hold         TestInjection
@@ -265,6 +266,28 @@ class TestShares:
             refused = lab.eve.call("POST", path, {"name": "robots"})
             assert refused.status_code == 400 and "at most 100 times create_group by eve" in refused.text
         lab.ann.ask("POST", "/v1/groups", {"name": "robots"})
+
+    def test_names_that_look_alike(self, lab: Lab) -> None:
+        lab.ann.ask("POST", "/v1/groups", {"name": "Lab élan 2"})
+        alike = [
+            "lab élan 2",
+            "Lab elan 2",
+            "Lab  élan 2 ",
+            "Ｌａｂ élan 2",
+            "Lab\u3164élan\u28002",
+            "Lab e\u0301lan 2",
+        ]
+        for name in (*alike, "ANN", "ａｎｎ", "Global", "glo\u0307bal"):
+            for path in ("/v1/groups", "/access/groups/create"):
+                refused = lab.ann.call("POST", path, {"name": name})
+                assert refused.status_code == 409, (name, refused.text)
+        for name in ("Ann", "EVE", "Admin"):
+            told = {"username": name, "password": f"{name}'s password"}
+            assert lab.admin.call("POST", "/v1/users", told).status_code == 409, name
+        for name in ("\u3164", "\u2800\u0301"):
+            refused = lab.ann.call("POST", "/v1/groups", {"name": name})
+            assert refused.status_code == 400 and "expected a group name" in refused.text
+        lab.ann.ask("POST", "/v1/groups", {"name": "Lab élan 3"})
 
     def test_declared_keys(self, lab: Lab) -> None:
         for i in range(10):

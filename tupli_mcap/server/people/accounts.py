@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+import unicodedata
 from collections.abc import Sequence
 from typing import Final
 
@@ -49,6 +50,7 @@ _GROUP: Final = re.compile(r"[^/\\\x00-\x1f\x7f]{1,100}")
 _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's own name
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
+_BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and symbols that draw nothing
 _MOST_PASSWORD: Final = 1024
 _MOST_DESCRIPTION: Final = 1000
 _MOST_GROUPS: Final = 100  # of a user, with those that are deleted: names cannot be used again
@@ -181,11 +183,20 @@ def _revoke(connection: Connection, name: str) -> None:
 
 
 def _reserve(connection: Connection, name: str, kind: str) -> bool:
-    """Takes a name; False if it is taken."""
-    if connection.execute(select(PRINCIPAL.c.name).where(PRINCIPAL.c.name == name)).first():
+    """Takes a name; False if it is taken, or looks like one that is: somebody might publish in the wrong group."""
+    alike = _alike(name)
+    if any(_alike(taken) == alike for taken in connection.execute(select(PRINCIPAL.c.name)).scalars()):
         return False
     connection.execute(insert(PRINCIPAL).values(name=name, kind=kind))
     return True
+
+
+def _alike(name: str) -> str:
+    """What names that look alike have in common: without case, accents, widths, spaces, and what draws nothing."""
+    if name.isascii():
+        return name.lower().replace(" ", "")
+    plain = unicodedata.normalize("NFKD", name).casefold()
+    return "".join(c for c in plain if unicodedata.category(c)[0] not in "MZC" and c not in _BLANK)
 
 
 # --- groups ---
@@ -202,7 +213,7 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
     if not caller.may(Right.ROLE_MANAGEMENT):
         demand_few(connection, caller.name, "create_group", _MOST_GROUPS)
     _demand_short(description)
-    if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name):
+    if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name) or not _alike(name):
         raise StorageError(
             f"expected a group name of 1 to 100 printable characters without slashes, found {name!r:.80}"
         )
