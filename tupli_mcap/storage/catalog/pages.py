@@ -152,7 +152,8 @@ def _streamed(connection: Connection, query: Select[Any]) -> Iterator[int]:
     """What a query of ids finds, fetched as it is needed."""
     found = connection.execute(query, execution_options={"yield_per": _FETCHED}).scalars()
     with contextlib.closing(found):
-        yield from found
+        for some in found.partitions():
+            yield from some
 
 
 def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:

@@ -81,7 +81,7 @@ __all__ = [
 
 _ROWS_AT_ONCE: Final = 20_000
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
-_GROWTH: Final = 4  # how many times as many episodes are looked at next, where too few have matched
+_GROWTH: Final = 8  # how many times as many episodes are looked at next, where too few have matched
 _MOST_AT_ONCE: Final = 4_000
 _ROWS_OF_ANSWER: Final = 500
 _STREAMED: Final = {"yield_per": _ROWS_OF_ANSWER}
@@ -359,6 +359,8 @@ def _headers(
 
 def _runs(connection: Connection, recordings: Collection[int]) -> dict[int, list[dict[str, Any]]]:
     """The runs that the episodes of recordings are of, by their places."""
+    if not recordings:
+        return {}
     found = select(RECORDING.c.id, RECORDING.c.runs).where(among(RECORDING.c.id, list(recordings)))
     return {number: jsonvalue.loads(runs) for number, runs in connection.execute(found)}
 
