@@ -12,13 +12,16 @@ cannot tell how many rows it will find.
 from __future__ import annotations
 
 import contextlib
+import itertools
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, or_, select, true
 
 from tupli_mcap.schema import BaseFilter
-from tupli_mcap.storage.catalog.filter_sql import Source, in_all, recordings_of, sources
+from tupli_mcap.storage.catalog.filter_sql import Source, in_all, narrowed, recordings_of, sources
 from tupli_mcap.storage.catalog.order import After, Range, Sort, beyond, has_index, ranges
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
@@ -60,6 +63,12 @@ class Asked(NamedTuple):
         """The recordings that may have such episodes."""
         return self.of if self.filter is None else and_(self.of, recordings_of(self.filter))
 
+    def meets(self) -> ColumnElement[bool]:
+        """The condition on rows of EPISODE and RECORDING that is true of all such episodes, with a look at each."""
+        if self.filter is None:
+            return self.only
+        return and_(self.only, narrowed(self.filter, self.indexed, by_index=False).may)
+
     def order(
         self, connection: Connection, *, few: bool, row_id: ColumnElement[int] = EPISODE.c.id
     ) -> list[Range]:
@@ -68,22 +77,32 @@ class Asked(NamedTuple):
         return found if self.after is None else beyond(connection, found, self.sort, self.after)
 
 
-def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tuple[Iterable[int], int]]:
-    """The ids of episodes, in order, among which the first `wanted` that match are likely to be; and how many ids these
-    are at most: if they are fewer, all that match are among them. If those were not enough, others that start anew."""
+@dataclass
+class Left:
+    """How many more episodes may be looked at."""
+
+    most: int
+
+
+def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tuple[Iterable[int], Left]]:
+    """The ids of episodes, in order and found as they are needed, among which the first `wanted` that match are likely
+    to be. If more may be looked at after the last one, all that match were among them; else, if those were not enough,
+    others follow, which start anew."""
     given = [] if asked.filter is None else sources(asked.filter, asked.indexed)
     near = wanted if asked.filter is None and asked.sort is None else max(wanted, _NEAR)
     fewest = _fewest(connection, given if asked.sort is None else [*given, _of_recordings(asked)])
     if fewest is not None:
-        source, count = fewest
-        yield _ids(connection, asked, source, _FEW + 1) if count else (), _FEW + 1
+        (source, count), left = fewest, Left(_FEW + 1)
+        yield _ids(connection, asked, source, left) if count else (), left
         return
+    left = Left(near)
     if asked.sort is None:
-        yield _next(connection, asked, near), near
+        yield _next(connection, asked, wanted, left), left
     elif has_index(asked.sort, asked.indexed):
-        yield _ids(connection, asked, None, near), near
+        yield _ids(connection, asked, None, left), left
     if given:
-        yield _ids(connection, asked, in_all(given).subquery(), _MOST), _MOST
+        left = Left(_MOST)
+        yield _ids(connection, asked, in_all(given).subquery(), left), left
 
 
 def _fewest(connection: Connection, given: Iterable[Source]) -> tuple[Subquery, int] | None:
@@ -102,8 +121,8 @@ def _of_recordings(asked: Asked) -> Source:
     return Source(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
 
 
-def _ids(connection: Connection, asked: Asked, source: Subquery | None, most: int) -> Iterator[int]:
-    """The ids of a source in order, or, without one, of all episodes; at most so many, found as they are needed."""
+def _ids(connection: Connection, asked: Asked, source: Subquery | None, left: Left) -> Iterator[int]:
+    """The ids of a source in order, or, without one, of all episodes."""
     parts = asked.order(
         connection, few=source is not None, row_id=EPISODE.c.id if source is None else source.c[0]
     )
@@ -117,29 +136,49 @@ def _ids(connection: Connection, asked: Asked, source: Subquery | None, most: in
             if asked.sort is not None:
                 joined = joined.join(part.table, part.row_id == source.c[0])
             query = select(part.row_id).select_from(joined).where(asked.recordings())
-        query = query.where(part.having).order_by(*part.order).limit(most)
+        query = query.where(part.having).order_by(*part.order).limit(left.most)
         for row_id in _streamed(connection, query):
             yield row_id
-            most -= 1
-        if most <= 0:
+            left.most -= 1
+        if left.most <= 0:
             return
 
 
-def _next(connection: Connection, asked: Asked, most: int) -> Iterator[int]:
-    """The ids of the next episodes in the order of their recordings, looked for as they are needed."""
+def _next(connection: Connection, asked: Asked, wanted: int, left: Left) -> Iterator[int]:
+    """The ids of the next episodes, in the order of their recordings, that SQL tells may match; fetched a page at a
+    time, as many episodes are looked at for each. Without a filter, only those that are found count as looked at."""
     found: Iterable[int]
-    for group in _groups(connection, asked):
-        if most <= 0:
+    both = EPISODE.join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
+    meets = asked.meets()
+    for group, size in _groups(connection, asked):
+        if left.most <= 0:
             return
-        query = select(EPISODE.c.id).where(asked.only, or_(*(_part(asked, item) for item in group)))
+        own = or_(*(_part(asked, item) for item in group))
+        query = select(EPISODE.c.id).select_from(both).where(meets, own)
         if len(group) == 1:  # of many, all are put in order below
-            query = query.order_by(EPISODE.c.id.desc() if asked.backwards else EPISODE.c.id).limit(most)
-            found = _streamed(connection, query)
+            query = query.order_by(EPISODE.c.id.desc() if asked.backwards else EPISODE.c.id)
+            if asked.filter is None:
+                query = query.limit(left.most)
+            elif size > left.most:
+                query = query.where(_first(own, left.most, asked.backwards))
+            found = _streamed(connection, query, min(wanted, _FETCHED))
         else:
-            found = _in_order(connection.execute(query).scalars(), group, asked.backwards)[:most]
-        for row_id in found:
+            found = _in_order(connection.execute(query).scalars(), group, asked.backwards)
+        if asked.filter is not None:
+            yield from found
+            left.most -= size
+            continue
+        for row_id in itertools.islice(found, left.most):
             yield row_id
-            most -= 1
+            left.most -= 1
+
+
+def _first(own: ColumnElement[bool], most: int, backwards: bool) -> ColumnElement[bool]:
+    """The condition that an episode is one of the first so many of some."""
+    row_id = EPISODE.c.id
+    others = select(row_id).where(own).order_by(row_id.desc() if backwards else row_id).offset(most).limit(1)
+    bound = others.correlate(None).scalar_subquery()
+    return row_id > func.coalesce(bound, -1) if backwards else row_id < func.coalesce(bound, sys.maxsize)
 
 
 def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards: bool) -> list[int]:
@@ -148,9 +187,9 @@ def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards:
     return sorted(found, key=lambda row_id: (places[row_id >> EPISODE_BITS], sign * row_id))
 
 
-def _streamed(connection: Connection, query: Select[Any]) -> Iterator[int]:
-    """What a query of ids finds, fetched as it is needed."""
-    found = connection.execute(query, execution_options={"yield_per": _FETCHED}).scalars()
+def _streamed(connection: Connection, query: Select[Any], size: int = _FETCHED) -> Iterator[int]:
+    """What a query of ids finds, fetched as it is needed, so many at once."""
+    found = connection.execute(query, execution_options={"yield_per": size}).scalars()
     with contextlib.closing(found):
         for some in found.partitions():
             yield from some
@@ -166,8 +205,9 @@ def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:
     return and_(own, EPISODE.c.id < reached if asked.backwards else EPISODE.c.id > reached)
 
 
-def _groups(connection: Connection, asked: Asked) -> Iterator[list[tuple[int, str]]]:
-    """Recordings in order, by id and path: one of many episodes, or several of few, as often as there are more."""
+def _groups(connection: Connection, asked: Asked) -> Iterator[tuple[list[tuple[int, str]], int]]:
+    """Recordings in order, by id and path: one of many episodes, or several of few, as often as there are more; and how
+    many episodes they have."""
     path, reached = RECORDING.c.path, None if asked.after is None else escape_text(asked.after.recording)
     sums = select(func.sum(TALLY.c.episodes)).where(TALLY.c.recording_id == RECORDING.c.id).scalar_subquery()
     query = select(RECORDING.c.id, path, sums).where(asked.recordings()).limit(_RECORDINGS)
@@ -177,15 +217,16 @@ def _groups(connection: Connection, asked: Asked) -> Iterator[list[tuple[int, st
     else:
         found = connection.execute(query).all()
     while found:
-        group, size = [], 0
+        group: list[tuple[int, str]] = []
+        size = 0
         for number, name, episodes in found:
+            if group and size + (episodes or 0) > _GROUP:
+                yield group, size
+                group, size = [], 0
             group.append((number, name))
             size += episodes or 0
-            if size >= _GROUP:
-                yield group
-                group, size = [], 0
         if group:
-            yield group
+            yield group, size
         if len(found) < _RECORDINGS:
             return
         last = found[-1][1]

@@ -141,12 +141,11 @@ def find_episodes(
     wanted = offset + limit
     in_file_order = filter is None and asked.sort is None
     if wanted <= (_ROWS_AT_ONCE if in_file_order else _MOST_NEAR):
-        for ids, most in candidates(connection, asked, wanted):
+        for ids, left in candidates(connection, asked, wanted):
             if in_file_order:
                 return _looked_at(connection, asked, itertools.islice(ids, offset, None), wanted)
-            counted = _Counted(ids)
-            found = list(itertools.islice(_looked_at(connection, asked, counted, 2 * wanted), wanted))
-            if len(found) == wanted or counted.count < most:
+            found = list(itertools.islice(_looked_at(connection, asked, ids, wanted), wanted))
+            if len(found) == wanted or left.most > 0:
                 return iter(found[offset:])
     return _all_of_them(connection, asked, limit, offset)
 
@@ -275,19 +274,6 @@ def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None
         joined = ids.join(RECORDING, RECORDING.c.id == recording_id)
         return query.select_from(joined.join(EPISODE, EPISODE.c.id == row_id))
     return query.select_from(rows.join(ids, and_(row_id == EPISODE.c.id, recording_id == RECORDING.c.id)))
-
-
-class _Counted:
-    """Counts the items of an iterable while they are taken."""
-
-    def __init__(self, items: Iterable[int]) -> None:
-        self._items = iter(items)
-        self.count = 0
-
-    def __iter__(self) -> Iterator[int]:
-        for item in self._items:
-            self.count += 1
-            yield item
 
 
 def _looked_at(
