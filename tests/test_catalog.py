@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
-from sqlalchemy import event
+from sqlalchemy import event, true
 
 from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FilterError, FormatError, NotFoundError, StorageError
@@ -29,6 +29,7 @@ from tupli_mcap.schema import (
     FilterAND,
     FilterEQ,
     FilterOR,
+    bound,
     compile_predicate,
     parse_filter,
 )
@@ -37,7 +38,7 @@ from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
-from tupli_mcap.storage.catalog.tables import FLAGGED_KEYS, RECORDING, TALLY
+from tupli_mcap.storage.catalog.tables import FLAGGED_KEYS, LAST_EPISODE, RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -353,6 +354,29 @@ class TestOrder:
                 if "ORDER BY" in sql
             ]
         assert any(index in plan and "FOR ORDER BY" not in plan for plan in plans), plans
+
+    @pytest.mark.parametrize(
+        ("after", "backwards", "seen"), [(None, False, range(10)), (20, True, range(10, 20))]
+    )
+    def test_only_the_next_episodes_are_looked_at(
+        self,
+        catalog: Catalog,
+        monkeypatch: pytest.MonkeyPatch,
+        after: int | None,
+        backwards: bool,
+        seen: range,
+    ) -> None:
+        monkeypatch.setattr(pages, "_NEAR", 10)
+        put(catalog, "a.mcap", [row(i, {"n": i}) for i in range(40)])
+        for first in (0, 5, 15, 30):
+            wanted = bound(F("metadata.n") >= first, EpisodeHeader)
+            reached = None if after is None else After("a.mcap", after)
+            asked = pages.Asked(wanted, {}, true(), true(), after=reached, backwards=backwards)
+            with catalog._read() as connection:
+                ((ids, left),) = pages.candidates(connection, asked, 5)
+                found = {row_id & LAST_EPISODE for row_id in ids}
+            assert found == {i for i in seen if i >= first}
+            assert left.most <= 0
 
     def test_recordings_of_few_episodes_are_asked_about_together(
         self, any_catalog: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch
