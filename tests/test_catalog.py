@@ -401,7 +401,7 @@ class TestOrder:
     def test_keys_that_have_no_order(self, mixed: Catalog | ServerCatalog, key: str) -> None:
         with (
             mixed._read() as connection,
-            pytest.raises(FilterError, match="cannot sort by|unknown filter key"),
+            pytest.raises(FilterError, match="cannot sort by|unknown key"),
         ):
             find_episodes(connection, None, sort=Sort(key))
 
@@ -556,7 +556,7 @@ class TestDeclaredKeys:
     @pytest.mark.parametrize(
         ("key", "message"),
         [
-            ("score", "unknown filter key 'score'; the keys are"),
+            ("score", "unknown key 'score'; the keys are"),
             ("metadata", "cannot be declared: name one in it, such as metadata.score"),
             ("metadata..x", "needs a name at character 9"),
         ],

@@ -332,11 +332,11 @@ def test_episode_filters_and_their_replacement(cart: tuple[TupliDataset, Taken])
 
 def test_filters_are_checked_at_once(cart: tuple[TupliDataset, Taken]) -> None:
     dataset, _ = cart
-    with pytest.raises(FilterError, match=r"unknown filter key 'nonsense'.*metadata"):
+    with pytest.raises(FilterError, match=r"unknown key 'nonsense'.*metadata"):
         dataset.with_episode_filter(F("nonsense") == 1)
-    with pytest.raises(FilterError, match="unknown filter key 'score'"):
+    with pytest.raises(FilterError, match="unknown key 'score'"):
         dataset.with_benchmark_filter(F("score") == 1)
-    with pytest.raises(FilterError, match=r"unknown filter key 'observation'.*state"):
+    with pytest.raises(FilterError, match=r"unknown key 'observation'.*state"):
         dataset.with_tuple_filter(F("observation") == 1)
     with pytest.raises(FilterError, match="expected a filter, such as"):
         dataset.with_episode_filter(True)  # type: ignore[arg-type]

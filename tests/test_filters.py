@@ -1005,8 +1005,8 @@ class TestColumns:
     @pytest.mark.parametrize(
         ("filter", "message"),
         [
-            (F("rewards") > 0, "unknown filter key 'rewards': a step has reward, terminal, state, action"),
-            (F("state.vel") > 0, "unknown filter key 'state.vel': state has pos, tag"),
+            (F("rewards") > 0, "unknown key 'rewards': a step has reward, terminal, state, action"),
+            (F("state.vel") > 0, "unknown key 'state.vel': state has pos, tag"),
             (F("state") > 0, "'state' names several values of a step"),
             (F("state.pos") > 0, r"needs 1 positions for values of shape \(2,\), found 0"),
             (F("state.pos.2") > 0, "needs a position from 0 to 1, found '2'"),

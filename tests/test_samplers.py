@@ -277,9 +277,7 @@ def test_what_a_sampler_refuses(dataset: TupliDataset, arguments: dict[str, Any]
 
 def test_what_else_is_refused(dataset: TupliDataset) -> None:
     transitions = dataset.transitions()
-    with pytest.raises(
-        FilterError, match=r"unknown filter key .meta.score. .did you mean .metadata.\?.; the keys"
-    ):
+    with pytest.raises(FilterError, match=r"unknown key .meta.score. .did you mean .metadata.\?.; the keys"):
         transitions.sampler(8, weights=F("meta.score"))
     with pytest.raises(SamplingError, match="expected one weight for each episode, found F"):
         Transitions(dataset.steps).sampler(8, weights=F("metadata.score"))

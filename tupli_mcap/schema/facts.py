@@ -80,7 +80,7 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         similar = did_you_mean(
             inside[0] if inside else _LIKE.get(name, name), [*known, *_MEANT.values(), *inside]
         )
-        raise FilterError(f"unknown filter key {key!r}{similar}; the keys are {', '.join(known)}")
+        raise FilterError(f"unknown key {key!r}{similar}; the keys are {', '.join(known)}")
     return (name, *inside)
 
 

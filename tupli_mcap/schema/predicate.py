@@ -176,7 +176,7 @@ def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> npt.ND
             return _inside(key, column, path[position:])
         if segment not in choices:
             where = join_key(path[:position]) if position else "a step"
-            raise FilterError(f"unknown filter key {key!r}: {where} has {', '.join(choices) or 'nothing'}")
+            raise FilterError(f"unknown key {key!r}: {where} has {', '.join(choices) or 'nothing'}")
         column = choices[segment]
     if isinstance(column, Mapping | tuple):
         raise FilterError(
