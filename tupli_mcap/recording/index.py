@@ -74,12 +74,16 @@ def indexed_seed(seed: int | None) -> tuple[int, int]:
 
 
 class IndexBuilder:
-    """Collects rows while recording: 96 bytes for each episode, plus its metadata text."""
+    """Collects rows while recording: 96 bytes for each episode, plus its metadata text.
 
-    def __init__(self) -> None:
-        self.rows = bytearray()
-        self.metadata = bytearray()
-        self.count = 0
+    Args:
+        index: the episodes that there are already.
+    """
+
+    def __init__(self, index: EpisodeIndex | None = None) -> None:
+        self.rows = bytearray() if index is None else bytearray(index.episodes.tobytes())
+        self.metadata = bytearray() if index is None else bytearray(index.metadata)
+        self.count = 0 if index is None else len(index.episodes)
 
     def add(self, row: EpisodeRow, metadata: str) -> None:
         """Adds an episode and its metadata as JSON."""

@@ -6,7 +6,7 @@ import contextlib
 import os
 import stat
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError
@@ -16,26 +16,24 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.assemble import Assembler
 from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.write.resume import restore_container
 
 _COPY = 1 << 22
 
 
-def add_attachments(
-    path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]], *, without: Sequence[str] = ()
-) -> None:
+def add_attachments(path: str | os.PathLike[str], attachments: Mapping[str, tuple[str, bytes]]) -> None:
     """Adds attachments (name -> media type, bytes) behind the chunks of a recording, or replaces those of their name.
 
-    Attachments that `without` names are removed. The file is replaced in one rename, so that it is always the old one
-    or the new one.
+    The file is replaced in one rename, so that it is always the old one or the new one.
 
     Raises:
         RecordingError: the recording is not finished, is being written, or cannot be written.
         FormatError: it is damaged.
     """
     with held(path) as place:
-        attach(place, attachments, without=without)
+        attach(place, attachments)
 
 
 @contextlib.contextmanager
@@ -56,39 +54,28 @@ def held(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without: Sequence[str] = ()) -> None:
-    """`add_attachments` to a file that is `held`."""
+    """`add_attachments` to a file that is `held`; attachments that `without` names are removed."""
     with contextlib.closing(PathSource(path)) as source:
         contents = read_contents(source)
         if not contents.complete:
             raise RecordingError(
                 f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
             )
-        _replace(path, source, contents, attachments, without)
-
-
-def _replace(
-    path: Path,
-    source: Source,
-    contents: Contents,
-    attachments: Mapping[str, tuple[str, bytes]],
-    without: Sequence[str],
-) -> None:
-    with replacing(path, 0o600) as (fd, _):
-        _write(fd, path, source, contents, attachments, without)
-        os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
+        with replacing(path, 0o600) as (fd, _):
+            container = Container(fd, str(path), "zstd")
+            restore_container(container, contents, source)
+            _write(container, source, contents, attachments, {*attachments, *without})
+            os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
 
 
 def _write(
-    fd: int,
-    path: Path,
+    container: Container,
     source: Source,
     contents: Contents,
     attachments: Mapping[str, tuple[str, bytes]],
-    without: Sequence[str],
+    gone: Collection[str],
 ) -> None:
-    container = Container(fd, str(path), "zstd")
-    restore_container(container, contents, source)
-    gone = {*attachments, *without}
+    """Copies the file and writes its end anew: without the old attachments that are `gone`, and with new ones."""
     kept = [index for index in container.attachment_indexes if index.name not in gone]
     # if a replaced attachment is the last one its bytes are dropped; otherwise they stay, unreferenced
     last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
@@ -102,8 +89,5 @@ def _write(
     for name, (media_type, data) in attachments.items():
         container.add_attachment(name, media_type, data, now)
     assembler = Assembler(container)
-    index = assembler.index
-    index.rows = bytearray(contents.index.episodes.tobytes())
-    index.metadata = bytearray(contents.index.metadata)
-    index.count = len(contents.index.episodes)
+    assembler.index = IndexBuilder(contents.index)
     assembler.finish(now)
