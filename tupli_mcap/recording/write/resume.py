@@ -20,6 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
+from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.recover.from_file import head, metadata_at
 from tupli_mcap.recording.recover.from_journal import belongs, misplaced_journal
@@ -130,37 +131,26 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
 
 
 def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
-    """New rows must go on where the old ones end; a power loss, or a lost journal, may leave steps without images."""
+    """New rows must go on where the old ones end.
+
+    A power loss, or a lost journal, may leave steps without images, or frames without the steps that they show.
+    """
     counts: dict[int, int] = {}
     for number, rows in contents.table[["channel", "rows"]].tolist():
         counts[number] = counts.get(number, 0) + rows
     topics = {channel.topic: channel.id for channel in contents.channels.values()}
-    _check_frames_aligned(writer, contents, counts)
-    for channel in contents.channels.values():
-        topic = parse(channel.topic)
-        if topic is None or topic.kind != "image":
-            continue
-        steps = topics.get(topic.topics.step, 0)
-        found, expected = counts.get(channel.id, 0), counts.get(steps, 0)
-        if found != expected:
-            raise RecordingError(
-                f"{writer.path} lost its end: expected {expected} images in {channel.topic}, found {found}; "
-                f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
-            )
-
-
-def _check_frames_aligned(writer: RecordingWriter, contents: Contents, counts: Mapping[int, int]) -> None:
-    """Raises RecordingError unless each camera has as many frames as rows that say which steps they show."""
-    topics = {channel.topic: channel.id for channel in contents.channels.values()}
-    for name, channel in topics.items():
+    for name in topics:
         topic = parse(name)
-        if topic is None or topic.kind != "frame":
+        if topic is not None and topic.kind == "image":
+            pictures, rows = name, topic.topics.step
+        elif topic is not None and topic.kind == "frame":
+            pictures, rows = topic.topics.camera(topic.name), name
+        else:
             continue
-        camera = topic.topics.camera(topic.name)
-        found, expected = counts.get(topics.get(camera, 0), 0), counts.get(channel, 0)
+        found, expected = (counts.get(topics.get(each, 0), 0) for each in (pictures, rows))
         if found != expected:
             raise RecordingError(
-                f"{writer.path} lost its end: expected {expected} frames in {camera}, found {found}; "
+                f"{writer.path} lost its end: expected {expected} pictures in {pictures}, found {found}; "
                 f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
             )
 
@@ -184,10 +174,7 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
     writer.place.replaced = contents.metadata.get("replaced", "")
     _keep_journal_place(writer, contents)
     restore_container(writer.container, contents, source)
-    index_rows = contents.index.episodes
-    writer.index.rows = bytearray(index_rows.tobytes())
-    writer.index.metadata = bytearray(contents.index.metadata)
-    writer.index.count = len(index_rows)
+    writer.index = IndexBuilder(contents.index)
     writer.next_episode = contents.next_episode
     steps = step_channels(writer.container.channels, source.name)
     if steps:
