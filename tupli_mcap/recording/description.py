@@ -20,7 +20,6 @@ from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.edit.made_of import made_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.series import sampled_infos
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
@@ -141,7 +140,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         signed_by=claimed_signer(recording),
         run={key: value for key, value in vars(run).items() if value},
         runs=_runs(recording, positions),
-        made_of=made_of(recording),
+        made_of=recording.made_of,
         metadata_keys=_metadata_keys(recording, positions),
         info_keys=_info_keys(recording, positions),
         seeds=len({seeds[i] for i in positions.tolist()} - {None}),

@@ -281,6 +281,13 @@ class OpenedRecording:
             raise RecordingError(f"{self.name} has no attachment {name!r}; it has {known}")
         return read_attachment(self._source, self._contents.attachments[name])
 
+    def _small_attachment(self, name: str, most: int) -> bytes | None:
+        """An attachment's bytes, None if there is none; raises FormatError if it has more than `most` bytes."""
+        info = self.attachments.get(name)
+        if info is not None and info.size > most:
+            raise FormatError(f"{self.name}: {name}: expected at most {most} bytes, found {info.size}")
+        return None if info is None else self.read_attachment(name)
+
     @property
     def labels(self) -> Labels:
         """Names of dimensions and values, and the seconds of a step; parts that the recording lacks are empty.
@@ -288,13 +295,10 @@ class OpenedRecording:
         Raises:
             FormatError: they do not fit the recording.
         """
-        info = self.attachments.get(LABELS_NAME)
-        if info is None or self._layout is None:
+        data = None if self._layout is None else self._small_attachment(LABELS_NAME, MAX_LABELS)
+        if data is None:
             return Labels.none()
-        where = f"{self.name}: {LABELS_NAME}"
-        if info.size > MAX_LABELS:
-            raise FormatError(f"{where}: expected at most {MAX_LABELS} bytes, found {info.size}")
-        return Labels.from_json(self.read_attachment(LABELS_NAME), self._layout.leaves, where)
+        return Labels.from_json(data, self.layout.leaves, f"{self.name}: {LABELS_NAME}")
 
     @property
     def benchmark(self) -> RecordedBenchmark:

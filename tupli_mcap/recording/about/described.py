@@ -53,13 +53,10 @@ class DescribedRecording(OpenedRecording):
     @cached_property
     def recorded_runs(self) -> RecordedRuns:
         """The runs as `run.json` has them; missing parts are empty."""
-        info = self.attachments.get(RUN_NAME)
-        if info is None:
+        data = self._small_attachment(RUN_NAME, MAX_RUN)
+        if data is None:
             return RecordedRuns([Run()])
-        where = f"{self.name}: {RUN_NAME}"
-        if info.size > MAX_RUN:
-            raise FormatError(f"{where}: expected at most {MAX_RUN} bytes, found {info.size}")
-        return RecordedRuns.from_json(self.read_attachment(RUN_NAME), where)
+        return RecordedRuns.from_json(data, f"{self.name}: {RUN_NAME}")
 
     @property
     def _environment_name(self) -> str:
@@ -75,14 +72,11 @@ class DescribedRecording(OpenedRecording):
         Raises:
             FormatError: it says something else.
         """
-        info = self.attachments.get(MADE_OF_NAME)
-        if info is None:
+        data, where = self._small_attachment(MADE_OF_NAME, MAX_MADE_OF), f"{self.name}: {MADE_OF_NAME}"
+        if data is None:
             return None
-        where = f"{self.name}: {MADE_OF_NAME}"
-        if info.size > MAX_MADE_OF:
-            raise FormatError(f"{where}: expected at most {MAX_MADE_OF} bytes, found {info.size}")
         try:
-            document = json.loads(self.read_attachment(MADE_OF_NAME))
+            document = json.loads(data)
         except (ValueError, RecursionError) as err:
             raise FormatError(f"{where}: expected JSON, found something else: {err}") from err
         if not isinstance(document, dict) or not isinstance(document.get("sources"), list):
@@ -96,13 +90,10 @@ class DescribedRecording(OpenedRecording):
         Raises:
             FormatError: `annotations.json` is damaged.
         """
-        info = self.attachments.get(ANNOTATIONS_NAME)
-        if info is None:
+        data = self._small_attachment(ANNOTATIONS_NAME, MAX_ANNOTATIONS)
+        if data is None:
             return Annotations()
-        where = f"{self.name}: {ANNOTATIONS_NAME}"
-        if info.size > MAX_ANNOTATIONS:
-            raise FormatError(f"{where}: expected at most {MAX_ANNOTATIONS} bytes, found {info.size}")
-        return Annotations(self.read_attachment(ANNOTATIONS_NAME), where)
+        return Annotations(data, f"{self.name}: {ANNOTATIONS_NAME}")
 
     @cached_property
     def readable_runs(self) -> list[Run]:
