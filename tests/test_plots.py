@@ -178,8 +178,10 @@ def test_images_are_not_read_for_histograms(tmp_path: Path, monkeypatch: pytest.
     with Recording(path) as recording:
         images = set(recording._store.chunks(recording._topics["/image/state"]))
         read: list[int] = []
-        chunk = recording._store.chunk
-        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: read.append(i) or chunk(i, **kw))
+        chunk = recording._store._chunk
+        monkeypatch.setattr(
+            recording._store, "_chunk", lambda i, *a, **kw: read.append(i) or chunk(i, *a, **kw)
+        )
         measure(recording, np.arange(len(recording)))
         assert read and images and not images & set(read)
 
@@ -1068,8 +1070,10 @@ def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
     )  # ten steps at each of 16 places
     with Recording(path) as recording:
         loaded: set[int] = set()
-        chunk = recording._store.chunk
-        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: loaded.add(i) or chunk(i, **kw))
+        chunk = recording._store._chunk
+        monkeypatch.setattr(
+            recording._store, "_chunk", lambda i, *a, **kw: loaded.add(i) or chunk(i, *a, **kw)
+        )
         found = sketch(recording, 10)
         assert found.sampled == 160
         chunks = recording._store.chunks(recording._topics["/step"])

@@ -82,8 +82,10 @@ def test_images_may_be_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with Recording(path) as recording:
         images = recording._topics["/image/state"]
         read: list[int] = []
-        chunk = recording._store.chunk
-        monkeypatch.setattr(recording._store, "chunk", lambda i, **kw: read.append(i) or chunk(i, **kw))
+        chunk = recording._store._chunk
+        monkeypatch.setattr(
+            recording._store, "_chunk", lambda i, *a, **kw: read.append(i) or chunk(i, *a, **kw)
+        )
         columns = recording.read(images=False)
         part = recording.read_steps(0, 1, 4, images=False)
         assert not set(read) & set(recording._store.chunks(images)) and read
