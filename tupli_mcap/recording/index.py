@@ -85,8 +85,8 @@ class IndexBuilder:
         self.metadata = bytearray() if index is None else bytearray(index.metadata)
         self.count = 0 if index is None else len(index.episodes)
 
-    def add(self, row: EpisodeRow, metadata: str) -> None:
-        """Adds an episode and its metadata as JSON."""
+    def add(self, row: tuple[Any, ...], metadata: str) -> None:
+        """Adds an episode and its metadata as JSON; `row` is an `EpisodeRow`, or a plain tuple of its fields."""
         (
             first_row,
             length,

@@ -27,7 +27,7 @@ from tupli_mcap.messages.episodes import (
     record,
     start_texts,
 )
-from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeRow, IndexBuilder, indexed_seed
+from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
@@ -152,9 +152,8 @@ class EpisodeLog(EventLog):
                 self._records[position:stop] = final_record + end_record
                 self._can_drop = False
                 self._position = self._commit[0] = stop
-        row = EpisodeRow(
-            first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
-        )
+        # no EpisodeRow: to make one takes as long as to add it
+        row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)
 
     def expect_end(self, episode: StartedEpisode) -> None:
