@@ -646,7 +646,7 @@ def test_the_command_line_tells_that_memory_ran_out(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     begin_json("info")
-    assert _report(MemoryError("Unable to allocate 18.3 GiB"), as_json=True) == 1
+    assert _report(MemoryError("Unable to allocate 18.3 GiB"), [], as_json=True) == 1
     out, err = capsys.readouterr()
     assert "error: not enough memory" in err
     assert json.loads(out)["error"]["type"] == "MemoryError"
