@@ -39,7 +39,7 @@ from tupli_mcap import (
 from tupli_mcap.remote import source
 from tupli_mcap.schema import EpisodeMetadataCallback
 
-PASSWORD = "bench"
+PASSWORD = "bench-password"
 PROGRAM = str(Path(sys.executable).with_name("tupli-mcap"))
 CHOSEN = F("metadata.chosen") == True  # noqa: E712 - an expression
 
