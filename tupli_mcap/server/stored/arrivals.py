@@ -48,11 +48,11 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
 
 def demand_short(recording: Recording) -> None:
     """Raises TooLargeError for long metadata of an episode or a run: they are in everybody's lists, a run's with each
-    of its episodes."""
+    of its episodes; FormatError for damaged ones."""
     numbers = recording.index["episode"].tolist()
     texts = [
         *zip((f"episode {number}" for number in numbers), recording.all_metadata(), strict=True),
-        *(("a run", jsonvalue.dumps(run)) for run in jsonvalue.loads(runs_of(recording))),
+        *(("a run", jsonvalue.dumps(run.as_dict())) for run in recording.recorded_runs.runs),
     ]
     for what, text in texts:
         if len(text) > _MOST_METADATA:
