@@ -107,6 +107,11 @@ def render(
             overwrite=force,
             progress=progress,
         )
+    _tell(report, as_json=as_json)
+
+
+def _tell(report: RenderReport, *, as_json: bool) -> None:
+    """Prints what was rendered; exits with 1 if not all of it could be."""
     if as_json:
         print_json(_plain(report))
     else:

@@ -6,7 +6,7 @@ import contextlib
 import heapq
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
@@ -153,16 +153,11 @@ def merge_excerpts(
     target = Assembler(container)
     trims = _new_trims(sources, turns, numbered)
     facts = {"without": sorted(without)} if without else {"how": "trim", "steps": trims} if trims else {}
-    said = {
-        **carry_runs(numbered),
-        **say_made_of([source.recording for source in sources], **{**made, **facts}),
-    }
-    target.begin(new_metadata(first, next_episode), {**attachments, **said}, now)
+    said = say_made_of([source.recording for source in sources], **{**made, **facts})
+    target.begin(new_metadata(first, next_episode), {**attachments, **carry_runs(numbered), **said}, now)
     if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
-    envs = first.num_envs if first.is_vector else None
-    if lanes is not None:
-        envs = max(lane + source.recording.num_envs for lane, source in zip(lanes, sources, strict=True))
+    envs = _num_envs(sources, lanes)
     for source in sources:
         _define_missing(source.recording, container, envs, codec, without)
     container.define_channels()
@@ -184,15 +179,28 @@ def merge_excerpts(
         infos.append(copier.infos(rows))
     target.add_episodes(episodes)
     if lanes is not None:
-        for channel in container.channels.values():
-            if channel.topic == INFO:
-                target.add_messages(channel.id, heapq.merge(*infos, key=itemgetter(0)))
+        _add_infos(target, infos)
     target.finish(now)
     if target.held:
         warn(
             f"the times of {target.held:,} merged rows were raised to that of the row ahead, which was later"
         )
     return target
+
+
+def _add_infos(target: Assembler, infos: Iterable[Iterator[tuple[int, bytes]]]) -> None:
+    """Adds the infos of all sources, (log_time, body) of each, in the order of their times."""
+    for channel in target.container.channels.values():
+        if channel.topic == INFO:
+            target.add_messages(channel.id, heapq.merge(*infos, key=itemgetter(0)))
+
+
+def _num_envs(sources: Sequence[Excerpt], lanes: Sequence[int] | None) -> int | None:
+    """How many sub-environments the merged recording has; None if it is not of a vector environment."""
+    if lanes is not None:
+        return max(lane + source.recording.num_envs for lane, source in zip(lanes, sources, strict=True))
+    first = sources[0].recording
+    return first.num_envs if first.is_vector else None
 
 
 def check_mergeable(
