@@ -620,6 +620,13 @@ def test_a_chunk_of_too_many_messages_is_left_early() -> None:
     assert len(message_headers(memoryview(data))) == 10_000
 
 
+@pytest.mark.parametrize("claimed", [9, 27, 1 << 31, 1 << 63, (1 << 64) - 1])
+def test_a_message_of_another_size_than_it_claims_is_found(claimed: int) -> None:
+    data = struct.pack("<BQ", 5, 26) + bytes(26) + struct.pack("<BQ", 5, claimed) + bytes(26)
+    with pytest.raises(FormatError, match=f"expected a message record at byte .* of {claimed} bytes"):
+        message_headers(memoryview(data))
+
+
 @pytest.mark.parametrize("size", [0, 9, 18])
 def test_a_summary_offset_of_another_size_is_found(size: int, tmp_path: Path) -> None:
     path = place("constant_zstd", tmp_path)

@@ -121,7 +121,8 @@ def message_places(data: Any, most: int = sys.maxsize) -> Array:
     if len(starts) > most:
         raise FormatError(f"expected at most {most} messages, found more")
     places = np.empty((len(starts), 2), np.int64)
-    places[:, 0], places[:-1, 1], places[-1:, 1] = starts, starts[1:], at
+    # the last one may claim more bytes than an integer of NumPy can say
+    places[:, 0], places[:-1, 1], places[-1:, 1] = starts, starts[1:], min(at, end)
     opcodes = np.frombuffer(data, np.uint8)[places[:, 0]]
     if at != end or (opcodes != Opcode.MESSAGE).any() or (places[:, 1] - places[:, 0] < BODY).any():
         deque(iter_records(data), 0)  # raises, and names the wrong record
