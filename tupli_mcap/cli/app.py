@@ -143,7 +143,7 @@ def _before_typer() -> Iterator[None]:
 
 def _what_is_safe(words: Sequence[str]) -> str:
     """What Ctrl-C leaves of a command. A file is replaced as a whole or not at all, so this holds at any time."""
-    command = next((word for word in words if word in _NAMES), None)
+    command = next((word for word in words if not word.startswith("-")), None)
     if command is None or command in _READING:
         return "nothing was changed"
     if command in ("push", "pull"):

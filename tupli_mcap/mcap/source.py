@@ -10,6 +10,7 @@ import os
 import stat
 import threading
 import weakref
+from abc import ABC, abstractmethod
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -80,7 +81,7 @@ def _lent_buffer(length: int) -> memoryview:
     return buffer[:length]
 
 
-class _Checked:
+class _Checked(ABC):
     """A source whose `_read` may return fewer bytes, or raise OSError."""
 
     name: str
@@ -113,8 +114,8 @@ class _Checked:
             f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
         )
 
-    def _read(self, offset: int, length: int) -> bytes:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, offset: int, length: int) -> bytes: ...
 
 
 class PathSource(_Checked):
