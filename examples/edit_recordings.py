@@ -1,6 +1,4 @@
-"""Keep the good episodes of a recording: filter, sort, annotate, split and save them, and delete the rest."""
-
-from pathlib import Path
+"""Keep the good episodes of a recording: filter, sort, annotate, delete, split and save them."""
 
 import gymnasium as gym
 
@@ -22,7 +20,10 @@ best = dataset.sort("return", descending=True)[0]
 best.annotate(success=True, note="the longest one")
 print("annotated", tupli_mcap.open("all.mcap").filter("metadata.success")[0].metadata)
 
-good = dataset.filter("return > 25 and end == 'terminal'")
+# the same as `tupli-mcap delete all.mcap --filter 'return <= 25'`; tupli_mcap.restore_episodes("all.mcap") undoes it
+print("deleted  ", dataset.filter("return <= 25").delete())
+
+good = tupli_mcap.open("all.mcap").filter("end == 'terminal'")
 print("good     ", good)
 train, test = good.split(0.8, seed=0)
 for name, part in (("train", train), ("test", test)):
@@ -32,7 +33,3 @@ for name, part in (("train", train), ("test", test)):
 # the same as `tupli-mcap split train.mcap -o parts/train.mcap --episodes 10`
 parts = tupli_mcap.split_recording("train.mcap", "parts/train.mcap", episodes=10)
 print("split    ", *(f"{part.path} ({part.steps} steps)" for part in parts))
-
-for path in ("all.mcap", "train.mcap"):  # a recording is one file
-    Path(path).unlink()
-print("left     ", tupli_mcap.open("."))

@@ -9,9 +9,10 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 from typer.testing import CliRunner
+from web_server import serving
 
 import tupli_mcap
-from tupli_mcap import FileStorage, RecordEpisodes, Recording
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
 
 
@@ -109,7 +110,7 @@ def test_of_a_directory_by_filter(runs: Path) -> None:
 
 
 def test_never_a_whole_recording_by_the_way(runs: Path) -> None:
-    assert "cannot bring back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
+    assert "which nothing brings back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
     assert seeds(runs) == [0, 1, 2, 3] * 2
     assert "say which" in run("delete", str(runs), code=2)
     run("delete", str(runs / "a.mcap"), "--episodes", "all", "--force")
@@ -122,3 +123,58 @@ def test_another_recording_of_the_same_name_loses_nothing(runs: Path) -> None:
     record(runs / "a.mcap", episodes=2)
     assert "restored 0 episodes" in run("restore", str(runs / "a.mcap"))
     assert seeds(runs / "a.mcap") == [0, 1]
+
+
+def test_in_python_and_back(runs: Path) -> None:
+    file = runs / "a.mcap"
+    doomed = tupli_mcap.open(file).filter("seed >= 2")
+    assert (doomed.delete(dry_run=True), seeds(file)) == (2, [0, 1, 2, 3])
+    assert not list(runs.rglob("*.json"))
+    assert (doomed.delete(), seeds(file)) == (2, [0, 1])
+    assert doomed.delete() == 0  # they are gone already
+    uuid = Recording(file).uuid
+    assert tupli_mcap.restore_episodes(runs, [3], dry_run=True) == [f"{uuid}-3"]
+    assert tupli_mcap.restore_episodes([file, runs], [3]) == [f"{uuid}-3"]
+    assert seeds(file) == [0, 1, 3]
+    assert tupli_mcap.restore_episodes(file) == [f"{uuid}-2"]
+    assert seeds(file) == [0, 1, 2, 3]
+    with pytest.raises(RecordingError, match="does not exist"):
+        tupli_mcap.restore_episodes(runs / "none.mcap")
+
+
+def test_one_episode_in_python(runs: Path) -> None:
+    assert tupli_mcap.open(runs)[1].delete() == 1
+    assert Recording(runs / "a.mcap").episodes[0].delete() == 1
+    assert Recording(runs / "a.mcap").episodes[0].delete() == 0
+    assert seeds(runs) == [2, 3, 0, 1, 2, 3]
+
+
+def test_in_python_never_a_whole_recording_by_the_way(runs: Path) -> None:
+    one, other = tupli_mcap.open(runs / "a.mcap"), tupli_mcap.open(FileStorage(runs / "deep"))
+    for dry_run in (True, False):
+        with pytest.raises(
+            RecordingError, match=r"b\.mcap: all its episodes.*choose fewer episodes, or pass force"
+        ):
+            (one.filter("seed == 0") + other).delete(dry_run=dry_run)
+    assert seeds(runs) == [0, 1, 2, 3] * 2
+    assert (one.filter("seed == 0") + other).delete(force=True) == 5
+    assert [path.name for path in runs.rglob("*.mcap")] == ["a.mcap"]
+    assert seeds(runs) == [1, 2, 3]
+
+
+def test_in_a_storage_the_catalog_knows(runs: Path) -> None:
+    storage = FileStorage(runs)
+    assert storage.count_episodes() == 8
+    assert tupli_mcap.open(storage).filter("seed >= 2").delete() == 4
+    assert storage.count_episodes() == 4
+    assert len(tupli_mcap.restore_episodes(runs)) == 4
+    assert storage.count_episodes() == 8
+
+
+def test_at_a_url_nothing_is_deleted(runs: Path) -> None:
+    with serving() as server:
+        server.files["/a.mcap"] = (runs / "a.mcap").read_bytes()
+        dataset = tupli_mcap.open(server.url("/a.mcap"))
+        for delete in (dataset.filter("seed == 0").delete, dataset[0].delete):
+            with pytest.raises(RecordingError, match="cannot be changed here; download it"):
+                delete()

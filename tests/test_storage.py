@@ -28,6 +28,7 @@ from gymnasium import spaces
 from sqlalchemy.exc import OperationalError
 from test_schemas import validator
 
+import tupli_mcap
 from tupli_mcap import EpisodeWriter, TupliDataset, TupliEnvWrapper
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import (
@@ -310,6 +311,16 @@ class StorageContract:
             storage.delete_episode(headers[1].id)
         assert storage.delete_episodes(FilterEQ(key="benchmark_id", value=benchmark)) == 2
         assert storage.list_episodes() == []
+
+    def test_delete_what_a_dataset_has(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        headers = storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
+        dataset = tupli_mcap.open(storage)
+        assert (dataset.delete(force=True, dry_run=True), storage.count_episodes()) == (5, 5)
+        assert dataset.filter("metadata.score >= 3").delete(force=True) == 2
+        assert dataset[0].delete(force=True) == 1
+        assert [h.id for h in storage.list_episodes()] == [h.id for h in headers[1:3]]
+        assert dataset.delete(force=True) == 2
 
     def test_publish_episode(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         filter_recording as filter_recording,
         merge_recordings as merge_recordings,
         open as open,
+        restore_episodes as restore_episodes,
         split_recording as split_recording,
     )
     from tupli_mcap.errors import (
@@ -86,7 +87,7 @@ if TYPE_CHECKING:
 # The module of each public name, imported on first use, so that `import tupli_mcap` is quick.
 _HOMES = {
     "benchmark": "TupliEnvWrapper",
-    "dataset": "Dataset TupliDataset filter_recording merge_recordings open split_recording",
+    "dataset": "Dataset TupliDataset filter_recording merge_recordings open restore_episodes split_recording",
     "errors": (
         "FilterError FormatError MissingExtraError NotFoundError RecordingError SignatureError "
         "SpaceError StepError StorageError TupliError UntrustedError"

@@ -40,7 +40,6 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import say, terminal_width
-from tupli_mcap.errors import RecordingError
 
 __all__ = [
     "compact",
@@ -165,40 +164,27 @@ def delete(
     is not touched until compact frees their space. A copy of the recording without FILE.json
     still shows them.
     """
+    from tupli_mcap.dataset import curate
+    from tupli_mcap.dataset.sources import FilesSource
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
-    from tupli_mcap.storage.sidecar import storage_of
 
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
     wanted = filter_of(filter_text)
-    doomed: dict[Path, dict[tuple[str, str], list[int]]] = {}
-    for path in (file for given in paths for file in find_recordings(given)):
-        with Recording(path) as recording:
+    files = [str(file) for given in paths for file in find_recordings(given)]
+    doomed: dict[tuple[str, str], list[int]] = {}
+    for file in files:
+        with Recording(file) as recording:
             among = candidates(recording, wanted)
             positions = among if episodes is None else named_positions(recording, among, episodes, wanted)
-            if len(positions) and len(positions) == len(candidates(recording)) and not force:
-                raise RecordingError(
-                    f"{path}: all its episodes would be deleted, and with them the file, which restore cannot bring "
-                    "back; choose fewer episodes, or remove the file with --force"
-                )
-            numbers = recording.index["episode"][positions].tolist()
-            root = storage_of(path.absolute())
-            key = path.absolute().relative_to(root).as_posix(), recording.uuid
-        if numbers:
-            doomed.setdefault(root, {})[key] = numbers
-    ids = [
-        episode_id(uuid, number)
-        for by_recording in doomed.values()
-        for (_, uuid), numbers in by_recording.items()
-        for number in numbers
-    ]
-    count = len(ids) if dry_run else 0
-    for root, by_recording in () if dry_run else doomed.items():
-        with open_storage(root) as storage:
-            count += storage.delete_numbers(by_recording)
+            if len(positions):
+                doomed[file, recording.uuid] = recording.index["episode"][positions].tolist()
+    source = FilesSource(files) if files else None
+    count = 0 if source is None else curate.delete(source, doomed, force=force, dry_run=dry_run)
+    ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
     print_result(
         {"dry_run": dry_run, "episodes": ids},
         f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
@@ -211,26 +197,15 @@ def restore(paths: _Paths, episodes: Episodes = None, dry_run: DryRun = False, a
 
     It cannot bring back episodes whose space compact has freed.
     """
+    from tupli_mcap.dataset import restore_episodes
     from tupli_mcap.dataset.which import bounds_of
-    from tupli_mcap.storage.listing import find_recordings
-    from tupli_mcap.storage.sidecar import storage_of
 
-    wanted = [bounds_of(item.strip(), episodes) for item in episodes.split(",")] if episodes else None
-    restored: list[str] = []
-    by_root: dict[Path, set[str]] = {}
-    for file in (file.absolute() for given in paths for file in find_recordings(given)):
-        root = storage_of(file)
-        by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
-    for root, recordings in by_root.items():
-        with open_storage(root) as storage:
-            chosen = []
-            for one in storage.deleted_episodes(recordings):
-                found = int(one.rpartition("-")[2])
-                if wanted is None or any(first <= found <= last for first, last in wanted):
-                    chosen.append(one)
-            if not dry_run:
-                storage.restore_episodes(chosen, recordings)
-            restored += chosen
+    if episodes is None:
+        restored = restore_episodes(paths, dry_run=dry_run)
+    else:
+        bounds = [bounds_of(item.strip(), episodes) for item in episodes.split(",")]
+        found = [restore_episodes(paths, range(low, high + 1), dry_run=dry_run) for low, high in bounds]
+        restored = list(dict.fromkeys(one for ids in found for one in ids))
     print_result(
         {"dry_run": dry_run, "episodes": restored},
         f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}",

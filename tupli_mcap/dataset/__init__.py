@@ -8,7 +8,7 @@ which, chosen      finds those that a word, a number or a filter means: in one r
 keys               the values of episodes at a key
 columns/           whole columns: reads and saves them; as tables, and in the forms of other libraries
 access, items/     `windows`, `transitions`, and samples of them; reads steps by number
-curate, display    writes a recording of fewer episodes; shows datasets as text and HTML
+curate, display    writes a recording of fewer episodes, deletes episodes; shows datasets as text and HTML
 """
 
 from __future__ import annotations
@@ -25,7 +25,13 @@ if TYPE_CHECKING:
         TorchTupleParser,
     )
     from tupli_mcap.dataset.columns.saved import SavedColumns, open_columns
-    from tupli_mcap.dataset.curate import FilterReport, filter_recording, merge_recordings, split_recording
+    from tupli_mcap.dataset.curate import (
+        FilterReport,
+        filter_recording,
+        merge_recordings,
+        restore_episodes,
+        split_recording,
+    )
     from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.dataset.opening import open
     from tupli_mcap.dataset.sources import DatasetError
@@ -37,7 +43,7 @@ __getattr__ = imported_on_use(
     {
         "columns.convert": "BaseTupleParser NumpyTupleParser TensorflowTupleParser TorchTupleParser",
         "columns.saved": "SavedColumns open_columns",
-        "curate": "FilterReport filter_recording merge_recordings split_recording",
+        "curate": "FilterReport filter_recording merge_recordings restore_episodes split_recording",
         "dataset": "Dataset",
         "opening": "open",
         "sources": "DatasetError",
@@ -59,5 +65,6 @@ __all__ = [
     "merge_recordings",
     "open",
     "open_columns",
+    "restore_episodes",
     "split_recording",
 ]

@@ -1,15 +1,15 @@
-"""Writes a recording of some episodes: those that match a filter, or those of a dataset."""
+"""Writes a recording of some episodes; deletes episodes, and brings them back."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.dataset.sources import DatasetError
+from tupli_mcap.dataset.sources import DatasetError, Source
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
@@ -30,14 +30,17 @@ from tupli_mcap.schema import BaseFilter, parse_filter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
+    from tupli_mcap.storage import TupliStorage
 
 __all__ = [
     "FilterReport",
+    "delete",
     "file_path",
     "filter_dataset",
     "filter_recording",
     "merge_recordings",
     "relabel",
+    "restore_episodes",
     "save",
     "split_recording",
     "trim",
@@ -274,3 +277,65 @@ def relabel(
     _check_new(dataset, target, overwrite=overwrite)
     relabel_excerpts(_excerpts(dataset), target, function, fields)
     return target
+
+
+def delete(
+    source: Source,
+    by_recording: Mapping[tuple[str, str], Collection[int]],
+    *,
+    force: bool = False,
+    dry_run: bool = False,
+) -> int:
+    """Deletes episodes by their numbers; returns how many were still there, or would be deleted.
+
+    Args:
+        by_recording: numbers of episodes, by the recording's name in the source, and its UUID.
+
+    Raises as `Dataset.delete`.
+    """
+    by_storage: dict[TupliStorage, dict[tuple[str, str], Collection[int]]] = {}
+    for (name, uuid), numbers in by_recording.items():
+        storage, known_as = source.home_of(name)
+        by_storage.setdefault(storage, {})[known_as, uuid] = numbers
+    if dry_run or len(by_storage) > 1:  # if one refuses, none deletes
+        count = sum(storage.delete_numbers(d, force=force, dry_run=True) for storage, d in by_storage.items())
+    if dry_run:
+        return count
+    return sum(storage.delete_numbers(doomed, force=force) for storage, doomed in by_storage.items())
+
+
+def restore_episodes(
+    places: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
+    episodes: Collection[int] | None = None,
+    *,
+    dry_run: bool = False,
+) -> list[str]:
+    """Brings deleted episodes back (their numbers, such as `[3, 7]`; all by default), and returns their ids.
+
+    Those whose space `compact` has freed, those of a file that was removed, and those on a server cannot be restored.
+
+    Args:
+        places: the paths of recordings, directories and storages.
+
+    Raises:
+        RecordingError: there is no such path.
+        StorageError: the notes beside a recording cannot be written.
+    """
+    from tupli_mcap.storage import FileStorage
+    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.sidecar import storage_of
+
+    by_root: dict[Path, set[str]] = {}
+    given = [places] if isinstance(places, str | os.PathLike) else places
+    for file in (file.absolute() for place in given for file in find_recordings(Path(place))):
+        root = storage_of(file)
+        by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
+    restored = []
+    for root, recordings in by_root.items():
+        storage = FileStorage(root)
+        deleted = storage.deleted_episodes(recordings)
+        chosen = [one for one in deleted if episodes is None or int(one.rpartition("-")[2]) in episodes]
+        if not dry_run:
+            storage.restore_episodes(chosen, recordings)
+        restored += chosen
+    return restored

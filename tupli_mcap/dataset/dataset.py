@@ -143,6 +143,7 @@ class Dataset(RandomAccess):
         position = int(np.searchsorted(recording.index["episode"], header.episode))
         episode = recording.episodes[position]
         episode.listed = header
+        episode.listed_in = self
         if episode.number != header.episode:
             raise DatasetError(f"{header.recording} has lost episode {header.episode}; open it again")
         return episode
@@ -476,6 +477,28 @@ class Dataset(RandomAccess):
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
         return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
+
+    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
+        """Deletes the episodes where they are stored: `ds.filter("return < 0").delete()`; returns their number.
+
+        Files are not touched: a file beside each (FILE.json) lists its deleted episodes, and `restore_episodes` brings
+        them back until `compact` frees their space. Episodes on a server are gone. A dataset that was listed before
+        still lists them; open it again.
+
+        Args:
+            force: also delete all episodes of a file, and with them the file, which cannot be restored.
+            dry_run: delete nothing, but return the number.
+
+        Raises:
+            RecordingError: all episodes of a file would be deleted (without `force`), or a file is at a URL; then none
+                is deleted.
+            DeniedError: an episode on a server is somebody else's.
+            StorageError: the server cannot be reached, the notes cannot be written, ...
+        """
+        doomed: dict[tuple[str, str], list[int]] = {}
+        for header in self.headers:
+            doomed.setdefault((header.recording, header.id.rpartition("-")[0]), []).append(header.episode)
+        return curate.delete(self._source, doomed, force=force, dry_run=dry_run)
 
     # ---- showing
 

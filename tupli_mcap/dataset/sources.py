@@ -8,7 +8,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from pydantic import ValidationError
 
@@ -30,7 +30,10 @@ from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import restored
-from tupli_mcap.storage.sidecar import Notes
+from tupli_mcap.storage.sidecar import Notes, storage_of
+
+if TYPE_CHECKING:
+    from tupli_mcap.storage import FileStorage
 
 __all__ = [
     "DatasetError",
@@ -75,6 +78,14 @@ class Source(Protocol):
         """The recording that a header names; the caller closes it. `episodes` as in `TupliStorage.open_recording`."""
         ...
 
+    def home_of(self, recording: str) -> tuple[TupliStorage, str]:
+        """The storage that changes the recording that a header names, and the name that the storage has for it.
+
+        Raises:
+            RecordingError: nothing can change it.
+        """
+        ...
+
 
 class StorageSource:
     """The episodes of a storage."""
@@ -112,6 +123,9 @@ class StorageSource:
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return self.storage.open_recording(recording, episodes)
 
+    def home_of(self, recording: str) -> tuple[TupliStorage, str]:
+        return self.storage, recording
+
     def __repr__(self) -> str:
         return repr(self.storage)
 
@@ -144,6 +158,7 @@ class FilesSource:
             )
         self.names = list(dict.fromkeys(names))
         self._addresses = {shown(name): name for name in self.names if is_url(name)}
+        self._folders: dict[Path, FileStorage] = {}
 
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
         matches = compile_predicate(filter, BenchmarkHeader)
@@ -201,6 +216,17 @@ class FilesSource:
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return Recording(self._addresses.get(recording, recording), cache_bytes=_CACHE_BYTES)
 
+    def home_of(self, recording: str) -> tuple[TupliStorage, str]:
+        if is_url(recording):
+            raise RecordingError(f"{recording} cannot be changed here; download it, and open the copy")
+        from tupli_mcap.storage import FileStorage  # and with it a database, which reading does not need
+
+        path = Path(recording).absolute()
+        root = storage_of(path)
+        if root not in self._folders:
+            self._folders[root] = FileStorage(root)
+        return self._folders[root], path.relative_to(root).as_posix()
+
     def __repr__(self) -> str:
         return repr(shown(self.names[0])) if len(self.names) == 1 else f"{len(self.names)} files"
 
@@ -243,6 +269,9 @@ class JoinedSource:
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return self._of[recording][0].open(recording, episodes)
+
+    def home_of(self, recording: str) -> tuple[TupliStorage, str]:
+        return self._of[recording][0].home_of(recording)
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self._sources))

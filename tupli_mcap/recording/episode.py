@@ -14,9 +14,10 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.columns.fields import GymnasiumNames
-from tupli_mcap.schema import RLTuple
+from tupli_mcap.schema import F, RLTuple
 
 if TYPE_CHECKING:
+    from tupli_mcap.dataset import Dataset
     from tupli_mcap.recording.about.run import Run
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
@@ -69,6 +70,8 @@ class Episode(GymnasiumNames):
         self._row = recording.index[position]
         self.listed: Described | None = None
         """The dataset's entry of this episode; its metadata follow later annotations."""
+        self.listed_in: Dataset | None = None
+        """The dataset that it is an episode of."""
 
     def __len__(self) -> int:
         return int(self._row["length"])
@@ -174,6 +177,14 @@ class Episode(GymnasiumNames):
         self.__dict__.pop("metadata", None)
         if self.listed is not None:
             self.listed.metadata = self.metadata
+
+    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
+        """Deletes the episode where it is stored; returns 1, or 0 if it was deleted before. See `Dataset.delete`.
+
+        To delete many, `dataset.filter(function).delete()` is quicker.
+        """
+        dataset = self._recording.dataset if self.listed_in is None else self.listed_in
+        return dataset.filter(F("id") == self.id).delete(force=force, dry_run=dry_run)
 
     @cached_property
     def start(self) -> EpisodeStart:

@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import secrets
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +24,7 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     EpisodeItem,
+    FilterIN,
 )
 from tupli_mcap.schema.times import time_ns
 
@@ -47,6 +48,7 @@ TupliStorageError = StorageError
 LOCAL_USER = "local_storage"
 """The creator of all items in a directory; also the only group that sees them."""
 _ATTEMPTS = 5
+_MOST_IDS = 10_000  # in one filter; a server takes twice as many
 _T = TypeVar("_T")
 _Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
 
@@ -155,6 +157,30 @@ class TupliStorage(ABC):
     @abstractmethod
     def delete_episodes(self, filter: BaseFilter) -> int:
         """Delete every episode that matches a filter; returns their number."""
+
+    def delete_numbers(
+        self,
+        by_recording: Mapping[tuple[str, str], Collection[int]],
+        *,
+        force: bool = False,
+        dry_run: bool = False,
+    ) -> int:
+        """Delete episodes by their numbers; returns how many were still there, or would be deleted.
+
+        Args:
+            by_recording: numbers of episodes, by the name that headers give their recording, and by its UUID.
+            force: in a directory, also delete all episodes of a recording, and with them its file.
+            dry_run: delete nothing.
+
+        Raises:
+            RecordingError: all episodes of a file would be deleted (without `force`); then none is deleted.
+        """
+        ids = [episode_id(uuid, n) for (_, uuid), numbers in by_recording.items() for n in numbers]
+        count = 0
+        for start in range(0, len(ids), _MOST_IDS):
+            wanted = FilterIN(key="id", value=ids[start : start + _MOST_IDS])
+            count += self.count_episodes(wanted) if dry_run else self.delete_episodes(wanted)
+        return count
 
     @abstractmethod
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:

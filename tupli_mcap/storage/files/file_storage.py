@@ -247,13 +247,15 @@ class FileStorage(TupliStorage):
     def delete_episodes(self, filter: BaseFilter) -> int:
         return self._recordings.delete(self._catalog.headers(filter))
 
-    def delete_numbers(self, by_recording: Mapping[tuple[str, str], Collection[int]]) -> int:
-        """Deletes episodes of recordings that may be copies of others, which the catalog does not list.
-
-        Args:
-            by_recording: numbers of episodes, by the recording's path below `root` and its UUID.
-        """
-        return self._recordings.delete_numbers(by_recording)
+    def delete_numbers(
+        self,
+        by_recording: Mapping[tuple[str, str], Collection[int]],
+        *,
+        force: bool = False,
+        dry_run: bool = False,
+    ) -> int:
+        # The recordings may be copies of others, which the catalog does not list.
+        return self._recordings.delete_numbers(by_recording, force=force, dry_run=dry_run)
 
     def deleted_episodes(self, recordings: Collection[str] | None = None) -> list[str]:
         """The ids of deleted episodes that can be restored, because `compact` has not freed their space.

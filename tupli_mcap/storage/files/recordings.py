@@ -143,21 +143,24 @@ class RecordingFiles:
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
             by_recording.setdefault((header.recording, _uuid(header)), set()).add(header.episode)
-        return self.delete_numbers(by_recording)
+        return self.delete_numbers(by_recording, force=True)
 
-    def delete_numbers(self, by_recording: Mapping[tuple[str, str], Collection[int]]) -> int:
-        """`delete` for the numbers of episodes, by the recording's path below the root and its UUID.
+    def delete_numbers(
+        self,
+        by_recording: Mapping[tuple[str, str], Collection[int]],
+        *,
+        force: bool,
+        dry_run: bool = False,
+    ) -> int:
+        """See `TupliStorage.delete_numbers`; recordings are named by their paths below the root.
 
         A copy of a recording is another one: only the recordings that are named here lose episodes.
         """
+        if dry_run:  # leaves no lock behind
+            return sum(len(note.deleted) for note in self._doomed(by_recording, force).values())
         with self._lock:
             self._finish_deletion()
-            doomed: dict[str, Sidecar] = {}
-            for (relative, uuid), numbers in by_recording.items():
-                with contextlib.suppress(NotFoundError):  # somebody else was first
-                    left = self._left(self.path(relative), uuid).intersection(numbers)
-                    if left:
-                        doomed[relative] = Sidecar(uuid=uuid, deleted=left)
+            doomed = self._doomed(by_recording, force)
             if len(doomed) > 1:
                 Deletion(
                     deleted={relative: note.deleted for relative, note in doomed.items()},
@@ -165,6 +168,25 @@ class RecordingFiles:
                 ).write(self._root)
             self._do_deletion(doomed)
         return sum(len(note.deleted) for note in doomed.values())
+
+    def _doomed(
+        self, by_recording: Mapping[tuple[str, str], Collection[int]], force: bool
+    ) -> dict[str, Sidecar]:
+        """Those of the episodes that are still there, by path below the root."""
+        doomed: dict[str, Sidecar] = {}
+        for (relative, uuid), numbers in by_recording.items():
+            with contextlib.suppress(NotFoundError):  # somebody else was first
+                path = self.path(relative)
+                left = self._left(path, uuid)
+                gone = left.intersection(numbers)
+                if gone == left and gone and not force:
+                    raise RecordingError(
+                        f"{path}: all its episodes would be deleted, and with them the file, which nothing brings "
+                        "back; choose fewer episodes, or pass force=True (--force)"
+                    )
+                if gone:
+                    doomed[relative] = Sidecar(uuid=uuid, deleted=gone)
+        return doomed
 
     def deleted(self, only: Collection[str] | None = None) -> list[str]:
         """The ids of the episodes that are deleted and still in their recordings, or `only` in those at these paths."""
