@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import certifi
 import pytest
 from hypothesis import settings
 
@@ -26,10 +27,15 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session", autouse=True)
 def _shared_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A cache for what is made once for several tests; no authorities to load whenever a client of a server is made."""
+    """A cache for what is made once for several tests. One authority, instead of all that are known: they are loaded
+    whenever a client of a server is made. A client of a bucket needs one at least."""
+    authority, end, _ = Path(certifi.where()).read_text().partition("-----END CERTIFICATE-----\n")
+    trusted = tmp_path_factory.mktemp("trusted")
+    (trusted / "authority.pem").write_text(authority + end)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
-        patch.setenv("SSL_CERT_DIR", str(tmp_path_factory.mktemp("certificates")))
+        patch.setenv("SSL_CERT_FILE", str(trusted / "authority.pem"))
+        patch.setenv("SSL_CERT_DIR", str(tmp_path_factory.mktemp("no more")))
         yield
 
 
