@@ -21,6 +21,7 @@ from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.listing import RecordingStamp
 
 _NAMES = itertools.count()
+_EMPTY = "template0 LOCALE_PROVIDER icu ICU_LOCALE 'en'"
 _SETTINGS = {"fsync": "off", "max_connections": "200", "listen_addresses": "", "client_min_messages": "error"}
 
 
@@ -41,6 +42,7 @@ class Cluster:
         self._bin = Path(found[-1]).parent
         self._directory = directory
         self._own: list[str] = []
+        self._template = ""  # the database that others are copies of, once there is one
         if os.getuid() == 0:  # as whom PostgreSQL refuses to run
             self._own = ["runuser", "-u", "postgres", "--"]
             os.chown(directory, pwd.getpwnam("postgres").pw_uid, -1)
@@ -58,15 +60,26 @@ class Cluster:
         self._run("pg_ctl", "--wait", "-m", how, "stop")
 
     @contextlib.contextmanager
-    def database(self) -> Iterator[str]:
-        """A new empty database, dropped after the block: its URL. Texts are ordered as English ones in it, unless a
-        column says otherwise."""
-        name = f"d{os.getpid()}_{next(_NAMES)}"
-        self.execute(f"CREATE DATABASE {name} TEMPLATE template0 LOCALE_PROVIDER icu ICU_LOCALE 'en'")
+    def database(self, *, empty: bool = False) -> Iterator[str]:
+        """A new database, dropped after the block: its URL. Texts are ordered as English ones in it, unless a column
+        says otherwise. Unless it is to be `empty`, it has the tables of a server, copied: to make them takes longer."""
+        if not (empty or self._template):
+            template = self._created(_EMPTY)
+            Database(self._url(template)).close()
+            self._template = template
+        name = self._created(_EMPTY if empty else self._template)
         try:
-            yield f"postgresql+psycopg://postgres@/{name}?host={self._directory}"
+            yield self._url(name)
         finally:
             self.execute(f"DROP DATABASE {name} WITH (FORCE)")
+
+    def _created(self, template: str) -> str:
+        name = f"d{os.getpid()}_{next(_NAMES)}"
+        self.execute(f"CREATE DATABASE {name} TEMPLATE {template}")
+        return name
+
+    def _url(self, name: str) -> str:
+        return f"postgresql+psycopg://postgres@/{name}?host={self._directory}"
 
     def execute(self, statement: LiteralString) -> None:
         """A statement of the superuser, outside of all databases of tests."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -11,26 +13,48 @@ from typing import Any
 
 import pytest
 import uvicorn
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
 
 from tupli_mcap.server.app import create_app
+from tupli_mcap.server.database import Database
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
 from tupli_mcap.server.run import Listening, configured
 from tupli_mcap.server.settings import Settings
 
 PASSWORD = "correct horse battery staple"
+# As the server hashes passwords, but at once: nobody attacks these. A server in a process of its own takes its time.
+_HASHES = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=8, parallelism=1),))
 
 
 @contextlib.contextmanager
 def serving(settings: Settings, listening: Listening | None = None) -> Iterator[str]:
     """Serves in a thread; yields the address. The admin's password is PASSWORD."""
-    with pytest_environment("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accounts, "_HASHES", _HASHES)
+        patch.setenv("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD)
+        database = settings.own / "server.sqlite"
+        if not settings.database and not database.exists():
+            settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+            database.write_bytes(_tables())
         library = Library(settings)
         library.first_password()
         library.adopt()
-    config = configured(lambda: create_app(library), settings, listening or Listening())
-    config.port = 0
-    with running(config) as url:
-        yield url
+        patch.delenv("TUPLI_MCAP_ADMIN_PASSWORD")
+        config = configured(lambda: create_app(library), settings, listening or Listening())
+        config.port = 0
+        with running(config) as url:
+            yield url
+
+
+@functools.cache
+def _tables() -> bytes:
+    """The database of a new server in SQLite, which is copied: to make the tables takes longer."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "server.sqlite")
+        Database(f"sqlite:///{file}").close()
+        return file.read_bytes()
 
 
 @contextlib.contextmanager
@@ -63,11 +87,3 @@ def settings_of(engine: str, request: pytest.FixtureRequest, directory: Path) ->
 
     with request.getfixturevalue("postgres").database() as database, buckets.bucket() as bucket:
         yield Settings(directory, database=database, blobs=bucket.url)
-
-
-@contextlib.contextmanager
-def pytest_environment(name: str, value: str) -> Iterator[None]:
-    """Sets a variable of the environment for a block."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(name, value)
-        yield

@@ -33,7 +33,7 @@ def place(kind: str, directory: Path, postgres: Cluster) -> Iterator[Settings]:
     settings = Settings(directory)
     with contextlib.ExitStack() as stack:
         if "postgresql" in kind:
-            database = stack.enter_context(postgres.database())
+            database = stack.enter_context(postgres.database(empty=True))
             bucket = stack.enter_context(buckets.bucket())
             settings = replace(settings, database=database, blobs=f"{bucket.url}/x")
         yield settings

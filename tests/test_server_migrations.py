@@ -33,7 +33,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
         yield f"sqlite:///{tmp_path / 'server.sqlite'}"
         return
     postgres: Cluster = request.getfixturevalue("postgres")
-    with postgres.database() as url:
+    with postgres.database(empty=True) as url:
         yield url
 
 

@@ -286,7 +286,7 @@ class Campaign:
         with contextlib.ExitStack() as stack:
             url = f"sqlite:///{settings.own / 'server.sqlite'}"
             if self.cluster:
-                url = stack.enter_context(self.cluster.database())
+                url = stack.enter_context(self.cluster.database(empty=True))
             fill_first(url)
             server = Server(replace(settings, database=url), self._environment)
             server.launch()
