@@ -5,21 +5,25 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import itertools
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 import pytest
+from persons import Person
 from postgres import Cluster
-from serving import PASSWORD, serving
+from serving import ENGINES, PASSWORD, serving, settings_of
 from test_storage import episode, query
 
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
@@ -257,6 +261,43 @@ def test_what_a_deleted_user_kept_for_themselves_goes(tmp_path: Path, another: A
         assert artifacts[0] in kept and artifacts[1] not in kept
         assert made[0].recording.rpartition("/")[2] in kept
         assert alone[0].recording.rpartition("/")[2] not in kept
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_who_asks_much_leaves_the_others_their_turn(
+    engine: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Eve's requests wait for the writer, so that none is answered before ann's are."""
+    with contextlib.ExitStack() as stack:
+        settings = stack.enter_context(settings_of(engine, request, tmp_path / "served"))
+        url = stack.enter_context(serving(settings))
+        admin = Person(url, "admin")
+        for name in ("ann", "eve"):
+            admin.ask("POST", "/v1/users", {"username": name, "password": f"{name}'s password"})
+        ann, eve = Person(url, "ann"), Person(url, "eve")
+        browser = stack.enter_context(httpx.Client(base_url=url, timeout=120))
+        browser.post("/sign-in", data={"username": "eve", "password": "eve's password"})
+        code = re.findall(r'name="code" value="(\w+)"', browser.get("/groups").text)[0]
+        database = stack.enter_context(contextlib.closing(Database(settings.database_url)))
+        pool = stack.enter_context(ThreadPoolExecutor(120))
+
+        def create(number: int) -> httpx.Response:
+            if number % 2:
+                return browser.post("/groups", data={"name": f"g{number}", "code": code})
+            return eve.call("POST", "/v1/groups", {"name": f"g{number}"})
+
+        with database.writing():
+            asked = [pool.submit(create, number) for number in range(120)]
+            refused = [each.result() for each in itertools.islice(as_completed(asked), 16)]
+            assert {each.status_code for each in refused} == {429}
+            assert {each.headers.get("Retry-After", "1") for each in refused} == {"1"}
+            assert ann.ask("GET", "/v1/me")["username"] == "ann"
+            assert ann.ask("POST", "/v1/episodes/count", {}) == 0
+            assert sum(each.done() for each in asked) == 16
+        answers = [each.result().status_code for each in asked]
+        assert (answers.count(429), answers.count(400)) == (16, 4)  # a user may create 100 groups
+        assert set(answers) == {200, 303, 400, 429}
 
 
 # --- connections ---

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from typing import Annotated, Any, Final
 from urllib.parse import quote, urlencode
 
@@ -66,12 +66,13 @@ FILE_NAME: Final = "{name:file_name}"
 """The part of a route's path for the name of a file, which may have slashes and line breaks."""
 
 
-def _shelf(request: Request) -> Shelf:
-    shelf: Shelf = request.app.state.shelf_of(request)
-    return shelf
+async def _shelf(request: Request) -> AsyncIterator[Shelf]:
+    async with request.app.state.shown(request) as shelf:
+        request.state.shelf = shelf
+        yield shelf
 
 
-Shown = Annotated[Shelf, Depends(_shelf)]
+Shown = Annotated[Shelf, Depends(_shelf, scope="function")]
 """The shelf, limited to what the requesting user may see."""
 
 
@@ -161,25 +162,17 @@ def _templates() -> Environment:
 
 
 def error_page(request: Request, err: Exception) -> Response:
-    """The page for an error; for `SignInNeededError`, a redirection to the sign-in page."""
+    """The page for an error; for `SignInNeededError`, a redirection to the sign-in page. `request.state.shelf` is the
+    shelf, once it is known."""
     as_json = request.query_params.get("format") == "json"
     if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
         here = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return _with_headers(RedirectResponse(address("sign-in", next=here), 303))
     status, text = _told(request, err)
-    title = _TITLES.get(status, "This did not work")
+    title, shelf = _TITLES.get(status, "This did not work"), getattr(request.state, "shelf", None)
     return _with_headers(
-        page(
-            request, "error.html", {"error": text}, status=status, shelf=_shelf_or_none(request), title=title
-        )
+        page(request, "error.html", {"error": text}, status=status, shelf=shelf, title=title)
     )
-
-
-def _shelf_or_none(request: Request) -> Shelf | None:
-    try:
-        return _shelf(request)
-    except TupliError:
-        return None
 
 
 def _told(request: Request, err: Exception) -> tuple[int, str]:

@@ -39,7 +39,7 @@ def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
     """The application that shows a shelf to programs of this machine only."""
     app = FastAPI(title="tupli-mcap", docs_url=None, redoc_url=None, openapi_url=None)
     app.state.shelf = shelf
-    app.state.shelf_of = lambda request: shelf
+    app.state.shown = lambda request: contextlib.nullcontext(shelf)
     for router in PAGES:
         app.include_router(router)
     app.get("/file/{ticket}/" + FILE_NAME)(read_recording)

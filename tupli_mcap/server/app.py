@@ -17,7 +17,8 @@ from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.page.routes import PAGES
 from tupli_mcap.server import pages
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.pages.session import shelf_of
+from tupli_mcap.server.pages.session import shown
+from tupli_mcap.server.people.throttle import Turns
 from tupli_mcap.server.routes import (
     accounts,
     episodes,
@@ -72,12 +73,13 @@ def create_app(library: Library) -> FastAPI:
     )
     app.state.library = library
     app.state.metrics = Metrics()
+    app.state.turns = Turns(library.settings.max_requests)
     app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
     for routes in (operation, accounts, items, episodes, query, recordings, viewers):
         app.include_router(routes.router, responses=_REFUSALS)
     app.include_router(pytupli.router, responses=_REFUSALS_OF_PYTUPLI)
     tell_errors(app)
-    app.state.shelf_of, app.state.kept, app.state.told = shelf_of, OpenedRecordings(), told
+    app.state.shown, app.state.kept, app.state.told = shown, OpenedRecordings(), told
     for router in (*pages.PAGES, *PAGES):
         app.include_router(router)
     app.add_middleware(Gate, settings=library.settings, metrics=app.state.metrics)

@@ -20,6 +20,7 @@ from sqlalchemy.exc import (
     InterfaceError,
     OperationalError,
     SQLAlchemyError,
+    TimeoutError as PoolTimeoutError,
 )
 
 from tupli_mcap.errors import StorageError
@@ -219,5 +220,9 @@ def _translated() -> Iterator[None]:
                 "the query takes too long; narrow the filter, or declare its keys with `declare_key`"
             ) from err
         raise UnavailableError(f"the server's database cannot be used: {err.orig}") from err
+    except PoolTimeoutError as err:
+        raise UnavailableError(
+            "all connections to the server's database are in use; try again later"
+        ) from err
     except DBAPIError as err:
         raise StorageError(f"the server's database cannot be used: {err.orig}") from err

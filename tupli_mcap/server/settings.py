@@ -20,7 +20,8 @@ class Settings:
     what is published in `global` is shown without a sign-in. access_seconds, refresh_seconds, ticket_seconds: how long
     tokens and tickets are valid. max_upload, max_body, max_message: most bytes of a recording, of a benchmark or an
     artifact, and of any other request. max_page: most items of a page. max_uploads: most unfinished uploads of a user.
-    quota: most bytes that each user may store; None without a limit. query_seconds: how long a query may take.
+    max_requests: most requests of a user that a process answers at a time. quota: most bytes that each user may store;
+    None without a limit. query_seconds: how long a query may take.
     head_seconds, stall_seconds: how long a client may keep the server waiting, see `patience`. pending_seconds: after
     this time, a pending file counts as left by a killed process. upkeep_seconds: time between two clean-ups.
     open_metrics: whether metrics are shown without a sign-in.
@@ -42,6 +43,7 @@ class Settings:
     max_message: int = 4 << 20
     max_page: int = 1000
     max_uploads: int = 100
+    max_requests: int = 4
     quota: int | None = None
     query_seconds: float = 30
     head_seconds: float = 20

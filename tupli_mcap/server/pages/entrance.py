@@ -25,12 +25,14 @@ _Next = Annotated[str, Form(alias="next")]
 
 
 @router.get("/", response_model=None)
-def root(request: Request, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1) -> Response:
+def root(
+    request: Request, visit: Visitor, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1
+) -> Response:
     """Browsers, and `?format=json`, get the datasets; other clients get the server's name and version."""
     browser = "text/html" in request.headers.get("accept", "") or "format" in request.query_params
     if not browser:
         return JSONResponse({"name": "tupli-mcap", "version": tupli_mcap.__version__})
-    return lists.datasets(request, session.shelf_of(request), q, number)
+    return lists.datasets(request, session.shelf_of(request, visit), q, number)
 
 
 @router.get("/sign-in")

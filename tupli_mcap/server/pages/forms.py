@@ -28,7 +28,7 @@ def form_page(
 ) -> Response:
     """A page with forms for a signed-in user. wrong: why the last form was refused."""
     shown: dict[str, Any] = {
-        "shelf": shelf_of(request),
+        "shelf": shelf_of(request, visit),
         "code": visit.code,
         "wrong": wrong,
         "me": visit.caller,

@@ -9,10 +9,13 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import AsyncIterator
 from typing import Annotated, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Form, Request, Response
+from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.page.answers import SignInNeededError
 from tupli_mcap.server.library import Library
@@ -20,7 +23,18 @@ from tupli_mcap.server.pages.shelf import LibraryShelf
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 
-__all__ = ["COOKIE", "Code", "Member", "Visit", "Visitor", "begin", "end", "is_own_origin", "shelf_of"]
+__all__ = [
+    "COOKIE",
+    "Code",
+    "Member",
+    "Visit",
+    "Visitor",
+    "begin",
+    "end",
+    "is_own_origin",
+    "shelf_of",
+    "shown",
+]
 
 COOKIE: Final = "tupli_mcap_session"
 
@@ -39,7 +53,7 @@ class Visit(NamedTuple):
         return bool(self.session)
 
 
-def _visit(request: Request) -> Visit:
+def _known_visit(request: Request) -> Visit:
     library: Library = request.app.state.library
     session = request.cookies.get(COOKIE, "")
     with library.database.reading() as connection:
@@ -50,8 +64,17 @@ def _visit(request: Request) -> Visit:
     return Visit(library, caller, session, library.tokens.form_code(session))
 
 
-Visitor = Annotated[Visit, Depends(_visit)]
-"""A visit by anybody."""
+async def _visit(request: Request) -> AsyncIterator[Visit]:
+    visit = await run_in_threadpool(_known_visit, request)
+    with contextlib.suppress(SignInNeededError):
+        request.state.shelf = shelf_of(request, visit)  # for error pages
+    address = request.client.host if request.client else ""
+    async with request.app.state.turns.turn(visit.caller, address):
+        yield visit
+
+
+Visitor = Annotated[Visit, Depends(_visit, scope="function")]
+"""A visit by anybody, whose turn it is until the function of the route returns."""
 
 
 def _member(visit: Visitor) -> Visit:
@@ -96,14 +119,20 @@ def end(response: Response) -> None:
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="lax")
 
 
-def shelf_of(request: Request) -> LibraryShelf:
+def shelf_of(request: Request, visit: Visit) -> LibraryShelf:
     """The shelf of what the caller may see.
 
     Raises:
         SignInNeededError: nobody is signed in, and the server has no guests.
     """
-    visit = _visit(request)
     if not visit.is_signed_in and not visit.library.settings.guests:
         raise SignInNeededError("sign in to see what is here")
     address = f"{request.url.scheme}://{request.url.netloc}"
     return LibraryShelf(visit.library, visit.caller, address, request.app.state.kept)
+
+
+@contextlib.asynccontextmanager
+async def shown(request: Request) -> AsyncIterator[LibraryShelf]:
+    """The shelf of what the caller may see, see `shelf_of`; it is their turn within the block."""
+    async with contextlib.asynccontextmanager(_visit)(request) as visit:
+        yield shelf_of(request, visit)

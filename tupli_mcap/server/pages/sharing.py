@@ -49,7 +49,7 @@ def change(
 
     def work() -> None:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        shelf = shelf_of(request)
+        shelf = shelf_of(request, visit)
         with visit.library.database.writing() as connection:
             if group not in _groups(connection, visit):
                 raise NotFoundError(f"you are in no group {group[:80]!r}")
@@ -87,7 +87,7 @@ def _turn_benchmark(
 def _page(
     request: Request, visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200
 ) -> Response:
-    shelf = shelf_of(request)
+    shelf = shelf_of(request, visit)
 
     def ask(connection: Connection) -> tuple[Dataset, list[dict[str, Any]], list[str]]:
         found = find_dataset(shelf, connection, key)

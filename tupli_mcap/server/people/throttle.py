@@ -1,28 +1,64 @@
-"""Limits failed sign-ins. Every function works in the transaction of its caller."""
+"""Limits failed sign-ins, and how many requests of a user are answered at a time. Functions that take a connection work
+in the transaction of their caller."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import AsyncIterator, Mapping
 from typing import Final
 
 from sqlalchemy import Connection, delete, func, insert, select
 
 from tupli_mcap.errors import TupliError
+from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.tables import FAILURE
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["TooManyError", "note_failure", "seconds_to_wait"]
+__all__ = ["TooManyError", "Turns", "note_failure", "seconds_to_wait"]
 
 _SECONDS: Final = 60
+_MOST_WAITING: Final = 100  # requests of a user
 
 
 class TooManyError(TupliError):
-    """There were too many attempts; wait for `seconds`."""
+    """There were too many attempts, or requests at a time; wait for `seconds`."""
 
-    def __init__(self, seconds: float) -> None:
-        super().__init__("too many attempts; wait a minute")
+    def __init__(self, seconds: float, text: str = "too many attempts; wait a minute") -> None:
+        super().__init__(text)
         self.seconds = seconds
+
+
+class Turns:
+    """Lets each user have `most` requests answered at a time, so that one who asks much leaves threads and connections
+    to the database to the others. Further requests wait for their turn, and keep no thread busy meanwhile. For one
+    event loop."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._asked = Counter[str]()
+        self._free = dict[str, asyncio.Semaphore]()
+
+    @contextlib.asynccontextmanager
+    async def turn(self, caller: Caller, address: str) -> AsyncIterator[None]:
+        """The turn of a request, which ends with the block. Guests are told apart by their addresses.
+
+        Raises:
+            TooManyError: too many requests of this caller wait already.
+        """
+        user = f"guest at {address}" if caller.is_guest else caller.name
+        if self._asked[user] >= self._most + _MOST_WAITING:
+            raise TooManyError(1, "too many requests at a time; wait for the answers to earlier ones")
+        self._asked[user] += 1
+        try:
+            async with self._free.setdefault(user, asyncio.Semaphore(self._most)):
+                yield
+        finally:
+            self._asked[user] -= 1
+            if not self._asked[user]:
+                del self._asked[user], self._free[user]
 
 
 def seconds_to_wait(connection: Connection, most: Mapping[str, int]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from typing import Annotated, Any, NamedTuple
 
 from fastapi import Depends, Query, Request
@@ -44,7 +44,7 @@ Address = Annotated[str, Depends(_address)]
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
 
-def _any_caller(library: Served, credentials: _Credentials, request: Request) -> Caller:
+def _known_caller(library: Served, credentials: _Credentials, request: Request) -> Caller:
     """The caller: a user, or a guest. SignInError if a token is given and not valid."""
     with library.database.reading() as connection:
         if credentials is None:
@@ -54,7 +54,19 @@ def _any_caller(library: Served, credentials: _Credentials, request: Request) ->
     return caller
 
 
-AnyCaller = Annotated[Caller, Depends(_any_caller)]
+_Known = Annotated[Caller, Depends(_known_caller)]
+
+
+async def _any_caller(request: Request, address: Address, caller: _Known) -> AsyncIterator[Caller]:
+    if request.method == "PATCH":  # takes no thread while its body arrives
+        yield caller
+        return
+    async with request.app.state.turns.turn(caller, address):
+        yield caller
+
+
+AnyCaller = Annotated[Caller, Depends(_any_caller, scope="function")]
+"""The caller, whose turn it is until the function of the route returns."""
 
 
 def _reader(library: Served, caller: AnyCaller) -> Caller:
@@ -105,9 +117,9 @@ class Holder(NamedTuple):
         return self.caller
 
 
-def _holder(
+def _known_holder(
     library: Served,
-    caller: AnyCaller,
+    caller: _Known,
     request: Request,
     ticket: Annotated[str | None, Query(max_length=4096)] = None,
 ) -> Holder:
@@ -121,4 +133,11 @@ def _holder(
     return Holder(found, what)
 
 
-TicketHolder = Annotated[Holder, Depends(_holder)]
+async def _holder(
+    request: Request, address: Address, holder: Annotated[Holder, Depends(_known_holder)]
+) -> AsyncIterator[Holder]:
+    async with request.app.state.turns.turn(holder.caller, address):
+        yield holder
+
+
+TicketHolder = Annotated[Holder, Depends(_holder, scope="function")]
