@@ -2,10 +2,11 @@
 
 tokens: forged, expired, of the wrong type          test_server.test_forged_tokens
     swapped, revoked, those of before a new password, and those that make others TestTokens
-    used twice, guessed                             test_server (refresh tokens; passwords are throttled)
+    used twice, guessed                             test_server (refresh tokens; passwords are throttled), TestShares
 every id of somebody else                           test_server_access, test_server (what_may_not_be_read_is_not_there)
 rights that one has not: given, taken, taken over   TestRights, test_server.test_nobody_gives_rights_that_they_lack
 names, keys and tokens that one user uses up         TestShares
+all threads, by one user                            test_server_limits
 names that look like those of others                TestShares
 injection: SQL by ids, keys, filters, names, orders TestInjection
     paths, headers, log lines, terminal escapes     TestInjection
@@ -297,6 +298,30 @@ class TestShares:
         lab.eve.ask("POST", "/v1/episodes/keys", {"key": "metadata.squat3"})  # which is there
         for person in (lab.ann, lab.admin):
             person.ask("POST", "/v1/episodes/keys", {"key": f"metadata.of_{person.name}"})
+
+    def test_guesses_at_once(self, lab: Lab) -> None:
+        """Of guesses that arrive together, no more than ten tell whether they were right."""
+        (dan,) = people(lab.admin, "guessed")
+
+        def guess(number: int) -> int:
+            told = {"username": "guessed", "password": f"guess {number}"}
+            return httpx.post(f"{lab.url}/v1/tokens", json=told, timeout=120).status_code
+
+        def change(number: int) -> int:
+            told = {"password": "my new password", "old": f"guess {number}"}
+            return dan.call("PUT", "/v1/users/guessed/password", told).status_code
+
+        with ThreadPoolExecutor(30) as pool:
+            assert sorted(pool.map(guess, range(30))) == [401] * 10 + [429] * 20
+            assert sorted(pool.map(change, range(30))) == [401] * 10 + [429] * 20
+        right = {"username": "guessed", "password": "guessed's password"}
+        assert httpx.post(f"{lab.url}/v1/tokens", json=right).status_code == 429  # also who guesses right
+
+    def test_right_passwords_at_once(self, lab: Lab) -> None:
+        people(lab.admin, "many")
+        with ThreadPoolExecutor(30) as pool:
+            signed_in = list(pool.map(lambda _: Person(lab.url, "many"), range(30)))
+        assert len({each.headers["Authorization"] for each in signed_in}) == 30
 
     @pytest.mark.parametrize("path", ["/v1/users", "/access/users/create", "/sign-in"])
     def test_sign_ups(self, path: str, tmp_path: Path) -> None:

@@ -40,7 +40,6 @@ from tupli_mcap.server.database import (
 )
 from tupli_mcap.server.people import accounts, quotas, throttle
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
-from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored import arrivals, episodes
@@ -154,14 +153,12 @@ class Library:
         # Failures are counted by user and address: failures at another address must not lock the user out.
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
         with self.database.reading() as connection:
-            wait = throttle.seconds_to_wait(connection, most)
-            right = not wait and accounts.verify_password(connection, username, password)
-        if wait:
-            raise TooManyError(wait)
+            throttle.demand_few_failures(connection, most)
+            right = accounts.verify_password(connection, username, password)
         with self.database.writing() as connection:
+            throttle.note_attempt(connection, most, failed=not right)
             if right:
                 return self.tokens.pair(connection, username)
-            throttle.note_failure(connection, most)
         raise SignInError("Incorrect username or password")
 
     def create_user(self, caller: Caller, name: str, password: str, address: str) -> None:
@@ -177,10 +174,7 @@ class Library:
                 caller.demand(Right.USER_CREATE)
             most = {f"sign-up at {address}": _MOST_SIGN_UPS}
             with self.database.writing() as connection:
-                wait = throttle.seconds_to_wait(connection, most)
-                throttle.note_failure(connection, {} if wait else most)
-            if wait:
-                raise TooManyError(wait)
+                throttle.note_attempt(connection, most, failed=True)
         hashed = accounts.hash_password(password, self.settings.min_password)
         with self.database.writing() as connection:
             accounts.create_user(connection, name, hashed)
@@ -192,19 +186,26 @@ class Library:
         Raises:
             DeniedError: it is another user, and the caller lacks the right, or a right of theirs.
             SignInError: `old` is not the password.
+            TooManyError: it was wrong too often.
             StorageError: the new one is not valid.
             NotFoundError: there is no such user.
         """
         caller.demand(Right.USER_UPDATE, name)
+        # Failures are counted by sign-in: who has got hold of one must not keep the user from changing the password.
+        most = {f"{name} by {caller.sign_in}": _MOST_OF_A_USER}
         with self.database.reading() as connection:
             accounts.demand_over(connection, caller, name)
-            if old is not None and not accounts.verify_password(connection, name, old):
-                raise SignInError("the old password is not right")
-        hashed = accounts.hash_password(password, self.settings.min_password)
+            throttle.demand_few_failures(connection, most)
+            right = old is None or accounts.verify_password(connection, name, old)
+        hashed = accounts.hash_password(password, self.settings.min_password) if right else ""
         with self.database.writing() as connection:
-            accounts.demand_over(connection, caller, name)
-            accounts.change_password(connection, name, hashed)
-            audit(connection, caller.name, "change_password", name)
+            throttle.note_attempt(connection, most, failed=not right)
+            if right:
+                accounts.demand_over(connection, caller, name)
+                accounts.change_password(connection, name, hashed)
+                audit(connection, caller.name, "change_password", name)
+        if not right:
+            raise SignInError("the old password is not right")
 
     def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
         """A new upload, or the caller's unfinished upload of the same bytes; the name of the recording if the caller

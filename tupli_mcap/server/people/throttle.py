@@ -17,7 +17,7 @@ from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.tables import FAILURE
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["TooManyError", "Turns", "note_failure", "seconds_to_wait"]
+__all__ = ["TooManyError", "Turns", "demand_few_failures", "note_attempt"]
 
 _SECONDS: Final = 60
 _MOST_WAITING: Final = 100  # requests of a user
@@ -61,20 +61,26 @@ class Turns:
                 del self._asked[user], self._free[user]
 
 
-def seconds_to_wait(connection: Connection, most: Mapping[str, int]) -> int:
-    """The seconds until the next attempt is allowed; 0 for now. most: by key, how many failures a minute may have."""
+def demand_few_failures(connection: Connection, most: Mapping[str, int]) -> None:
+    """Raises TooManyError if a key has failed too often. most: by key, how many failures a minute may have."""
     now = int(time.time())
     counted = select(FAILURE.c.key, func.count(), func.min(FAILURE.c.time)).group_by(FAILURE.c.key)
     recent = counted.where(FAILURE.c.time > now - _SECONDS, FAILURE.c.key.in_(map(escape_text, most)))
     full = {escape_text(key): allowed for key, allowed in most.items()}
     first = [since for key, count, since in connection.execute(recent) if count >= full[key]]
-    return max((since + _SECONDS - now for since in first), default=0)
+    if first:
+        raise TooManyError(max(first) + _SECONDS - now)
 
 
-def note_failure(connection: Connection, most: Mapping[str, int]) -> None:
-    """Notes a failure of each key."""
-    now = int(time.time())
-    connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
-    rows = [{"key": escape_text(key), "time": now} for key in most]
-    if rows:
-        connection.execute(insert(FAILURE), rows)
+def note_attempt(connection: Connection, most: Mapping[str, int], *, failed: bool) -> None:
+    """Notes the end of an attempt, in the transaction that does what it was made for. Of attempts at the same time,
+    those that end after too many have failed are refused, right or wrong: they tell nothing of a password.
+
+    Raises:
+        TooManyError: a key has failed too often, see `demand_few_failures`.
+    """
+    demand_few_failures(connection, most)
+    if failed:
+        now = int(time.time())
+        connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
+        connection.execute(insert(FAILURE), [{"key": escape_text(key), "time": now} for key in most])
