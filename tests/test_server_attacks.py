@@ -55,6 +55,7 @@ from serving import ENGINES, serving, settings_of
 
 from tupli_mcap import EpisodeWriter, Recording
 from tupli_mcap.recording import rewrite_recording
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -696,6 +697,17 @@ class TestSizes:
             told = {"headers": {"Upload-Offset": "0"}, "content": path.read_bytes()}
             refused = lab.eve.call("PATCH", begun.headers["Location"], **told)
             assert refused.status_code == 413 and "at most 65536 characters" in refused.text, kind
+
+    def test_a_recording_whose_run_is_damaged_is_stored(self, lab: Lab, tmp_path: Path) -> None:
+        """Such a run is named after its file, here as elsewhere."""
+        path = tmp_path / "run.mcap"
+        record_rollouts("CartPole-v1", path, steps=20, seed=6)
+        add_attachments(path, {"run.json": ("application/json", b'{"runs": 3}')})
+        with pytest.warns(UserWarning, match="the run is not known"):
+            name = lab.eve.send(path.read_bytes())
+        wanted = {"filter": {"type": "EQ", "key": "recording", "value": name}}
+        first, *_ = lab.eve.ask("POST", "/v1/episodes/list", wanted)["items"]
+        assert first["run"]["name"] == name.rpartition("/")[2].removesuffix(".mcap")
 
     def test_a_head_without_an_end(self, lab: Lab) -> None:
         parts = urlsplit(lab.url)

@@ -4,6 +4,7 @@ Every function works in the transaction of its caller.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import secrets
 from collections.abc import Collection, Sequence
@@ -12,7 +13,7 @@ from typing import Final, NamedTuple
 from sqlalchemy import Connection, insert, select
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.server.database import audience, audit, settle
 from tupli_mcap.server.people.access import Caller, Right, readable
@@ -48,12 +49,11 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
 
 def demand_short(recording: Recording) -> None:
     """Raises TooLargeError for long metadata of an episode or a run: they are in everybody's lists, a run's with each
-    of its episodes; FormatError for damaged ones."""
+    of its episodes. FormatError for damaged ones of an episode; lists have nothing of a damaged run."""
     numbers = recording.index["episode"].tolist()
-    texts = [
-        *zip((f"episode {number}" for number in numbers), recording.all_metadata(), strict=True),
-        *(("a run", jsonvalue.dumps(run.as_dict())) for run in recording.recorded_runs.runs),
-    ]
+    texts = list(zip((f"episode {number}" for number in numbers), recording.all_metadata(), strict=True))
+    with contextlib.suppress(FormatError):
+        texts += [("a run", jsonvalue.dumps(run.as_dict())) for run in recording.recorded_runs.runs]
     for what, text in texts:
         if len(text) > _MOST_METADATA:
             raise TooLargeError(
