@@ -136,10 +136,11 @@ def publish(
     Returns:
         How many they are.
     """
-    found = list(find_episodes(connection, caller, filter, only=only))
-    for header in found:
+    found = []
+    for header in find_episodes(connection, caller, filter, only=only):
         if header.created_by != caller.name:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
+        found.append(header)
     if found:
         published_in([], group)
         demand_audience(connection, caller, Right.EPISODE_CREATE, group)
@@ -165,9 +166,11 @@ def unpublish(
         How many they are.
     """
     copies = caller.may(Right.EPISODE_DELETE, group)
-    found = list(find_episodes(connection, caller, filter, only=only, copies=copies))
-    if any(header.created_by != caller.name for header in found):
-        caller.demand(Right.EPISODE_DELETE, group)
+    found = []
+    for header in find_episodes(connection, caller, filter, only=only, copies=copies):
+        if header.created_by != caller.name:
+            caller.demand(Right.EPISODE_DELETE, group)
+        found.append(header)
     _set_audiences(connection, found, lambda groups: [name for name in groups if name != group])
     _note(connection, caller, "unpublish_episodes", found, f" from {group}")
     return len(found)
@@ -190,10 +193,11 @@ def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) 
         DeniedError: an episode is somebody else's, and the caller may not delete it; then none is deleted.
     """
     may = caller.may(Right.EPISODE_DELETE)
-    doomed = list(find_episodes(connection, caller, filter, copies=may))
-    for header in doomed:
+    doomed = []
+    for header in find_episodes(connection, caller, filter, copies=may):
         if header.created_by != caller.name and not may:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may delete it")
+        doomed.append(header)
     _note(connection, caller, "delete_episodes", doomed)
     return len(doomed), _delete(connection, doomed)
 
