@@ -161,6 +161,26 @@ def test_lists_come_in_pages(tmp_path: Path) -> None:
         assert page({"offset": 2, "limit": 0}) == ([], None)
 
 
+@pytest.mark.parametrize("with_tuples", [False, True])
+def test_a_list_of_pytupli_s_is_made_while_it_is_sent(tmp_path: Path, with_tuples: bool) -> None:
+    """It has no pages, and a server holds one page of it in memory."""
+    with server_with(tmp_path / "served", max_page=2) as admin:
+        benchmark = admin.store_benchmark(query()).id
+        path, told = f"{admin.url}/episodes/list", {"include_tuples": with_tuples}
+        assert httpx.post(path, json=told, headers=token_of(admin)).text == "[]"
+        for count in (3, 1, 2):
+            admin.record_episodes([episode(benchmark) for _ in range(count)])
+            answer = httpx.post(path, json=told, headers=token_of(admin))
+            assert answer.headers["Transfer-Encoding"] == "chunked"
+            listed = answer.json()
+            assert [each["id"] for each in listed] == [header.id for header in admin.list_episodes()]
+            assert {len(each.get("tuples", "")) for each in listed} == {3 if with_tuples else 0}
+        none = {"type": "GT", "key": "steps", "value": 100, **told}
+        assert httpx.post(path, json=none, headers=token_of(admin)).text == "[]"
+        refused = httpx.post(path, json={**none, "key": "unknown"}, headers=token_of(admin))
+        assert refused.status_code == 400
+
+
 # --- the disk ---
 
 

@@ -22,7 +22,7 @@ from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["MOST_COMPARED", "film_file", "recording_of", "replay_file", "sent", "streamed"]
+__all__ = ["MOST_COMPARED", "film_file", "in_pieces", "recording_of", "replay_file", "sent", "streamed"]
 
 MOST_COMPARED = 8
 _MEDIA = "application/octet-stream"
@@ -50,9 +50,13 @@ def streamed(
     Raises:
         SpaceError, RecordingError: the episodes cannot be merged. A later error ends the connection.
     """
-    pieces = stream_excerpts(opening, without)
+    return in_pieces(stream_excerpts(opening, without), _MEDIA, **headers)
+
+
+def in_pieces(pieces: Generator[bytes], media: str, **headers: str) -> StreamingResponse:
+    """An answer that is made while it is sent. Errors of its first piece are raised; later ones end the connection."""
     first = next(pieces)
-    return _Streamed(_after(first, pieces), media_type=_MEDIA, headers=headers)
+    return _Streamed(_after(first, pieces), media_type=media, headers=headers)
 
 
 def _after(first: bytes, pieces: Generator[bytes]) -> Generator[bytes]:

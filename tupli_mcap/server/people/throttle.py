@@ -7,8 +7,8 @@ import asyncio
 import contextlib
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Mapping
-from typing import Final
+from collections.abc import AsyncIterable, AsyncIterator, Mapping
+from typing import Final, TypeVar
 
 from sqlalchemy import Connection, delete, func, insert, select
 
@@ -21,6 +21,7 @@ __all__ = ["TooManyError", "Turns", "demand_few_failures", "note_attempt"]
 
 _SECONDS: Final = 60
 _MOST_WAITING: Final = 100  # requests of a user
+_T = TypeVar("_T")
 
 
 class TooManyError(TupliError):
@@ -59,6 +60,17 @@ class Turns:
             self._asked[user] -= 1
             if not self._asked[user]:
                 del self._asked[user], self._free[user]
+
+    async def each(self, caller: Caller, address: str, pieces: AsyncIterable[_T]) -> AsyncIterator[_T]:
+        """The pieces of an answer, each made in a turn of its own: a client that reads slowly keeps none."""
+        remaining = aiter(pieces)
+        while True:
+            async with self.turn(caller, address):
+                try:
+                    piece = await anext(remaining)
+                except StopAsyncIteration:
+                    return
+            yield piece
 
 
 def demand_few_failures(connection: Connection, most: Mapping[str, int]) -> None:

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
+from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import TypeAdapter, ValidationError
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, NotFoundError
+from tupli_mcap.page.copies import in_pieces
 from tupli_mcap.schema import (
     ArtifactMetadataItem,
     BaseFilter,
@@ -34,12 +36,14 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, Right
 from tupli_mcap.server.people.accounts import ConflictError
+from tupli_mcap.server.people.throttle import Turns
 from tupli_mcap.server.routes.accounts import Credentials
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
+from tupli_mcap.storage.catalog.queries import After
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]
@@ -337,15 +341,40 @@ def record_episode(library: Served, caller: Changing, told: Episode) -> Response
 
 
 @router.post("/episodes/list", response_model=list[EpisodeHeader])
-def list_episodes(library: Served, caller: Reader, told: _Filter = None) -> Response:
+def list_episodes(
+    library: Served, caller: Reader, address: Address, request: Request, told: _Filter = None
+) -> StreamingResponse:
     """The episodes that match a filter, with their tuples if `include_tuples` says so."""
-    with_tuples = bool((told or {}).get("include_tuples"))
-    with library.database.reading() as connection:
-        found = list(episodes.find_episodes(connection, caller, _filter(told)))
-    if not with_tuples:
-        return answer(found)
-    items = [item.model_dump() for item in library.with_tuples(found)]
-    return Response(jsonvalue.dumps_plain(items), media_type="application/json")
+    pages = _pages(library, caller, _filter(told))
+    if (told or {}).get("include_tuples"):
+        items = (item.model_dump() for page in pages for item in library.with_tuples(page))
+        texts = (jsonvalue.dumps_plain(item) for item in items)
+    else:
+        texts = (jsonvalue.dumps([dict(header) for header in page])[1:-1] for page in pages if page)
+    made = in_pieces(_list_of(texts), "application/json")
+    turns: Turns = request.app.state.turns
+    made.body_iterator = turns.each(caller, address, made.body_iterator)
+    return made
+
+
+def _pages(library: Library, caller: Caller, wanted: BaseFilter | None) -> Iterator[list[EpisodeHeader]]:
+    """The episodes that match a filter, each page in a transaction of its own."""
+    most, after = library.settings.max_page, None
+    while True:
+        with library.database.reading() as connection:
+            page = list(episodes.find_episodes(connection, caller, wanted, limit=most, after=after))
+        yield page
+        if len(page) < most:
+            return
+        after = After(page[-1].recording, page[-1].episode)
+
+
+def _list_of(texts: Iterator[str]) -> Generator[bytes]:
+    """A JSON list; each text has one or more of its items."""
+    yield b"[" + next(texts, "").encode()
+    for text in texts:
+        yield b"," + text.encode()
+    yield b"]"
 
 
 @router.put("/episodes/publish")
