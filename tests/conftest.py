@@ -3,6 +3,7 @@ no width of a terminal, even if pytest runs in one."""
 
 from __future__ import annotations
 
+import functools
 import gc
 import itertools
 import multiprocessing
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import certifi
 import pytest
+import typer.testing
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -36,6 +38,14 @@ def _shared_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
         patch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("SSL_CERT_FILE", str(trusted / "authority.pem"))
         patch.setenv("SSL_CERT_DIR", str(tmp_path_factory.mktemp("no more")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _commands_made_once() -> Iterator[None]:
+    """Typer would make all commands of the program anew whenever a test runs one of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.testing, "_get_command", functools.cache(typer.testing._get_command))
         yield
 
 
