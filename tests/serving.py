@@ -24,15 +24,18 @@ from tupli_mcap.server.run import Listening, configured
 from tupli_mcap.server.settings import Settings
 
 PASSWORD = "correct horse battery staple"
-# As the server hashes passwords, but at once: nobody attacks these. A server in a process of its own takes its time.
-_HASHES = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=8, parallelism=1),))
+REAL_HASHES = accounts._HASHES
+# Of passwords that nobody attacks: made in no time. A server in a process of its own has the real ones.
+_QUICK_HASHES = PasswordHash((Argon2Hasher(time_cost=1, memory_cost=8, parallelism=1),))
 
 
 @contextlib.contextmanager
-def serving(settings: Settings, listening: Listening | None = None) -> Iterator[str]:
+def serving(
+    settings: Settings, listening: Listening | None = None, *, hashes: PasswordHash = _QUICK_HASHES
+) -> Iterator[str]:
     """Serves in a thread; yields the address. The admin's password is PASSWORD."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(accounts, "_HASHES", _HASHES)
+        patch.setattr(accounts, "_HASHES", hashes)
         patch.setenv("TUPLI_MCAP_ADMIN_PASSWORD", PASSWORD)
         database = settings.own / "server.sqlite"
         if not settings.database and not database.exists():
