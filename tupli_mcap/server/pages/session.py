@@ -77,7 +77,7 @@ Visitor = Annotated[Visit, Depends(_visit, scope="function")]
 """A visit by anybody, whose turn it is until the function of the route returns."""
 
 
-def _member(visit: Visitor) -> Visit:
+async def _member(visit: Visitor) -> Visit:
     if not visit.is_signed_in:
         raise SignInNeededError("sign in to see this page")
     return visit
@@ -87,7 +87,7 @@ Member = Annotated[Visit, Depends(_member)]
 """A visit by a signed-in user."""
 
 
-def _checked(request: Request, visit: Member, code: Annotated[str, Form()] = "") -> Visit:
+async def _checked(request: Request, visit: Member, code: Annotated[str, Form()] = "") -> Visit:
     if not is_own_origin(request) or not visit.library.tokens.is_form_code(visit.session, code):
         raise DeniedError("this form is out of date, or not from this sign-in; reload the page and try again")
     return visit

@@ -28,7 +28,7 @@ __all__ = [
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
 
-def _library(request: Request) -> Library:
+async def _library(request: Request) -> Library:
     library: Library = request.app.state.library
     return library
 
@@ -36,7 +36,7 @@ def _library(request: Request) -> Library:
 Served = Annotated[Library, Depends(_library)]
 
 
-def _address(request: Request) -> str:
+async def _address(request: Request) -> str:
     return request.client.host if request.client else ""
 
 
@@ -69,7 +69,11 @@ AnyCaller = Annotated[Caller, Depends(_any_caller, scope="function")]
 """The caller, whose turn it is until the function of the route returns."""
 
 
-def _reader(library: Served, caller: AnyCaller) -> Caller:
+async def _reader(library: Served, caller: AnyCaller) -> Caller:
+    return _demand_guests(library, caller)
+
+
+def _demand_guests(library: Library, caller: Caller) -> Caller:
     if caller.is_guest and not library.settings.guests:
         raise SignInError("this server shows nothing to guests")
     return caller
@@ -78,7 +82,7 @@ def _reader(library: Served, caller: AnyCaller) -> Caller:
 Reader = Annotated[Caller, Depends(_reader)]
 
 
-def _writer(caller: AnyCaller) -> Caller:
+async def _writer(caller: AnyCaller) -> Caller:
     if caller.is_guest:
         raise SignInError("guests may change nothing")
     if not caller.may_write:
@@ -96,7 +100,7 @@ def no_machine(caller: Caller) -> Caller:
     return caller
 
 
-def _person(caller: Writer) -> Caller:
+async def _person(caller: Writer) -> Caller:
     return no_machine(caller)
 
 
@@ -124,7 +128,7 @@ def _known_holder(
     ticket: Annotated[str | None, Query(max_length=4096)] = None,
 ) -> Holder:
     if ticket is None:
-        return Holder(_reader(library, caller), None)
+        return Holder(_demand_guests(library, caller), None)
     with library.database.reading() as connection:
         found, what = library.tokens.of_ticket(connection, ticket)
     if found.is_guest and not library.settings.guests:

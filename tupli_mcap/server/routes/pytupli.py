@@ -55,7 +55,7 @@ _FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)
 _Filter = Annotated[dict[str, Any] | None, Body()]
 
 
-def _changing(caller: Reader) -> Caller:
+async def _changing(caller: Reader) -> Caller:
     if not caller.is_guest and not caller.may_write:
         raise DeniedError("this token may only read; make one with the scope 'write'")
     return caller
@@ -65,7 +65,7 @@ Changing = Annotated[Caller, Depends(_changing)]
 """A caller who changes something. A guest gets an error, as guests lack the rights."""
 
 
-def _person(caller: Changing) -> Caller:
+async def _person(caller: Changing) -> Caller:
     return no_machine(caller)
 
 
