@@ -121,11 +121,8 @@ class Tokens:
         if token.startswith(_API_PREFIX):
             return _of_api_token(connection, token)
         told = self._told(token, "access")
-        epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == told.get("sub"))).scalar()
-        caller = (
-            None if epoch is None or epoch != told.get("epoch") else caller_named(connection, told["sub"])
-        )
-        if caller is None:
+        caller = caller_named(connection, told["sub"])
+        if caller is None or caller.epoch != told.get("epoch"):
             raise SignInError("the access token is not valid any more")
         return caller._replace(sign_in=str(told.get("by", "")))
 

@@ -12,15 +12,17 @@ cannot tell how many rows it will find.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, or_, select, true
 
 from tupli_mcap.schema import BaseFilter
+from tupli_mcap.storage.catalog.compare_sql import Narrowed
 from tupli_mcap.storage.catalog.filter_sql import Source, in_all, narrowed, recordings_of, sources
 from tupli_mcap.storage.catalog.order import After, Range, Sort, beyond, has_index, ranges
 from tupli_mcap.storage.catalog.tables import (
@@ -44,7 +46,8 @@ _GROUP: Final = 500  # episodes that are worth a statement
 _FETCHED: Final = 500  # ids at once
 
 
-class Asked(NamedTuple):
+@dataclass(frozen=True)
+class Asked:
     """A query: which episodes, and in which order.
 
     filter: bound to headers of episodes. indexed: see `filter_sql.narrowed`. only, of: further conditions, on rows of
@@ -63,11 +66,16 @@ class Asked(NamedTuple):
         """The recordings that may have such episodes."""
         return self.of if self.filter is None else and_(self.of, recordings_of(self.filter))
 
-    def meets(self) -> ColumnElement[bool]:
-        """The condition on rows of EPISODE and RECORDING that is true of all such episodes, with a look at each."""
+    @functools.cached_property
+    def each(self) -> Narrowed:
+        """The condition on rows of EPISODE and RECORDING of the filter, which looks at each of them."""
         if self.filter is None:
-            return self.only
-        return and_(self.only, narrowed(self.filter, self.indexed, by_index=False).may)
+            return Narrowed(true())
+        return narrowed(self.filter, self.indexed, by_index=False)
+
+    def meets(self) -> ColumnElement[bool]:
+        """The condition on rows of EPISODE and RECORDING that is true of all such episodes of their recordings."""
+        return and_(self.only, self.each.may)
 
     def order(
         self, connection: Connection, *, few: bool, row_id: ColumnElement[int] = EPISODE.c.id

@@ -38,7 +38,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.compare_sql import Condition, Narrowed
-from tupli_mcap.storage.catalog.filter_sql import merged, narrowed, recordings_of
+from tupli_mcap.storage.catalog.filter_sql import merged, narrowed
 from tupli_mcap.storage.catalog.metadata_sql import among
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.pages import Asked, candidates
@@ -135,7 +135,7 @@ def find_episodes(
             the key to sort by is unknown.
         NotFoundError: The episode to go on after is gone.
     """
-    asked = _asked(connection, filter, only, of, sort)._replace(after=after, backwards=backwards)
+    asked = _asked(connection, filter, only, of, sort, after, backwards)
     if limit is None:
         return _all_of_them(connection, asked, None, offset)
     wanted = offset + limit
@@ -247,19 +247,22 @@ def _asked(
     only: Condition | None,
     of: Condition | None,
     sort: Sort | None = None,
+    after: After | None = None,
+    backwards: bool = False,
 ) -> Asked:
     meant = None if filter is None else merged(bound(filter, EpisodeHeader))
     indexed = {} if filter is None and sort is None else _indexed(connection)
-    return Asked(meant, indexed, true() if only is None else only, true() if of is None else of, sort)
+    only, of = (true() if condition is None else condition for condition in (only, of))
+    return Asked(meant, indexed, only, of, sort, after, backwards)
 
 
-def _narrowed(asked: Asked, *, by_index: bool = True) -> Narrowed:
-    """The condition on rows of EPISODE and RECORDING; by_index: see `filter_sql.narrowed`."""
-    also = and_(asked.only, asked.of)
+def _narrowed(asked: Asked) -> Narrowed:
+    """The condition on rows of EPISODE and RECORDING."""
+    also = and_(asked.only, asked.recordings())
     if asked.filter is None:
         return Narrowed(also)
-    found = narrowed(asked.filter, asked.indexed, by_index=by_index)
-    return found._replace(may=and_(found.may, recordings_of(asked.filter), also))
+    found = narrowed(asked.filter, asked.indexed)
+    return found._replace(may=and_(found.may, also))
 
 
 def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None = None) -> Select[Any]:
@@ -280,13 +283,14 @@ def _looked_at(
     connection: Connection, asked: Asked, ids: Iterable[int], size: int
 ) -> Iterator[EpisodeHeader]:
     """The matching episodes among those with some ids, in the same order. `size`: how many to ask for at first."""
-    found = _narrowed(asked, by_index=False)
     of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
+    of_them = of_them.where(asked.meets(), asked.recordings())
     ids = iter(ids)
     while some := list(itertools.islice(ids, size)):
-        rows = connection.execute(of_them.where(among(EPISODE.c.id, some), found.may))
+        rows = connection.execute(of_them.where(among(EPISODE.c.id, some)))
         known = {row.id: row for row in rows}
-        yield from _headers(connection, asked, found, [known[number] for number in some if number in known])
+        ordered = [known[number] for number in some if number in known]
+        yield from _headers(connection, asked, asked.each, ordered)
         size = min(_GROWTH * size, _MOST_AT_ONCE)
 
 
