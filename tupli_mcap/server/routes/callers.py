@@ -1,4 +1,7 @@
-"""The dependencies of all routes: the server's library, and the caller."""
+"""The dependencies of all routes: the server's library, and the caller.
+
+One that waits for nothing is `async`: FastAPI runs all others in threads, and handing over takes longer than they do.
+"""
 
 from __future__ import annotations
 
