@@ -88,6 +88,26 @@ def test_bodies_are_of_a_size_that_is_said_before(tmp_path: Path) -> None:
         assert admin.store_artifact(b"x" * 5000, ArtifactMetadata(name="x")).id
 
 
+def test_a_stranger_sends_no_long_body(tmp_path: Path) -> None:
+    """It would be parsed before anybody looks who has sent it."""
+    deep = b'{"hash": "h", "serialized": "x", "metadata": {"extra": [' + b"[]," * 1000 + b"[]]}}"
+    with server_with(tmp_path / "served", max_message=1000, guests=True) as admin:
+        for path in (
+            "/v1/benchmarks",
+            "/v1/artifacts",
+            "/benchmarks/create",
+            "/artifacts/upload",
+            "/episodes/record",
+        ):
+            for headers in ({}, {"Authorization": "Bearer forged"}, {"Authorization": "Bearer"}):
+                headers["Content-Type"] = "application/json"
+                refused = httpx.post(admin.url + path, content=deep, headers=headers)
+                assert refused.status_code == 401, path
+                assert "expected at most 1000 bytes of somebody who is not signed in" in refused.text
+        known = httpx.post(f"{admin.url}/v1/benchmarks", content=deep, headers=token_of(admin))
+        assert known.status_code == 400
+
+
 @pytest.mark.parametrize(
     ("filter", "message"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import AsyncIterator
 from typing import Any, Final
 
@@ -19,6 +20,7 @@ from tupli_mcap.server import pages
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages.session import shown
 from tupli_mcap.server.people.throttle import Turns
+from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes import (
     accounts,
     episodes,
@@ -82,8 +84,16 @@ def create_app(library: Library) -> FastAPI:
     app.state.shown, app.state.kept, app.state.told = shown, OpenedRecordings(), told
     for router in (*pages.PAGES, *PAGES):
         app.include_router(router)
-    app.add_middleware(Gate, settings=library.settings, metrics=app.state.metrics)
+    known = functools.partial(_is_known, library)
+    app.add_middleware(Gate, settings=library.settings, metrics=app.state.metrics, known=known)
     return app
+
+
+def _is_known(library: Library, token: str) -> bool:
+    with contextlib.suppress(SignInError), library.database.reading() as connection:
+        library.tokens.caller(connection, token)
+        return True
+    return False
 
 
 async def _look_after(library: Library) -> None:

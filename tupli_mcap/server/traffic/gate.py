@@ -1,12 +1,18 @@
-"""Wraps every request: gives it an id, limits its body, counts and logs it, and writes errors only into the log."""
+"""Wraps every request: gives it an id, limits its body, counts and logs it, and writes errors only into the log.
+
+A body is read, and its JSON parsed, before the caller is known: strangers may send only short ones.
+"""
 
 from __future__ import annotations
 
 import json
 import secrets
 import time
+from collections.abc import Callable
 from typing import Any, Final
 
+from fastapi.security.utils import get_authorization_scheme_param
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from structlog.contextvars import bind_contextvars, clear_contextvars
@@ -25,10 +31,12 @@ _QUIET: Final = frozenset(("/health", "/ready", "/metrics"))
 
 
 class Gate:
-    """An ASGI application around the server's."""
+    """An ASGI application around the server's. known: whether a token is that of a user."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, metrics: Metrics) -> None:
-        self._app, self._settings, self._metrics = app, settings, metrics
+    def __init__(
+        self, app: ASGIApp, settings: Settings, metrics: Metrics, known: Callable[[str], bool]
+    ) -> None:
+        self._app, self._settings, self._metrics, self._known = app, settings, metrics, known
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -39,8 +47,8 @@ class Gate:
         bind_contextvars(id=passing.id)  # which is in every line of the log from here on
         with self._metrics.running.track_inprogress():
             try:
-                if (refusal := self._refusal(scope)) is not None:
-                    await passing.answer(413, refusal)
+                if (refusal := await self._refusal(scope)) is not None:
+                    await passing.answer(*refusal)
                 else:
                     await self._app(scope, passing.receive, passing.send)
             except ClientDisconnect:
@@ -54,16 +62,21 @@ class Gate:
             finally:
                 self._note(scope, passing)
 
-    def _refusal(self, scope: Scope) -> str | None:
-        """The reason for refusing a body; None to read it."""
-        headers = dict(scope["headers"])
+    async def _refusal(self, scope: Scope) -> tuple[int, str] | None:
+        """The status and the reason for refusing a body; None to read it."""
+        headers, settings = dict(scope["headers"]), self._settings
         if scope["method"] == "PATCH":  # its body is measured while it arrives
             return None
-        most = self._settings.max_body if scope["path"] in _CONTENT else self._settings.max_message
+        most = settings.max_body if scope["path"] in _CONTENT else settings.max_message
         said = headers.get(b"content-length", b"0")
-        if b"transfer-encoding" not in headers and said.isdigit() and len(said) < 20 and int(said) <= most:
+        if b"transfer-encoding" in headers or not said.isdigit() or len(said) >= 20 or int(said) > most:
+            return 413, f"expected a body of at most {most} bytes, with its Content-Length"
+        if int(said) <= settings.max_message:
             return None
-        return f"expected a body of at most {most} bytes, with its Content-Length"
+        _, token = get_authorization_scheme_param(headers.get(b"authorization", b"").decode("latin-1"))
+        if bool(token) and await run_in_threadpool(self._known, token):
+            return None
+        return 401, f"expected at most {settings.max_message} bytes of somebody who is not signed in; sign in"
 
     def _note(self, scope: Scope, passing: _Passing) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "-"
