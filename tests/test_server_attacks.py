@@ -700,6 +700,21 @@ class TestSizes:
             refused = lab.eve.call("PATCH", begun.headers["Location"], **told)
             assert refused.status_code == 413 and "at most 65536 characters" in refused.text, kind
 
+    def test_members_of_a_group_without_an_end(self, lab: Lab) -> None:
+        """All who write would wait for them."""
+        lab.ann.ask("POST", "/v1/groups", {"name": "endless"})
+        many = [{"user": "eve", "roles": ["member"]}] * 1001
+        for method, path, told in (
+            ("PUT", "/v1/groups/endless/members", many),
+            ("PUT", "/v1/groups/endless/members", [{"user": "eve", "roles": ["member"] * 1000}]),
+            ("POST", "/access/groups/add-members", {"group_name": "endless", "members": many}),
+            ("POST", "/access/groups/remove-members", {"group_name": "endless", "members": many}),
+        ):
+            refused = lab.ann.call(method, path, told)
+            assert refused.status_code == 400 and "at most 1000 members and roles" in refused.text, path
+        found = lab.ann.ask("PUT", "/v1/groups/endless/members", many[:500])
+        assert [member["user"] for member in found["members"]] == ["ann", "eve"]
+
     def test_a_recording_whose_run_is_damaged_is_stored(self, lab: Lab, tmp_path: Path) -> None:
         """Such a run is named after its file, here as elsewhere."""
         path = tmp_path / "run.mcap"

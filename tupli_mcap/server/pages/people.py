@@ -92,7 +92,7 @@ def add_member(
 
     def change() -> None:
         with visit.library.database.writing() as connection:
-            accounts.add_member(connection, visit.caller, name, user, [role])
+            accounts.add_members(connection, visit.caller, name, [(user, [role])])
 
     return tried(change, partial(_group, request, visit, name), address("group", name=name))
 
@@ -103,7 +103,7 @@ def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text =
 
     def change() -> None:
         with visit.library.database.writing() as connection:
-            accounts.remove_member(connection, visit.caller, name, user)
+            accounts.remove_members(connection, visit.caller, name, [user])
 
     return tried(change, partial(_group, request, visit, name), address("group", name=name))
 

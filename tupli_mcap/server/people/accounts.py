@@ -20,7 +20,7 @@ from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, RE
 
 __all__ = [
     "ConflictError",
-    "add_member",
+    "add_members",
     "caller_named",
     "change_password",
     "create_group",
@@ -38,7 +38,7 @@ __all__ = [
     "members_of",
     "memberships_of",
     "prepare",
-    "remove_member",
+    "remove_members",
     "verify_password",
 ]
 
@@ -54,6 +54,9 @@ _BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and symbols that dra
 _MOST_PASSWORD: Final = 1024
 _MOST_DESCRIPTION: Final = 1000
 _MOST_GROUPS: Final = 100  # of a user, with those that are deleted: names cannot be used again
+_MOST_AT_ONCE: Final = (
+    1000  # roles that are given, or members removed, in one transaction, for which others wait
+)
 
 
 class ConflictError(StorageError):
@@ -266,15 +269,33 @@ def delete_group(connection: Connection, caller: Caller, name: str) -> None:
     audit(connection, caller.name, "delete_group", name)
 
 
-def add_member(connection: Connection, caller: Caller, group: str, user: str, roles: Sequence[str]) -> None:
-    """Gives a user further roles in a group. Nobody can give a right that they lack.
+def add_members(
+    connection: Connection, caller: Caller, group: str, members: Sequence[tuple[str, Sequence[str]]]
+) -> None:
+    """Gives users further roles in a group. Nobody can give a right that they lack.
+
+    members: names of users, each with the roles.
 
     Raises:
         NotFoundError: there is no such group, role or user.
         DeniedError: the caller may not change the group, or lacks a right of the roles.
+        StorageError: there are too many members or roles at a time.
     """
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
+    _demand_few(sum(1 + len(roles) for _, roles in members))
+    for user, roles in members:
+        _add_member(connection, caller, group, user, roles)
+
+
+def _demand_few(found: int) -> None:
+    if found > _MOST_AT_ONCE:
+        raise StorageError(
+            f"expected at most {_MOST_AT_ONCE} members and roles at a time, found {found}; send some of them"
+        )
+
+
+def _add_member(connection: Connection, caller: Caller, group: str, user: str, roles: Sequence[str]) -> None:
     known = {role["role"] for role in list_roles(connection)}
     for role in roles:
         if role not in known:
@@ -289,15 +310,17 @@ def add_member(connection: Connection, caller: Caller, group: str, user: str, ro
     audit(connection, caller.name, "add_member", f"{group}: {user} {', '.join(roles)}")
 
 
-def remove_member(connection: Connection, caller: Caller, group: str, user: str) -> None:
-    """Takes a user out of a group; nothing happens if they are not in it. Raises NotFoundError, DeniedError."""
+def remove_members(connection: Connection, caller: Caller, group: str, users: Sequence[str]) -> None:
+    """Takes users out of a group; nothing happens to those who are not in it. Raises as `add_members` does."""
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
-    if group == GLOBAL:
-        demand_over(connection, caller, user)
-    gone = delete(MEMBERSHIP).where(MEMBERSHIP.c.team == group, MEMBERSHIP.c.user == user)
-    connection.execute(gone)
-    audit(connection, caller.name, "remove_member", f"{group}: {user}")
+    _demand_few(len(users))
+    for user in users:
+        if group == GLOBAL:
+            demand_over(connection, caller, user)
+        gone = delete(MEMBERSHIP).where(MEMBERSHIP.c.team == group, MEMBERSHIP.c.user == user)
+        connection.execute(gone)
+        audit(connection, caller.name, "remove_member", f"{group}: {user}")
 
 
 def _known(connection: Connection, caller: Caller, group: str) -> None:

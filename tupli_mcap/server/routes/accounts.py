@@ -200,8 +200,7 @@ def delete_group(library: Served, caller: Writer, name: str) -> None:
 def add_members(library: Served, caller: Writer, name: str, told: list[Member]) -> GroupWithMembers:
     """Gives users roles in a group: to all of them, or to none."""
     with library.database.writing() as connection:
-        for member in told:
-            accounts.add_member(connection, caller, name, member.user, member.roles)
+        accounts.add_members(connection, caller, name, [(member.user, member.roles) for member in told])
         return GroupWithMembers.model_validate(accounts.members_of(connection, caller, name))
 
 
@@ -209,7 +208,7 @@ def add_members(library: Served, caller: Writer, name: str, told: list[Member]) 
 def remove_member(library: Served, caller: Writer, name: str, user: str) -> None:
     """Removes a user from a group."""
     with library.database.writing() as connection:
-        accounts.remove_member(connection, caller, name, user)
+        accounts.remove_members(connection, caller, name, [user])
 
 
 @router.post("/roles")

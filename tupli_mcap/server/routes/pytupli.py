@@ -188,10 +188,9 @@ def delete_group(library: Served, caller: Changing, group_name: str) -> None:
 @router.post("/access/groups/add-members")
 def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
     """Gives users roles in a group."""
+    members = [(member.user, member.roles or ["member"]) for member in told.members]
     with library.database.writing() as connection:
-        for member in told.members:
-            roles = member.roles or ["member"]
-            accounts.add_member(connection, caller, told.group_name, member.user, roles)
+        accounts.add_members(connection, caller, told.group_name, members)
     return _group(library, caller, told.group_name)
 
 
@@ -199,8 +198,8 @@ def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -
 def remove_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
     """Takes users out of a group."""
     with library.database.writing() as connection:
-        for member in told.members:
-            accounts.remove_member(connection, caller, told.group_name, member.user)
+        users = [member.user for member in told.members]
+        accounts.remove_members(connection, caller, told.group_name, users)
     return _group(library, caller, told.group_name)
 
 
