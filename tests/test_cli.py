@@ -1101,19 +1101,8 @@ class TestSharing:
         )
         assert out.splitlines()[-1] == "trusted      not needed"
 
-    def test_trust_shows_what_a_pickle_says_it_imports(self, lab: tuple[Path, str, str]) -> None:
-        (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")
-        out = ok("trust", path, "--show")
-        assert re.search(
-            r"^warning +Loading this pickle can run any code; the names below are what", out, re.MULTILINE
-        )
-        assert re.search(r"^imports +cloudpickle\.cloudpickle:_make_skeleton_class, ", out, re.MULTILINE)
-        shown = run("trust", path, "--show", "--json").json
-        assert shown["imports"]["names"][0] == "cloudpickle.cloudpickle:_make_skeleton_class"
-        assert shown["imports"]["gaps"] == []
-
     def test_trust_judges_no_pickle(self, here: Path) -> None:
-        """Functions that everybody imports reach `eval` through their arguments alone."""
+        """Functions that every pickle may use reach `eval` through their arguments alone."""
         record = EnvironmentRecord("Maze", pickle=b"c_operator\ngetitem\n.")
         carried = {"benchmark.json": ("application/json", record.to_json())}
         carried["env.cloudpickle"] = ("application/octet-stream", record.pickle or b"")
@@ -1121,7 +1110,7 @@ class TestSharing:
             env.reset(seed=0)
             env.step(0)
         out = ok("trust", "a.mcap", "--show")
-        assert "can run any code" in out and "they prove nothing" in out
+        assert re.search("^warning +loading this pickle can run any code$", out, re.MULTILINE)
         assert not re.search("known|unusual|suspicious|dangerous|harmless", out)
 
     def test_untrust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:

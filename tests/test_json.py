@@ -179,7 +179,7 @@ restore-server: restore-server backup again
 logout: logout
 """
 EMPTY = {
-    "attachments_lost[]", "ends_lost[]", "final_states_lost[]", "foreign[]", "imports.gaps[]", "info_keys[]",
+    "attachments_lost[]", "ends_lost[]", "final_states_lost[]", "foreign[]", "info_keys[]",
     "left_over[]", "notes[]", "options[]", "skipped[]", "starts_lost[]",
 }  # fmt: skip
 """Lists in which nothing is here."""

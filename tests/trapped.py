@@ -40,7 +40,6 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.environment import named_imports
 from tupli_mcap.messages import encode_rows as encoder
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.verify import verify_recording
@@ -267,7 +266,6 @@ def _attachments(recording: Recording) -> None:
 
 def _benchmark(recording: Recording) -> None:
     benchmark = recording.benchmark
-    named_imports(benchmark.record.pickle or b"")
     repr((benchmark, benchmark.needs_trust, benchmark.voucher))
     benchmark.make_env()
     raise AssertionError("the environment was built")
@@ -374,7 +372,6 @@ def main(corpus: Path, target: Path) -> None:
                 trap.armed = False
 
     # Lazy imports of our own first, on a harmless file: what is imported after that was named by a file.
-    named_imports(b"Vx\n.")  # the codecs of texts in pickles
     "\x1b".encode("unicode_escape")  # how the terminal shows such characters
     rich.cells.get_character_cell_size("\N{HORIZONTAL ELLIPSIS}")  # tables of characters' widths
     warm = target / "warm"

@@ -2,7 +2,7 @@
 
 _capture, _build             from an environment to an `EnvironmentRecord` (`_record`), and back
 _changes, _local_code        whether an environment is as its constructors left it; which code is the user's own
-_pickling, _imports          pickles of environments; what a pickle imports
+_pickling                    pickles of environments
 _arguments                   arguments that are more than data, and so need trust
 _docs                        names of dimensions and actions"""
 
@@ -10,14 +10,11 @@ from tupli_mcap.environment._arguments import more_than_data
 from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, name_of, note, resets_itself
 from tupli_mcap.environment._docs import documented_labels
-from tupli_mcap.environment._imports import WHAT_LOADING_DOES, PickleImports, named_imports
 from tupli_mcap.environment._pickling import rebuild_ezpickled
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json, sha256
 
 __all__ = [
-    "WHAT_LOADING_DOES",
     "EnvironmentRecord",
-    "PickleImports",
     "Snapshot",
     "build",
     "canonical_json",
@@ -27,7 +24,6 @@ __all__ = [
     "fingerprint",
     "more_than_data",
     "name_of",
-    "named_imports",
     "note",
     "reasons_for_distrust",
     "rebuild_ezpickled",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +11,9 @@ from tupli_mcap.cli.options import Json
 from tupli_mcap.cli.output import bytes_of, print_facts, print_json, print_result
 
 if TYPE_CHECKING:
-    from tupli_mcap.environment import PickleImports
     from tupli_mcap.recording.sign.carried_code import CarriedCode
 
 __all__ = ["trust", "untrust"]
-
-_SHOWN = 40  # how many entries of a list are shown; --json has all
 
 
 def trust(
@@ -38,8 +34,7 @@ def trust(
 
     Rebuilding may run code from the file with your rights on this machine; so may reset
     options that name files or code. --show prints what the file says about that code, and
-    runs nothing. For a pickle, these are the names it imports: they show what it may use, not
-    that it is harmless. Trust is yours only, and ends when a byte of the environment changes.
+    runs nothing. Trust is yours only, and ends when a byte of the environment changes.
     Reading episodes needs no trust. --key trusts every environment that this key signs (see
     bundle --sign).
     """
@@ -136,7 +131,7 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
         *([("spec", code.spec)] if code.spec else []),
         *((one.of, f"{one.name}{_registered(one.name, one.here)}") for one in code.entry_points),
         *([("classes", ", ".join(code.classes))] if code.classes else []),
-        *(_facts_of_pickle(code.imports) if code.imports is not None else []),
+        *([("warning", "loading this pickle can run any code")] if code.kind == "pickle" else []),
         ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
         ("digest", code.digest),
         *([("foreign", "; ".join(code.foreign))] if code.foreign and code.kind == "spec" else []),
@@ -162,15 +157,3 @@ def _registered(name: str, here: str | None) -> str:
     if here is None:
         return ""
     return " (as registered here)" if here == name else f" (registered here: {here})"
-
-
-def _facts_of_pickle(imports: PickleImports) -> list[tuple[str, str]]:
-    from tupli_mcap.environment import WHAT_LOADING_DOES
-
-    facts = [("warning", WHAT_LOADING_DOES), ("imports", _several(imports.names))]
-    return [*facts, ("not listed", _several(imports.gaps))] if imports.gaps else facts
-
-
-def _several(texts: Sequence[str]) -> str:
-    shown = ", ".join(texts[:_SHOWN])
-    return shown if len(texts) <= _SHOWN else f"{shown} and {len(texts) - _SHOWN} more (--json lists them)"

@@ -13,11 +13,9 @@ import gymnasium as gym
 
 from tupli_mcap import jsonvalue, trust
 from tupli_mcap.environment import (
-    PickleImports,
     canonical_json,
     entry_point_name,
     more_than_data,
-    named_imports,
     reasons_for_distrust,
     sha256,
 )
@@ -47,8 +45,8 @@ class CarriedCode(NamedTuple):
     """The environment in a recording, as the file describes it; `name`, `classes` and `versions` are claims.
 
     Attributes:
-        kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, whose
-            instructions name `imports`; it may import and run anything) or "names" (nothing can rebuild it).
+        kind: "spec" (its JSON text is `spec`, the code it names `entry_points`), "pickle" (of `size` bytes, which may
+            import and run anything) or "names" (nothing can rebuild it).
         foreign: the code that would run and that this machine does not know; empty if building it needs no trust.
         options: the parts of its resets' options that are more than data; replaying would pass them to the environment.
         needs_trust: it is built, or given all options, only if the user trusts it.
@@ -63,7 +61,6 @@ class CarriedCode(NamedTuple):
     spec: str
     entry_points: list[EntryPoint]
     size: int
-    imports: PickleImports | None
     classes: tuple[str, ...]
     versions: dict[str, str]
     digest: str
@@ -98,7 +95,6 @@ def carried_code(path: str | os.PathLike[str]) -> CarriedCode:
         spec="" if spec is None else json.dumps(spec),
         entry_points=[] if spec is None else _entry_points(spec),
         size=len(record.pickle or b""),
-        imports=None if record.pickle is None else named_imports(record.pickle),
         classes=record.classes,
         versions=dict(record.versions),
         digest=record.digest,
