@@ -37,7 +37,6 @@ from tupli_mcap.errors import (
     TupliError,
 )
 from tupli_mcap.recording import EpisodeData, write_recording
-from tupli_mcap.recording.index import EpisodeIndex
 from tupli_mcap.schema import Episode, EpisodeItem, EpisodeMetadataCallback, F, FilterEQ, RLTuple
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -392,22 +391,6 @@ def test_nothing_is_read_before_it_is_needed(
     good.load()
     good.convert_to_numpy()
     assert asked == [("states", "actions", "terminals", "timeouts")] * 2
-
-
-def test_each_recording_is_parsed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What listing the episodes has opened says where their steps lie, too."""
-    for i in range(3):
-        record(tmp_path / f"{i}.mcap", Sampler(gym.spaces.Box(-1, 1, (2,)), gym.spaces.Discrete(3)), 40, i)
-    decode, parsed = EpisodeIndex.decode.__func__, []  # type: ignore[attr-defined]
-
-    def counted(cls: type[EpisodeIndex], data: bytes, where: str) -> EpisodeIndex:
-        parsed.append(where)
-        return decode(cls, data, where)
-
-    monkeypatch.setattr(EpisodeIndex, "decode", classmethod(counted))
-    windows = TupliDataset.from_files(tmp_path / "*.mcap").windows(2)
-    assert windows[np.arange(len(windows))] is not None
-    assert len(parsed) == 3
 
 
 def test_only_the_asked_episodes_are_read(
@@ -863,10 +846,3 @@ def test_a_bar_after_a_second(
     assert out == ""
     assert "Loading" in err
     assert set(threading.enumerate()) == threads
-
-
-def test_explain_shows_the_sql(tmp_path: Path) -> None:
-    storage = FileStorage(tmp_path / "lab")
-    text = TupliDataset(storage).with_episode_filter(F("n_tuples") > 3).explain()
-    assert "SELECT" in text
-    assert "n_tuples" in text

@@ -97,7 +97,7 @@ def test_episodes_that_went_on_since_they_were_listed(tmp_path: Path, space: spa
         for env in envs:
             roll(env, 30)
         source = FilesSource(paths)
-        headers = source.episodes(None, None)
+        headers = source.episodes(None)
         for env in envs:
             for _ in range(3):
                 env.step(env.action_space.sample())

@@ -96,7 +96,7 @@ def subjects_of(
 
     if isinstance(source, TupliStorage) or (isinstance(source, str) and is_server(source)):
         stored = _stored(source)
-        yield from _of_headers(stored, stored.episodes(None, episode_filter))
+        yield from _of_headers(stored, stored.episodes(episode_filter))
     elif isinstance(source, str | os.PathLike):
         yield from _of_path(os.fspath(source), partial(candidates, filter=episode_filter))
     elif isinstance(source, Recording):
@@ -227,7 +227,7 @@ def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitSt
     from tupli_mcap.dataset.sources import numbers_by_recording
 
     server = _stored(address)
-    headers = server.episodes(None, filter)
+    headers = server.episodes(filter)
     numbers = np.array([header.episode for header in headers])
     returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
     named: dict[int, None] = {}

@@ -79,9 +79,9 @@ class Dataset(RandomAccess):
     def headers(self) -> Sequence[EpisodeHeader]:
         """The facts about the episodes, in their order, without their steps."""
         if self._listed is None:
-            self._listed = self._source.episodes(None, self._filter)
+            self._listed = self._source.episodes(self._filter)
             if not self._listed and self._filter is not None:
-                check_metadata(self._filter, self._source.episodes(None, None))
+                check_metadata(self._filter, self._source.episodes(None))
         return self._listed
 
     @property
@@ -154,7 +154,7 @@ class Dataset(RandomAccess):
         there is none."""
         if self.headers:
             return self._open(self.headers[0].recording)
-        left_out = self._source.episodes(None, None)
+        left_out = self._source.episodes(None)
         return self._source.open(left_out[0].recording, [left_out[0].episode]) if left_out else None
 
     @property

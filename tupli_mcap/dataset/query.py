@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from typing import Any, Self
 
 from tupli_mcap.arrays import Array
@@ -11,9 +10,8 @@ from tupli_mcap.dataset.columns.load import Selected, TupleFilter, read_columns,
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
-from tupli_mcap.dataset.sources import Source, numbers_by_recording
+from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
 __all__ = ["Query"]
@@ -27,7 +25,7 @@ class Query:
 
     def __init__(
         self,
-        source: Source,
+        source: StorageSource | FilesSource,
         benchmark_filter: BaseFilter | None = None,
         episode_filter: BaseFilter | None = None,
         tuple_filter: TupleFilter | None = None,
@@ -88,9 +86,9 @@ class Query:
             raise AssertionError("reading leaves the selection behind")
         return self._selected
 
-    def refresh(self, seen: dict[str, Recording] | None = None) -> list[EpisodeHeader]:
-        """Lists the episodes again; columns are kept if the episodes are the same. `seen` as in `Source.episodes`."""
-        headers = self.source.episodes(self.benchmark_filter, self.episode_filter, seen)
+    def refresh(self) -> list[EpisodeHeader]:
+        """Lists the episodes again; columns are kept if the episodes are the same."""
+        headers = self.source.episodes(self.episode_filter, self.benchmark_filter)
         if self._headers is None or _identity(headers) != _identity(self._headers):
             self._selected, self.layout, self._columns, self._recorded = None, None, {}, None
         self._headers, self._benchmarks = headers, None
@@ -99,15 +97,12 @@ class Query:
     def steps(self) -> Steps:
         """The wanted steps by number: from columns in memory, else from the recordings, on access."""
         if self._recorded is None:
-            seen: dict[str, Recording] = {}
-            headers = self.refresh(seen) if self._headers is None else self._headers
+            headers = self.headers
             mask = None if self._selector is None else self.selected.mask
             chosen = numbers_by_recording(headers)
             self._recorded = RecordedSteps(
                 ListedEpisodes.each(headers),
-                lambda name: (
-                    nullcontext(seen.pop(name)) if name in seen else self.source.open(name, chosen[name])
-                ),
+                lambda name: self.source.open(name, chosen[name]),
                 mask,
                 cache_bytes=self.cache_bytes,
                 threads=self.threads,

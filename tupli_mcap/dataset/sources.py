@@ -58,21 +58,9 @@ class DatasetError(TupliError, ValueError):
 class Source(Protocol):
     """Lists episodes and opens their recordings."""
 
-    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]: ...
-
-    def episodes(
-        self,
-        benchmark_filter: BaseFilter | None,
-        episode_filter: BaseFilter | None,
-        seen: dict[str, Recording] | None = None,
-    ) -> list[EpisodeHeader]:
-        """The episodes that match both filters; those of one recording follow each other.
-
-        Recordings that were opened are added to `seen`, by name: they are closed, but their indexes can be used.
-        """
+    def episodes(self, episode_filter: BaseFilter | None) -> list[EpisodeHeader]:
+        """The episodes that match a filter; those of one recording follow each other."""
         ...
-
-    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str: ...
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         """The recording that a header names; the caller closes it. `episodes` as in `TupliStorage.open_recording`."""
@@ -97,28 +85,14 @@ class StorageSource:
         return self.storage.list_benchmarks(filter)
 
     def episodes(
-        self,
-        benchmark_filter: BaseFilter | None,
-        episode_filter: BaseFilter | None,
-        seen: dict[str, Recording] | None = None,
+        self, episode_filter: BaseFilter | None, benchmark_filter: BaseFilter | None = None
     ) -> list[EpisodeHeader]:
-        wanted = self._wanted(benchmark_filter, episode_filter)
+        wanted = episode_filter
+        if benchmark_filter is not None:
+            ids = [header.id for header in self.benchmarks(benchmark_filter)]
+            of_benchmarks = FilterIN(key="benchmark_id", value=ids)
+            wanted = of_benchmarks if episode_filter is None else of_benchmarks & episode_filter
         return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
-
-    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        """How the storage finds the episodes: SQL and plan if it has a catalog, else the filter."""
-        wanted = self._wanted(benchmark_filter, episode_filter)
-        explain = getattr(self.storage, "explain", None)
-        return str(wanted) if explain is None else str(explain(wanted))
-
-    def _wanted(
-        self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None
-    ) -> BaseFilter | None:
-        if benchmark_filter is None:
-            return episode_filter
-        ids = [header.id for header in self.benchmarks(benchmark_filter)]
-        wanted = FilterIN(key="benchmark_id", value=ids)
-        return wanted if episode_filter is None else wanted & episode_filter
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return self.storage.open_recording(recording, episodes)
@@ -170,10 +144,7 @@ class FilesSource:
         return list(found.values())
 
     def episodes(
-        self,
-        benchmark_filter: BaseFilter | None,
-        episode_filter: BaseFilter | None,
-        seen: dict[str, Recording] | None = None,
+        self, episode_filter: BaseFilter | None, benchmark_filter: BaseFilter | None = None
     ) -> list[EpisodeHeader]:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
@@ -186,8 +157,6 @@ class FilesSource:
             notes = None if is_url(name) else Notes.read(Path(name))
             deleted = set() if notes is None else notes.about(recording.metadata).deleted
             headers = list(episode_headers(recording, name, deleted))
-            if seen is not None:
-                seen[name] = recording
             copies = [header for header in headers if header.id in files]
             if copies:
                 warn(f"{name} holds {len(copies)} episodes of {files[copies[0].id]} again; they are left out")
@@ -208,10 +177,6 @@ class FilesSource:
                 continue
             with recording:
                 yield recording
-
-    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        """The filter that every episode is tested with; files have no SQL."""
-        return f"every episode: benchmark {benchmark_filter}, episode {episode_filter}"
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return Recording(self._addresses.get(recording, recording), cache_bytes=_CACHE_BYTES)
@@ -251,21 +216,9 @@ class JoinedSource:
                         "save one of the datasets to a file, and add that"
                     )
 
-    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
-        found = [header for source in self._sources for header in source.benchmarks(filter)]
-        return list({(header.id, header.metadata.name): header for header in found}.values())
-
-    def episodes(
-        self,
-        benchmark_filter: BaseFilter | None,
-        episode_filter: BaseFilter | None,
-        seen: dict[str, Recording] | None = None,
-    ) -> list[EpisodeHeader]:
-        found = [s.episodes(benchmark_filter, episode_filter, seen) for s in self._sources]
+    def episodes(self, episode_filter: BaseFilter | None) -> list[EpisodeHeader]:
+        found = [source.episodes(episode_filter) for source in self._sources]
         return list({header.id: header for headers in found for header in headers}.values())
-
-    def explain(self, benchmark_filter: BaseFilter | None, episode_filter: BaseFilter | None) -> str:
-        return "\n".join(source.explain(benchmark_filter, episode_filter) for source in self._sources)
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return self._of[recording][0].open(recording, episodes)

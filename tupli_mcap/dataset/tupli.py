@@ -76,7 +76,7 @@ class TupliDataset(RandomAccess):
         made._setup(FilesSource(files), info)
         return made
 
-    def _setup(self, source: Source, info: dict[str, Any] | None) -> None:
+    def _setup(self, source: StorageSource | FilesSource, info: dict[str, Any] | None) -> None:
         self.info = info
         self._query = Query(source)
         self.set_seed(None)
@@ -151,10 +151,6 @@ class TupliDataset(RandomAccess):
     def preview(self) -> list[EpisodeHeader]:
         """Lists the episodes again; reads no step."""
         return list(self._query.refresh())
-
-    def explain(self) -> str:
-        """How the episodes are found: for a storage with a catalog, the SQL of the filters and its plan."""
-        return self._query.source.explain(self._query.benchmark_filter, self._query.episode_filter)
 
     def load(self) -> None:
         """List the episodes again and read their steps (states, actions, rewards, terminals, timeouts) into
