@@ -14,7 +14,6 @@ from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, f
 from tupli_mcap.cli.output import bytes_of, counted, number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
@@ -131,13 +130,7 @@ def _chosen(
 ) -> Iterator[tuple[Recording, list[Episode]]]:
     """The chosen episodes and their recording. RecordingError if they are of several."""
     from tupli_mcap.dataset.chosen import chosen_from
-    from tupli_mcap.dataset.which import choose_episodes
-    from tupli_mcap.recording import Recording
 
-    if not is_server(source) and not Path(source).is_dir():
-        with Recording(source) as recording:
-            yield recording, choose_episodes(recording, episodes, wanted)
-        return
     with chosen_from(source, episodes, wanted) as found:
         if len(found) > 1:
             names = ", ".join(Path(item.recording.name).name for item in found[:_MOST_NAMES])

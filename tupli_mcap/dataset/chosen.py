@@ -17,15 +17,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union,
 import numpy as np
 
 from tupli_mcap.dataset.which import (
-    WORDS,
     Positions,
-    bounds_of,
     candidates,
     extreme,
     named_positions,
+    places_of,
     positions_of,
 )
-from tupli_mcap.errors import FilterError, RecordingError, TupliError, warn
+from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown
 
@@ -171,13 +170,11 @@ def chosen_from(
     with ExitStack() as stack:
         chosen: list[Chosen] = []
         for source in given:
-            if not isinstance(source, Recording) and is_server(os.fspath(source)):
-                chosen += _of_server(os.fspath(source), text, wanted, stack)
-                continue
-            if not isinstance(source, Recording) and _is_directory(source):
-                chosen += _of_directory(Path(source), text, wanted, stack)
-                continue
             if not isinstance(source, Recording):
+                many = _many_at(os.fspath(source))
+                if many is not None:
+                    chosen += _of_many(many, shown(os.fspath(source)), text, wanted, stack)
+                    continue
                 source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
             among = candidates(source, wanted)
             chosen.append(Chosen(source, named_positions(source, among, text, wanted)))
@@ -219,36 +216,47 @@ def _parsed(text: str) -> BaseFilter:
     return parse_filter(text)
 
 
-def _is_directory(source: str | os.PathLike[str]) -> bool:
-    return not is_url(os.fspath(source)) and Path(source).is_dir()
+def _many_at(place: str) -> EpisodeSource | None:
+    """The episodes of a server or of a directory; None for the place of one recording."""
+    if is_server(place):
+        return _stored(place)
+    if is_url(place) or not Path(place).is_dir():
+        return None
+    from tupli_mcap.dataset.sources import FilesSource
+    from tupli_mcap.storage.listing import find_recordings
+
+    files = find_recordings(Path(place))
+    if not files:
+        raise RecordingError(f"{place} holds no recording (.mcap)")
+    return FilesSource(files, of_directory=True)
 
 
-def _of_server(address: str, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
+def _of_many(
+    source: EpisodeSource, where: str, text: str, filter: BaseFilter | None, stack: ExitStack
+) -> list[Chosen]:
+    """The episodes that a text names among those of all recordings of a source."""
     from tupli_mcap.dataset.sources import numbers_by_recording
 
-    server = _stored(address)
-    headers = server.episodes(filter)
+    headers = source.episodes(filter)
     numbers = np.array([header.episode for header in headers])
     returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
     named: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
-        if item not in WORDS:
-            first, last = bounds_of(item, text)
-            named.update(dict.fromkeys(np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()))
-        elif headers:
-            everywhere = {"all": range(len(numbers)), "first": [0], "last": [len(numbers) - 1]}
-            named.update(dict.fromkeys(everywhere.get(item) or [extreme(item, returns)]))
+        named.update(dict.fromkeys(places_of(item, text, numbers, returns)))
     if not named:
         why = "" if filter is None else f" that matches {filter}"
-        where = shown(address)
         raise RecordingError(f"{where} has no episode {text!r}{why}; see tupli-mcap episodes {where}")
-    chosen = numbers_by_recording([headers[i] for i in named])
-    _check_few(len(chosen), shown(address))
-    opened = {name: stack.enter_context(server.open(name, wanted)) for name, wanted in chosen.items()}
-    return [
-        Chosen(recording, np.flatnonzero(np.isin(recording.index["episode"], chosen[name])).tolist())
-        for name, recording in opened.items()
-    ]
+    by_recording = numbers_by_recording([headers[i] for i in named])
+    if len(by_recording) > _MOST_OPEN:
+        raise RecordingError(
+            f"expected episodes of at most {_MOST_OPEN} recordings, found {len(by_recording)} in {where}; choose fewer"
+        )
+    chosen = []
+    for name, wanted in by_recording.items():
+        recording = stack.enter_context(source.open(name, wanted))
+        position_of = {number: i for i, number in enumerate(recording.index["episode"].tolist())}
+        chosen.append(Chosen(recording, [position_of[number] for number in wanted]))
+    return chosen
 
 
 def _stored(storage: TupliStorage | str) -> EpisodeSource:
@@ -256,56 +264,3 @@ def _stored(storage: TupliStorage | str) -> EpisodeSource:
     from tupli_mcap.storage import storage_at
 
     return StorageSource(storage_at(storage))
-
-
-def _check_few(recordings: int, where: str) -> None:
-    if recordings > _MOST_OPEN:
-        raise RecordingError(
-            f"expected episodes of at most {_MOST_OPEN} recordings, found {recordings} in {where}; choose fewer"
-        )
-
-
-def _of_directory(folder: Path, text: str, filter: BaseFilter | None, stack: ExitStack) -> list[Chosen]:
-    from tupli_mcap.storage.listing import find_recordings
-
-    items = list(dict.fromkeys(item.strip().lower() for item in text.split(",")))
-    named: dict[str, dict[str, tuple[float, list[int]]]] = {item: {} for item in items}  # by item and file
-    paths = find_recordings(folder)
-    if not paths:
-        raise RecordingError(f"{folder} holds no recording (.mcap)")
-    for path in paths:
-        try:
-            with Recording(path, cache_bytes=_CACHE_BYTES) as recording:
-                among = candidates(recording, filter)
-                for item in items:
-                    with contextlib.suppress(RecordingError):  # another one of the directory may have it
-                        positions = named_positions(recording, among, item, filter)
-                        named[item][str(path)] = float(recording.index["return"][positions[0]]), positions
-        except FilterError:
-            raise
-        except TupliError as err:
-            warn(f"{err}; it is left out")
-    chosen: dict[str, dict[int, None]] = {}
-    for item in items:
-        for file in _files_of(item, {file: total for file, (total, _) in named[item].items()}):
-            chosen.setdefault(file, {}).update(dict.fromkeys(named[item][file][1]))
-    if not chosen:
-        why = "" if filter is None else f" that matches {filter}"
-        raise RecordingError(
-            f"{folder} has no episode {text!r}{why} in any recording; see tupli-mcap ls {folder}"
-        )
-    _check_few(len(chosen), str(folder))
-    return [
-        Chosen(stack.enter_context(Recording(file, cache_bytes=_CACHE_BYTES)), list(positions))
-        for file, positions in chosen.items()
-    ]
-
-
-def _files_of(item: str, returns: dict[str, float]) -> list[str]:
-    """The files in which an item chooses an episode, among those that have one; `returns` are the returns by file."""
-    files = list(returns)
-    if not files or item not in ("best", "worst", "first", "last"):
-        return files
-    if item in ("first", "last"):
-        return [files[0 if item == "first" else -1]]
-    return [files[extreme(item, list(returns.values()))]]

@@ -26,6 +26,7 @@ __all__ = [
     "choose_episodes",
     "extreme",
     "named_positions",
+    "places_of",
     "positions_of",
 ]
 
@@ -112,25 +113,32 @@ def named_positions(
     why = "" if filter is None else f" that matches {filter}"
     if not len(among):
         raise RecordingError(f"{recording.name} has no episode{why}")
+    rows = recording.index[among]
     chosen: dict[int, None] = {}
-    for item in text.split(","):
-        chosen.update(dict.fromkeys(_named(recording, among, item.strip().lower(), text, why)))
+    for item in (item.strip().lower() for item in text.split(",")):
+        places = places_of(item, text, rows["episode"], rows["return"])
+        if not places:
+            raise RecordingError(
+                f"{recording.name} has no episode {item}{why}; choose from {_range(rows['episode'])}"
+            )
+        chosen.update(dict.fromkeys(among[places].tolist()))
     return list(chosen)
 
 
-def _named(recording: Recording, among: Positions, item: str, text: str, why: str) -> list[int]:
-    if item == "all":
-        return [int(position) for position in among]
+def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
+    """The places that one item of a text names, among episodes with these numbers and returns; none if there is none.
+
+    Raises:
+        FilterError: the item is no number, no range and no word.
+    """
+    if item not in WORDS:
+        first, last = bounds_of(item, text)
+        return np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()
+    if item == "all" or not len(numbers):
+        return list(range(len(numbers)))
     if item in ("first", "last"):
-        return [int(among[0 if item == "first" else -1])]
-    if item in ("best", "worst"):
-        return [int(among[extreme(item, recording.index["return"][among])])]
-    first, last = bounds_of(item, text)
-    numbers = recording.index["episode"][among]
-    matching = among[(numbers >= first) & (numbers <= last)]
-    if not len(matching):
-        raise RecordingError(f"{recording.name} has no episode {item}{why}; choose from {_range(numbers)}")
-    return [int(position) for position in matching]
+        return [0 if item == "first" else len(numbers) - 1]
+    return [extreme(item, returns)]
 
 
 def bounds_of(item: str, text: str) -> tuple[int, int]:
