@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, RECORD_HEADER
+from tupli_mcap.messages import cdr
 
 END_NAMES = ("terminal", "timeout", "interrupted")
 TERMINAL, TIMEOUT, INTERRUPTED = range(3)
@@ -26,7 +27,6 @@ END_SCHEMA = (
 _SEED = re.compile(r"-?[0-9]{1,80}", re.ASCII)
 START_FIELDS = struct.Struct("<IIQ??2x")
 END_FIELDS = struct.Struct("<IIQQdB?2x")
-_LENGTH = struct.Struct("<I")
 
 
 def record(channel: int, sequence: int, time_ns: int, body: bytes) -> bytes:
@@ -35,37 +35,12 @@ def record(channel: int, sequence: int, time_ns: int, body: bytes) -> bytes:
     return head + CDR_HEADER + body
 
 
-def _strings(offset: int, *texts: bytes) -> bytes:
+def _strings(*texts: str) -> bytes:
+    """CDR strings, one after the other, from an offset on that is a multiple of 4."""
     out = bytearray()
     for text in texts:
-        out += bytes(-(offset + len(out)) % 4)
-        out += _LENGTH.pack(len(text) + 1) + text + b"\0"
+        cdr.write_string(out, 0, text)
     return bytes(out)
-
-
-def read_strings(body: memoryview, offset: int, count: int) -> list[str]:
-    """`count` CDR strings from `offset` on.
-
-    Raises:
-        FormatError: a length beyond the message, a missing NUL, or text that is not UTF-8.
-    """
-    texts = []
-    for _ in range(count):
-        offset += -offset % 4
-        if offset + 4 > len(body):
-            raise FormatError(f"expected a string at byte {offset} of a message of {len(body)} bytes")
-        (length,) = _LENGTH.unpack_from(body, offset)
-        offset += 4
-        if length < 1 or offset + length > len(body) or body[offset + length - 1] != 0:
-            raise FormatError(
-                f"expected a string of {length} bytes with its NUL at byte {offset} of a message"
-            )
-        try:
-            texts.append(str(body[offset : offset + length - 1], "utf-8"))
-        except UnicodeDecodeError as err:
-            raise FormatError(f"expected UTF-8 text at byte {offset} of a message: {err.reason}") from err
-        offset += length
-    return texts
 
 
 class EpisodeStart(NamedTuple):
@@ -103,18 +78,20 @@ class EpisodeStart(NamedTuple):
             raise FormatError(
                 f"/episode_start: expected at least {START_FIELDS.size} bytes, found {len(body)}"
             )
-        texts = read_strings(body, START_FIELDS.size, 3)
-        return cls._make([*START_FIELDS.unpack_from(body, 0), *texts])
+        seed, at = cdr.read_string(body, START_FIELDS.size, 0)
+        options, at = cdr.read_string(body, at, 0)
+        reset_info, _ = cdr.read_string(body, at, 0)
+        return cls._make([*START_FIELDS.unpack_from(body, 0), seed, options, reset_info])
 
 
-_PLAIN_START = _strings(START_FIELDS.size, b"", b"", b"{}")
+_PLAIN_START = _strings("", "", "{}")
 
 
 def start_texts(seed: str, options: str, reset_info: str) -> bytes:
     """The end of an `EpisodeStart`'s CDR body, which follows its `START_FIELDS`."""
     if seed == "" and options == "" and reset_info == "{}":
         return _PLAIN_START
-    return _strings(START_FIELDS.size, seed.encode(), options.encode(), reset_info.encode())
+    return _strings(seed, options, reset_info)
 
 
 class EpisodeEnd(NamedTuple):
@@ -136,15 +113,16 @@ class EpisodeEnd(NamedTuple):
     def decode(cls, body: memoryview) -> EpisodeEnd:
         if len(body) < END_FIELDS.size:
             raise FormatError(f"/episode_end: expected at least {END_FIELDS.size} bytes, found {len(body)}")
-        message = cls._make([*END_FIELDS.unpack_from(body, 0), *read_strings(body, END_FIELDS.size, 1)])
+        metadata, _ = cdr.read_string(body, END_FIELDS.size, 0)
+        message = cls._make([*END_FIELDS.unpack_from(body, 0), metadata])
         if message.end >= len(END_NAMES):
             raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {message.end}")
         return message
 
 
-_PLAIN_END = _strings(END_FIELDS.size, b"{}")
+_PLAIN_END = _strings("{}")
 
 
 def end_texts(metadata: str) -> bytes:
     """The end of an `EpisodeEnd`'s CDR body, which follows its `END_FIELDS`."""
-    return _PLAIN_END if metadata == "{}" else _strings(END_FIELDS.size, metadata.encode())
+    return _PLAIN_END if metadata == "{}" else _strings(metadata)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.episodes import read_strings
+from tupli_mcap.messages import cdr
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
 from tupli_mcap.messages.topics import parse
 
@@ -24,7 +24,6 @@ FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", 
 """A row of `/frame/<name>`."""
 
 _STAMP = struct.Struct("<iI")
-_COUNT = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
 _NAME = re.compile("[a-z](?:_?[a-z0-9]+)*")  # of a camera
 
@@ -46,9 +45,9 @@ class EncodedFrame(NamedTuple):
 def encode_frame(camera: str, frame: EncodedFrame) -> bytes:
     """The CDR body of a `sensor_msgs/msg/CompressedImage`."""
     out = bytearray(_STAMP.pack(*divmod(frame.time_ns, 10**9)))
-    for text in (camera.encode(), frame.form.encode()):
-        out += bytes(-len(out) % 4) + _COUNT.pack(len(text) + 1) + text + b"\0"
-    out += bytes(-len(out) % 4) + _COUNT.pack(len(frame.data))
+    cdr.write_string(out, 0, camera)
+    cdr.write_string(out, 0, frame.form)
+    cdr.write_length(out, 0, len(frame.data))
     return bytes(out) + frame.data
 
 
@@ -61,14 +60,12 @@ def decode_frame(body: memoryview) -> tuple[EncodedFrame, str]:
     if len(body) < _STAMP.size:
         raise FormatError(f"expected a compressed image, found {len(body)} bytes")
     sec, nanosec = _STAMP.unpack_from(body)
-    frame_id, form = read_strings(body, _STAMP.size, 2)
-    at = _STAMP.size
-    for text in (frame_id, form):
-        at += -at % 4 + _COUNT.size + len(text.encode()) + 1
-    at += -at % 4
-    if at + _COUNT.size > len(body) or at + _COUNT.size + _COUNT.unpack_from(body, at)[0] != len(body):
+    frame_id, at = cdr.read_string(body, _STAMP.size, 0)
+    form, at = cdr.read_string(body, at, 0)
+    size, at = cdr.read_length(body, at, 0)
+    if at + size != len(body):
         raise FormatError(f"expected the bytes of a picture from byte {at} to the end of a message")
-    return EncodedFrame(sec * 10**9 + nanosec, form, bytes(body[at + _COUNT.size :])), frame_id
+    return EncodedFrame(sec * 10**9 + nanosec, form, bytes(body[at:])), frame_id
 
 
 def encode_pair(episode: int, step: int) -> bytes:

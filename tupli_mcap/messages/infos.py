@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.messages.episodes import read_strings
+from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.leaves import NameRegistry
 
 _HEAD = struct.Struct("<II")
@@ -51,16 +51,16 @@ class InfoCodec:
     ) -> bytes:
         """The CDR body of a step's info. Values of `kinds` go into typed fields, which are read as `float`."""
         rest = dict(info)
-        parts = [_HEAD.pack(episode, step)]
+        out = bytearray(_HEAD.pack(episode, step))
         for name in self.names:
             value = rest.get(name)
             if type(value) in kinds:
                 del rest[name]
-                parts.append(_FIELD.pack(value, True))
+                out += _FIELD.pack(value, True)
             else:
-                parts.append(_FIELD.pack(0.0, False))
-        text = jsonvalue.dumps_any(rest).encode() if rest else b"{}"
-        return b"".join([*parts, struct.pack("<I", len(text) + 1), text, b"\0"])
+                out += _FIELD.pack(0.0, False)
+        cdr.write_string(out, 0, jsonvalue.dumps_any(rest) if rest else "{}")
+        return bytes(out)
 
     def decode(self, body: memoryview) -> tuple[int, int, dict[str, Any]]:
         """(episode, step, info)."""
@@ -73,7 +73,7 @@ class InfoCodec:
             value, present = _FIELD.unpack_from(body, _HEAD.size + i * _FIELD.size)
             if present:
                 info[name] = value
-        (text,) = read_strings(body, fixed, 1)
+        text, _ = cdr.read_string(body, fixed, 0)
         rest = jsonvalue.loads(text)
         if not isinstance(rest, dict):
             raise FormatError(f"/info: expected a JSON object, found {text[:80]!r}")

@@ -7,7 +7,6 @@ fields all have constant size therefore has constant offsets, and a chunk of suc
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from mcap.opcode import Opcode
 
 from tupli_mcap.arrays import DType
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
+from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.leaves import Leaf, ros_type
 
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
@@ -115,17 +115,14 @@ def image_layout(leaf: Leaf) -> ImageLayout:
     frames = shape[0] if leaf.kind == "stack" else 1  # newer frames are below older ones
     height, width, channels = (*shape[1:], 1)[:3] if leaf.kind == "stack" else shape
     height *= frames
-    encoding = {1: b"mono8", 3: b"rgb8", 4: b"rgba8"}[channels]
     body = bytearray(8)
-    for value in (leaf.name.encode(), height, width, encoding, b"", width * channels, leaf.size):
-        if value == b"":
-            body += b"\0"  # is_bigendian
-            continue
-        body += bytes(-len(body) % 4)
-        if isinstance(value, bytes):
-            body += struct.pack("<I", len(value) + 1) + value + b"\0"
-        else:
-            body += struct.pack("<I", value)
+    cdr.write_string(body, 0, leaf.name)
+    cdr.write_length(body, 0, height)
+    cdr.write_length(body, 0, width)
+    cdr.write_string(body, 0, {1: "mono8", 3: "rgb8", 4: "rgba8"}[channels])
+    body += b"\0"  # is_bigendian
+    cdr.write_length(body, 0, width * channels)
+    cdr.write_length(body, 0, leaf.size)
     u1 = np.dtype(np.uint8)
     fields = [
         Field("sec", np.dtype(np.int32), (), 0),
