@@ -1,7 +1,6 @@
 """Datasets for PyTorch's DataLoader over windows, transitions and episodes; `torch` in here is PyTorch itself.
 
 mapped, stream         items by number, for any sampler; batches in a shuffled order
-order                  that order, over workers and ranks
 items, episodes        windows, transitions and whole episodes as tensors
 tensors, packed        columns as tensors; a batch from a worker to the loader
 rl, d3rlpy             for TorchRL; for d3rlpy"""

@@ -9,11 +9,9 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from tupli_mcap.dataset.items import Items, SamplingError
+from tupli_mcap.dataset.items.shuffle import Blocks, Part, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
-from tupli_mcap.torch.order import Batches, Blocks, Part, blocks_of
-
-_CHUNK_BYTES = 256 << 10  # assumed if the size of chunks is not known
 
 
 class StreamDataset(IterableDataset[dict[str, Any]]):
@@ -72,7 +70,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         self._mix = 1
         self._blocks: Blocks | None = None
         if shuffle:
-            self._mix, self._blocks = _mixing(items, worker_cache_bytes)
+            self._mix, self._blocks = mixing(items, worker_cache_bytes)
         self._epoch = torch.zeros((), dtype=torch.int64)
         self._epoch.share_memory_()  # type: ignore[no-untyped-call]  # workers that persist see it change
         self._drawn: tuple[int, int] | None = None  # a worker's seed, and its number of passes
@@ -125,7 +123,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             self._state = self._state_of(key, done)
             yield batch
 
-    def _batches(self, key: list[int] | None, workers: int) -> Batches:
+    def _batches(self, key: list[int] | None, workers: int) -> ShuffledBatches:
         streams = self._streams or workers
         if streams % workers:
             raise SamplingError(
@@ -133,7 +131,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             )
         part = Part(self._rank, self._ranks, streams)
         total = len(self._reader.items)
-        return Batches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
+        return ShuffledBatches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
 
     def _key(self, worker_seed: int | None) -> list[int] | None:
         """The seed of this epoch's order."""
@@ -191,20 +189,6 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         info = get_worker_info()
         told = {"workers": 1 if info is None else info.num_workers, "key": key, "batches": done}
         return {"items": self._reader.items.identity, **self._options(), **told}
-
-
-def _mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
-    """The number of blocks that are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit
-    into half of the cache, and are large enough that few items extend into the next block, which would be read
-    twice."""
-    chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
-    chunks = max(4, cache_bytes // 2 // chunk_bytes)
-    single = blocks_of(items, 1)
-    items_of_chunk = len(items) / len(single)
-    steps = getattr(items, "length", 1) + getattr(items, "history", 0)  # of an item, where it has many
-    least = int(min(2 * steps, chunks * items_of_chunk / 4))
-    blocks = blocks_of(items, least) if least > items_of_chunk else single
-    return max(2, chunks * len(blocks) // len(single)), blocks
 
 
 def _place(rank: int | None, ranks: int | None) -> tuple[int, int]:

@@ -156,10 +156,9 @@ class Items(ABC, Generic[T]):
         shuffle: Shuffle | Literal[False] = False,
         seed: int | None = None,
         drop_last: bool = False,
-        buffer: int | None = None,
     ) -> Order:
         """An `Order` of these items: each number once an epoch, in batches."""
-        return Order(self, batch_size, shuffle=shuffle, seed=seed, drop_last=drop_last, buffer=buffer)
+        return Order(self, batch_size, shuffle=shuffle, seed=seed, drop_last=drop_last)
 
     def batches(self, numbers: Numbers | int, *, read_ahead: int = 0) -> Batches[T]:
         """The items that an order or a sampler gives, read in batches; a number stands for `order(number)`.

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.recorded import CACHE_BYTES
+from tupli_mcap.dataset.items.shuffle import Blocks, Part, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import SamplingError, checked_count
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ __all__ = ["Numbers", "Order", "Shuffle", "check_state", "checked_seed", "seeded
 
 Shuffle = Literal["exact", "blocks"]
 _EPOCHS = 1  # the stream of random numbers; a `Sampler` has another
-_BUFFER = 1 << 16
 _SHUFFLES = (False, "exact", "blocks")
 
 
@@ -53,12 +53,10 @@ class Order:
     Args:
         items: the items.
         batch_size: numbers in a batch; the last one may have fewer.
-        shuffle: False keeps their order. "exact" makes all orders equally likely. "blocks" fills a buffer with blocks
-            (chunks) in random order, and takes items out of it at random: few chunks are in use at a time, and each is
-            read once or twice an epoch, even if the cache holds only some of them.
+        shuffle: False keeps their order. "exact" makes all orders equally likely. "blocks" takes chunks in a
+            random order, and mixes the items of as many as half the cache holds: each is read about once an epoch.
         seed: an integer from 0; None takes a random one. Each epoch has another order.
         drop_last: leave out a last batch that is not full.
-        buffer: number of items in the blocks in use; by default 65,536, or as many as half the cache holds.
 
     Raises:
         SamplingError: an argument is invalid.
@@ -72,7 +70,6 @@ class Order:
         shuffle: Shuffle | Literal[False] = False,
         seed: int | None = None,
         drop_last: bool = False,
-        buffer: int | None = None,
     ) -> None:
         if shuffle not in _SHUFFLES:
             raise SamplingError(
@@ -85,13 +82,10 @@ class Order:
         self.epoch, self.batch = 0, 0  # the next batch
         self._resumed = True
         self._n = len(items)
-        if buffer is not None:
-            self.buffer = checked_count(buffer, 1, "a buffer")
-        else:
-            room = getattr(items.source, "room", len(items.source))
-            self.buffer = max(1, min(_BUFFER, room * self._n // len(items.source)))
-        self._runs = items.block_runs() if shuffle == "blocks" else None
-        self._blocks = None if self._runs is None else _digest(self._runs)
+        self._mix = 0
+        self._blocks: Blocks | None = None
+        if shuffle == "blocks":
+            self._mix, self._blocks = mixing(items, getattr(items.source, "cache_bytes", CACHE_BYTES))
         if not len(self):
             raise SamplingError(
                 f"expected at least {batch_size} items for one full batch, found {self._n}; take drop_last=False"
@@ -120,9 +114,14 @@ class Order:
         self.epoch, self.batch = epoch + 1, 0
 
     def _batches(self, epoch: int) -> Iterator[Array]:
+        if self._blocks is not None:
+            key = [self.seed, epoch]
+            return iter(
+                ShuffledBatches(
+                    self._blocks, self._n, self.batch_size, Part(0, 1, 1), key, self._mix, drop_last=False
+                )
+            )
         random = seeded(self.seed, _EPOCHS, epoch)
-        if self._runs is not None:
-            return _through_buffer(self._runs, self.buffer, self.batch_size, random)
         order: Callable[[int], Array] = np.arange if self.shuffle is False else random.permutation
         return _cut(order(self._n), self.batch_size)
 
@@ -138,8 +137,8 @@ class Order:
             "kind": f"{type(self).__name__}, shuffle={self.shuffle}",
             "items": self.items_identity,
             "batch_size": self.batch_size,
-            "buffer": self.buffer if self._runs is not None else 0,
-            "blocks": self._blocks,
+            "mix": self._mix,
+            "blocks": None if self._blocks is None else self._blocks.digest,
             "seed": self.seed,
             "epoch": epoch,
             "batch": batch - len(unused),
@@ -157,58 +156,9 @@ def _cut(order: Array, size: int) -> Iterator[Array]:
         yield order[first : first + size]
 
 
-def _through_buffer(
-    runs: tuple[Array, Array, Array], size: int, batch_size: int, random: np.random.Generator
-) -> Iterator[Array]:
-    """Batches of item numbers (int64), each item once; the last batch may be shorter.
-
-    Each item waits a random time, but none longer than `span` blocks, so that few blocks are in use at any time. (If
-    items were drawn at random from a full buffer, some items of almost every block would stay behind.)
-
-    Args:
-        runs: the first item, the length and the block of runs of items; blocks enter the buffer in random order.
-        size: number of items in the blocks in use, about twice as many as wait.
-    """
-    _, lengths, blocks = runs
-    count = len(np.unique(blocks))
-    span = size * count / int(lengths.sum())
-    # before that block, nothing leaves: also the first items are of many blocks
-    first = min(int(span), count - 1)
-    waiting, due, ready = np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64)
-    for now, block in enumerate(_blocks(*runs, random)):
-        low, high = max(now, first), min(now + span, count)
-        waiting = np.concatenate([waiting, block])
-        due = np.concatenate([due, low + max(0.0, high - low) * random.random(len(block))])
-        over = due < now + 1  # items of later blocks are due later
-        ready = np.concatenate([ready, waiting[over][np.argsort(due[over])]])
-        waiting, due = waiting[~over], due[~over]
-        full = len(ready) - len(ready) % batch_size
-        yield from ready[:full].reshape(-1, batch_size)
-        ready = ready[full:]
-    ready = np.concatenate([ready, waiting[np.argsort(due)]])
-    for first in range(0, len(ready), batch_size):
-        yield ready[first : first + batch_size]
-
-
-def _blocks(firsts: Array, lengths: Array, blocks: Array, random: np.random.Generator) -> Iterator[Array]:
-    """The items of one block after the other."""
-    order = np.argsort(blocks, kind="stable")
-    cuts = np.flatnonzero(np.diff(blocks[order], prepend=-1, append=-1))
-    for block in random.permutation(len(cuts) - 1).tolist():
-        chosen = order[cuts[block] : cuts[block + 1]]
-        steps = lengths[chosen]
-        within = np.arange(steps.sum()) - np.repeat(np.cumsum(steps) - steps, steps)
-        yield np.repeat(firsts[chosen], steps) + within
-
-
 def seeded(seed: int, stream: int, number: int) -> np.random.Generator:
     """A random generator for one number of a stream; each has another."""
     return np.random.Generator(np.random.Philox(key=seed, counter=[0, 0, stream, number]))
-
-
-def _digest(runs: tuple[Array, Array, Array]) -> str:
-    """A digest (SHA-256, hex) of the items in each block."""
-    return hashlib.sha256(b"".join(part.tobytes() for part in runs)).hexdigest()
 
 
 def checked_seed(seed: object) -> int:
@@ -231,7 +181,7 @@ def check_state(state: Mapping[str, Any], own: Mapping[str, Any]) -> None:
             "expected the state of a shuffle of these blocks, found that of others: the recordings were written "
             "anew, loaded or saved as columns; read them in the same way, or take shuffle='exact'"
         )
-    for key in ("kind", "batch_size", "buffer"):
+    for key in ("kind", "batch_size", "mix"):
         if state.get(key) != own.get(key):
             raise SamplingError(f"expected a state with {key} {own.get(key)!r}, found {state.get(key)!r:.80}")
     if not own.keys() <= state.keys():

@@ -133,14 +133,6 @@ class RecordedSteps:
             rows.hold(())
         self._share_budget()
 
-    @property
-    def room(self) -> int:
-        """The number of steps in the chunks that fit into half the cache."""
-        stored = sum(int(store.table["uncompressed"].sum()) for store in self._index.stores)
-        # images may be stored smaller than they are
-        images = sum(leaf.size for leaf in self.layout.images) if self.layout else 0
-        return int(self.cache_bytes / 2 / max(1, stored / max(1, len(self)), images))
-
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         n = len(self)
         if len(rows) and (rows.min() < 0 or rows.max() >= n):

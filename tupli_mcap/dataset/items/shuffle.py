@@ -1,4 +1,4 @@
-"""The order of an epoch: shuffled, but items that are near each other on the disk stay near each other.
+"""A shuffled order of an epoch in which items that are near each other on the disk stay near each other.
 
 The blocks (chunks) of the items are shuffled and laid out as one sequence. Each rank has a part of it, and each
 stream of a rank a part of that. Within a stream, the items of `mix` blocks at a time are shuffled. Batch b of a rank
@@ -12,12 +12,18 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items import Items
+
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.items.items import Items
+
+__all__ = ["Blocks", "Part", "ShuffledBatches", "mixing"]
+
+_CHUNK_BYTES = 256 << 10  # assumed if the size of chunks is not known
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,7 @@ class Blocks:
         return found
 
 
-def blocks_of(items: Items[Any], least: int) -> Blocks:
+def _blocks_of(items: Items[Any], least: int) -> Blocks:
     """The blocks of items, and neighbours joined as long as there are fewer than `least` items in them together."""
     begins, lengths, kind = items.block_runs()
     stops = begins + lengths
@@ -68,6 +74,20 @@ def blocks_of(items: Items[Any], least: int) -> Blocks:
     return Blocks(begins, stops, np.append(firsts[kept], len(begins)))
 
 
+def mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
+    """The number of blocks that are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit
+    into half of the cache, and are large enough that few items extend into the next block, which would be read
+    twice."""
+    chunk_bytes = getattr(items.source, "block_bytes", 0) or _CHUNK_BYTES
+    chunks = max(2, cache_bytes // 2 // chunk_bytes)
+    single = _blocks_of(items, 1)
+    items_of_chunk = len(items) / len(single)
+    steps = getattr(items, "length", 1) + getattr(items, "history", 0)  # of an item, where it has many
+    least = int(min(2 * steps, chunks * items_of_chunk / 4))
+    blocks = _blocks_of(items, least) if least > items_of_chunk else single
+    return max(2, chunks * len(blocks) // len(single)), blocks
+
+
 class Part(NamedTuple):
     """A part of the batches: those of one of `ranks`, in `streams` streams."""
 
@@ -76,7 +96,7 @@ class Part(NamedTuple):
     streams: int
 
 
-class Batches:
+class ShuffledBatches:
     """The batches of one rank in one epoch: batch b is an array of numbers of items (int64).
 
     Args:
