@@ -23,13 +23,16 @@ from tupli_mcap import (
     Recording,
     RecordingError,
     SpaceError,
-    filter_recording,
     merge_recordings,
+    open as open_dataset,
     split_recording,
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.dataset import DatasetError
+from tupli_mcap.dataset.curate import filter_dataset
 from tupli_mcap.mcap.source import PathSource
+from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -525,7 +528,9 @@ class TestFilter:
     @pytest.mark.parametrize("kind", SPACES)
     def test_what_it_is_true_of_comes_along(self, tmp_path: Path, kind: str) -> None:
         path = record(tmp_path / "run.mcap", kind, frames=2)
-        report = filter_recording(path, tmp_path / "some.mcap", "metadata.score < 20 and n_tuples > 2")
+        report = filter_dataset(
+            open_dataset(path), tmp_path / "some.mcap", "metadata.score < 20 and n_tuples > 2"
+        )
         assert_sound(report.path)
         with Recording(path) as recording, Recording(report.path) as kept:
             numbers = [e.number for e in recording.episodes if e.metadata["score"] < 20 and len(e) > 2]
@@ -541,11 +546,11 @@ class TestFilter:
             last = recording.episodes[-1].metadata["score"]
             steps = recording._topics["/step"]
             channels = recording._contents.table["channel"].tolist()
-        report = filter_recording(
-            path, tmp_path / "some.mcap", F("metadata.score") < last, compression=compression
-        )
-        assert_sound(report.path)
-        there = set(chunks_of(report.path))
+            numbers = [e.number for e in recording.episodes if e.metadata["score"] < last]
+            target = tmp_path / "some.mcap"
+            rewrite_recording(recording, target, episodes=numbers, compression=compression)
+        assert_sound(target)
+        there = set(chunks_of(target))
         mine = [
             chunk in there
             for chunk, channel in zip(chunks_of(path), channels, strict=True)
@@ -563,20 +568,23 @@ class TestFilter:
         data[int(row["offset"]) + int(row["length"]) // 2] ^= 1
         path.write_bytes(data)
         with pytest.raises(RecordingError.__base__ or Exception, match="damaged|does not fit|cannot be"):
-            filter_recording(path, tmp_path / "some.mcap", "n_tuples > 0")
+            filter_dataset(open_dataset(path), tmp_path / "some.mcap", "n_tuples > 0")
         assert not (tmp_path / "some.mcap").exists()
 
     def test_errors(self, tmp_path: Path) -> None:
         path, other = record(tmp_path / "run.mcap"), record(tmp_path / "other.mcap")
-        with pytest.raises(RecordingError, match=r"has no episode that matches .*n_tuples"):
-            filter_recording(path, tmp_path / "no.mcap", F("n_tuples") > 99)
+        with pytest.raises(RecordingError, match=r"expected an episode that matches .*n_tuples"):
+            filter_dataset(open_dataset(path), tmp_path / "no.mcap", F("n_tuples") > 99)
         with pytest.raises(FilterError, match="colour"):
-            filter_recording(path, tmp_path / "no.mcap", "colour = 3")
-        with pytest.raises(RecordingError, match="is the recording itself"):
-            filter_recording(path, path, "n_tuples > 1", overwrite=True)
-        with pytest.raises(RecordingError, match="exists; choose another path"):
-            filter_recording(path, other, "n_tuples > 1")
-        assert filter_recording(path, other, "n_tuples > 1", overwrite=True).size == other.stat().st_size
+            filter_dataset(open_dataset(path), tmp_path / "no.mcap", "colour = 3")
+        with pytest.raises(DatasetError, match="is one of the recordings themselves"):
+            filter_dataset(open_dataset(path), path, "n_tuples > 1", overwrite=True)
+        with pytest.raises(DatasetError, match="exists; choose another path"):
+            filter_dataset(open_dataset(path), other, "n_tuples > 1")
+        assert (
+            filter_dataset(open_dataset(path), other, "n_tuples > 1", overwrite=True).size
+            == other.stat().st_size
+        )
 
 
 def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

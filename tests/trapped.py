@@ -198,7 +198,7 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     yield "split", lambda: tupli_mcap.split_recording(path, work / f"{name}_parts" / "a.mcap", episodes=1)
     yield (
         "filter",
-        lambda: tupli_mcap.filter_recording(path, work / f"some_{name}", "n_tuples > 0", overwrite=True),
+        lambda: tupli_mcap.open(path).filter("n_tuples > 0").save(work / f"some_{name}", overwrite=True),
     )
     yield "import", lambda: _import(path, work / "lab")
     yield "view", lambda: viewer.save(path, work / f"{name}.rrd", overwrite=True)

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset import (
         Dataset as Dataset,
         TupliDataset as TupliDataset,
-        filter_recording as filter_recording,
         merge_recordings as merge_recordings,
         open as open,
         restore_episodes as restore_episodes,
@@ -87,7 +86,7 @@ if TYPE_CHECKING:
 # The module of each public name, imported on first use, so that `import tupli_mcap` is quick.
 _HOMES = {
     "benchmark": "TupliEnvWrapper",
-    "dataset": "Dataset TupliDataset filter_recording merge_recordings open restore_episodes split_recording",
+    "dataset": "Dataset TupliDataset merge_recordings open restore_episodes split_recording",
     "errors": (
         "FilterError FormatError MissingExtraError NotFoundError RecordingError SignatureError "
         "SpaceError StepError StorageError TupliError UntrustedError"

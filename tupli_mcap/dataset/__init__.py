@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     )
     from tupli_mcap.dataset.columns.saved import SavedColumns, open_columns
     from tupli_mcap.dataset.curate import (
-        FilterReport,
-        filter_recording,
         merge_recordings,
         restore_episodes,
         split_recording,
@@ -43,7 +41,7 @@ __getattr__ = imported_on_use(
     {
         "columns.convert": "BaseTupleParser NumpyTupleParser TensorflowTupleParser TorchTupleParser",
         "columns.saved": "SavedColumns open_columns",
-        "curate": "FilterReport filter_recording merge_recordings restore_episodes split_recording",
+        "curate": "merge_recordings restore_episodes split_recording",
         "dataset": "Dataset",
         "opening": "open",
         "sources": "DatasetError",
@@ -55,13 +53,11 @@ __all__ = [
     "BaseTupleParser",
     "Dataset",
     "DatasetError",
-    "FilterReport",
     "NumpyTupleParser",
     "SavedColumns",
     "TensorflowTupleParser",
     "TorchTupleParser",
     "TupliDataset",
-    "filter_recording",
     "merge_recordings",
     "open",
     "open_columns",

@@ -15,7 +15,6 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
-    Recording,
     rewrite_recording,
     say_made_of,
     trim_recording,
@@ -37,7 +36,6 @@ __all__ = [
     "delete",
     "file_path",
     "filter_dataset",
-    "filter_recording",
     "merge_recordings",
     "relabel",
     "restore_episodes",
@@ -49,55 +47,13 @@ __all__ = [
 
 
 class FilterReport(NamedTuple):
-    """The result of filtering a recording, or of a dry run; `size` of the file in bytes, 0 if none was written."""
+    """The result of filtering a dataset, or of a dry run; `size` of the file in bytes, 0 if none was written."""
 
     path: Path
     episodes: int
     steps: int
     left_out: int
     size: int = 0
-
-
-def filter_recording(
-    source: str | os.PathLike[str],
-    target: str | os.PathLike[str],
-    filter: BaseFilter | str,
-    *,
-    compression: str = "zstd",
-    overwrite: bool = False,
-    dry_run: bool = False,
-) -> FilterReport:
-    """Writes the episodes that match a filter (or its text, such as "metadata.score > 3") to `target`.
-
-    They keep their ids and everything that belongs to them; a signature is left out.
-
-    Raises:
-        FilterError: the filter names a key that episodes do not have.
-        RecordingError: no episode matches; the target exists (without `overwrite`) or cannot be written.
-        FormatError: the source is damaged.
-    """
-    target = Path(target)
-    wanted = parse_filter(filter) if isinstance(filter, str) else filter
-    with Recording(source) as recording:
-        if target.exists():
-            if recording.path is not None and target.samefile(recording.path):
-                raise RecordingError(f"{target} is the recording itself; write to another path")
-            if not overwrite:
-                raise RecordingError(
-                    f"{target} exists; choose another path, or pass overwrite=True (--force)"
-                )
-        positions = candidates(recording, wanted)
-        if not len(positions):
-            raise RecordingError(f"{recording.name} has no episode that matches {wanted}")
-        rows = recording.index[positions]
-        steps, left_out = int(rows["length"].sum()), len(recording) - len(rows)
-        report = FilterReport(target, len(rows), steps, left_out)
-        if dry_run:
-            return report
-        said = say_made_of([recording], "filter", query=str(wanted))
-        numbers = rows["episode"].tolist()
-        rewrite_recording(recording, target, episodes=numbers, attachments=said, compression=compression)
-    return report._replace(size=target.stat().st_size)
 
 
 def merge_recordings(
