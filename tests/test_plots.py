@@ -39,12 +39,12 @@ from tupli_mcap.cli import app
 from tupli_mcap.cli.info import PLAIN, sparkline
 from tupli_mcap.errors import install_line
 from tupli_mcap.plots import Measured, Report, report
-from tupli_mcap.plots.draw_trace import by_scale
 from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
 from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
 from tupli_mcap.recording import edit_run
+from tupli_mcap.recording.description import by_scale
 from tupli_mcap.recording.series import sketch
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -263,9 +263,8 @@ def test_numbers_on_an_axis_stand_apart(tmp_path: Path) -> None:
 
 
 def test_lines_of_one_axis_have_about_one_size() -> None:
-    table = np.array([[1.0, 1000, 2, 900, 0, np.nan]])
-    assert by_scale(table) == [[0, 2, 4, 5], [1, 3]]
-    assert [len(group) for group in by_scale(np.ones((2, 8)))] == [6, 2]
+    assert by_scale([1.0, 1000, 2, 900, 0, 0], 8, 6) == [[0, 2, 4, 5], [1, 3]]
+    assert [len(group) for group in by_scale([1.0] * 8, 8, 6)] == [6, 2]
 
 
 def test_an_episode_step_by_step(cartpole: Path) -> None:

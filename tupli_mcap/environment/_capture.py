@@ -25,8 +25,6 @@ from tupli_mcap.environment._pickling import InProcessCopy, dump
 from tupli_mcap.environment._record import EnvironmentRecord, canonical_json
 from tupli_mcap.errors import TupliError, brief
 
-# Python 3.11 and 3.12 store attributes without a dict until code reads `__dict__`; from then on they are slower.
-_HAS_LAZY_DICTS = (3, 11) <= sys.version_info < (3, 13)
 _ID_IN_TEXT = re.compile(r"<\w+<([^<>]+)>>+$")  # as Gymnasium writes an environment: <Wrapper<Class<id>>>
 _OF_MAKE_VEC = ("num_envs", "vectorization_mode", "vector_kwargs", "wrappers")  # among a spec's arguments
 
@@ -124,7 +122,6 @@ class Snapshot:
                 self._copy = InProcessCopy(env)
             except Exception as err:  # noqa: BLE001 - any class may fail to pickle in its own way
                 self._failure = err
-        _renew_attributes(env)
 
     def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
         """The environment as data, see `capture`.
@@ -261,15 +258,6 @@ def _layers(env: Any) -> Iterator[Any]:
         if not isinstance(env, gym.Wrapper | gym.vector.VectorWrapper):
             return
         env = env.env
-
-
-def _renew_attributes(env: gym.Env[Any, Any]) -> None:
-    """Replaces the attributes' dict by an equal one, which makes attributes fast again after `__dict__` was read."""
-    if not _HAS_LAZY_DICTS:
-        return
-    for layer in _layers(env):
-        with contextlib.suppress(AttributeError, TypeError):
-            layer.__dict__ = dict(layer.__dict__)
 
 
 def _class_name(env: Any) -> str:

@@ -13,6 +13,7 @@ from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured, Trace
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
+from tupli_mcap.recording.description import by_scale
 from tupli_mcap.spaces.labels import short_path
 
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel
@@ -99,7 +100,8 @@ def _add_values(add: Callable[..., None], trace: Trace, leaves: Sequence[LeafVal
         add(partial(_draw_table, trace, numbers, True), _TABLE_HEIGHT)
     else:
         for leaf in numbers:
-            for chosen in by_scale(trace.values[leaf.leaf.name]):
+            sizes = np.abs(np.nan_to_num(trace.values[leaf.leaf.name])).max(axis=0, initial=0).tolist()
+            for chosen in by_scale(sizes, _SAME_SCALE, _LINES):
                 add(partial(_draw_lines, trace, leaf, chosen, steps))
     for leaf in leaves:
         if len(leaf.counts) > _CHOICES:
@@ -107,20 +109,6 @@ def _add_values(add: Callable[..., None], trace: Trace, leaves: Sequence[LeafVal
         else:
             for i in range(len(leaf.counts)):
                 add(partial(_draw_choice, trace, leaf, i))
-
-
-def by_scale(values: Array) -> list[list[int]]:
-    """Groups of the columns of a table (points, n), each for one axis: a few columns with values of a similar size."""
-    sizes = np.abs(np.nan_to_num(values)).max(axis=0, initial=0)
-    groups: list[list[int]] = []
-    largest = 0.0
-    for i in np.argsort(-sizes, kind="stable").tolist():
-        if groups and len(groups[-1]) < _LINES and (sizes[i] * _SAME_SCALE >= largest or sizes[i] == 0):
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-            largest = float(sizes[i])
-    return sorted(sorted(group) for group in groups)
 
 
 def _plot(trace: Trace, title: str, values: Array, steps: bool, axes: Any, **options: Any) -> None:

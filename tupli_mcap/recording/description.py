@@ -306,6 +306,21 @@ def spread_of(values: np.ndarray[Any, Any]) -> Spread | None:
     return Spread(mean, std, least, most, int(none.sum()))
 
 
+def by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]]:
+    """Groups of dimensions that may share an axis: within `ratio` of the largest, at most `most` together.
+
+    Dimensions that are always zero go with the smallest others. Groups and dimensions keep their order.
+    """
+    groups: list[list[int]] = []
+    for i in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
+        largest = sizes[groups[-1][0]] if groups else 0.0
+        if groups and len(groups[-1]) < most and (sizes[i] == 0 or sizes[i] * ratio >= largest):
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return sorted(sorted(group) for group in groups)
+
+
 def nan_text(count: int, episodes: int) -> str:
     """Says for people how many of the episodes have NaN; empty if none has."""
     if not count:

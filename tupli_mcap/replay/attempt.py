@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.replay.compare import Checker, Tally
 from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, recorded_actions
-from tupli_mcap.replay.recorded_values import Block, RecordedValues
+from tupli_mcap.replay.recorded_values import RecordedValues
 from tupli_mcap.replay.starts import EpisodePlan
 
 Watch = Callable[[int], None]
@@ -34,26 +33,6 @@ class Attempt(NamedTuple):
         return self.tally.first is None and self.error is None
 
 
-class _Actions:
-    """The recorded actions, one after another, of the blocks that are bound one after another."""
-
-    def __init__(self, recording: Recording, *, plain: bool) -> None:
-        self._recording = recording
-        self._plain = plain
-        self._get: Any = None
-        self._block: Block | None = None
-
-    def bind(self, block: Block) -> None:
-        self._block = block
-        self._get = recorded_actions(self._recording, block.columns.actions, plain=self._plain)
-
-    def __iter__(self) -> Iterator[Any]:
-        step = 0
-        while self._block is not None:
-            yield self._get(step - self._block.start)
-            step += 1
-
-
 def attempt(
     recording: Recording,
     replayer: Replayer,
@@ -65,20 +44,18 @@ def attempt(
     """Runs an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
     first difference."""
     tally = Tally()
-    actions = _Actions(recording, plain=replayer.plain)
-    moments = replayer.moments(plan, actions)
     try:
-        moment = next(moments)
+        moment = replayer.start(plan)
         for block in values:
             checker.bind(block.columns, block.start)
-            actions.bind(block)
+            action_of = recorded_actions(recording, block.columns.actions, plain=replayer.plain)
             for step in range(block.start, block.stop):
                 checker.state(step, moment.state, tally)
                 if watch is not None:
                     if tally.first is not None:
                         return Attempt(tally)
                     watch(step)
-                moment = next(moments)
+                moment = replayer.step(step, action_of(step - block.start))
                 if not checker.result(step, moment, tally) and step + 1 < values.length:
                     tally.ended = step  # the environment ended the episode: no later step can be compared
                     return Attempt(tally)
@@ -103,13 +80,12 @@ def repeats_itself(
 def _prints(
     recording: Recording, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
 ) -> Iterator[bytes]:
-    actions = _Actions(recording, plain=replayer.plain)
-    moments = replayer.moments(plan, actions)
     try:
-        yield _print(recording.layout, next(moments))
+        yield _print(recording.layout, replayer.start(plan))
         for block in values:
-            actions.bind(block)
-            for moment in islice(moments, min(block.stop, _SAMPLE) - block.start):
+            action_of = recorded_actions(recording, block.columns.actions, plain=replayer.plain)
+            for step in range(block.start, min(block.stop, _SAMPLE)):
+                moment = replayer.step(step, action_of(step - block.start))
                 yield _print(recording.layout, moment)
                 if moment.terminal or moment.timeout:
                     return

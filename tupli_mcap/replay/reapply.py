@@ -1,12 +1,12 @@
 """Runs an episode again: resets the environment with the recorded seed and options, and steps it with the actions.
 
-It yields what the environment returns; other modules compare and render.
+It returns what the environment returns; other modules compare and render.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -79,26 +79,27 @@ class Replayer:
             self._used = False
         return self._env
 
-    def moments(self, plan: EpisodePlan, actions: Iterable[Any]) -> Iterator[Moment]:
-        """The moment of the reset, then one for each action. It continues after an end, as a recorded episode may.
+    def step(self, number: int, action: Any) -> Moment:
+        """Takes step `number` of the episode. It goes on after an end, as a recorded episode may.
+
+        Raises:
+            EnvironmentFailedError: the environment raised.
+        """
+        try:
+            moment = Moment(*self.env.step(action))
+        except (Exception, SystemExit) as err:
+            raise EnvironmentFailedError(number, err) from err
+        self._last, self._last_action = moment, action
+        return moment
+
+    def start(self, plan: EpisodePlan) -> Moment:
+        """Starts an episode.
 
         Raises:
             EnvironmentFailedError: the environment raised.
         """
         if plan.how == "drawn" and self.used:
             self.close()  # an environment draws its own seed only in its first reset, so a new one began here
-        moment = self._start(plan)
-        yield moment
-        step = self.env.step
-        for i, action in enumerate(actions):
-            try:
-                moment = Moment(*step(action))
-            except (Exception, SystemExit) as err:
-                raise EnvironmentFailedError(i, err) from err
-            self._last, self._last_action = moment, action
-            yield moment
-
-    def _start(self, plan: EpisodePlan) -> Moment:
         if plan.how == "continues" and self._last is not None:
             return Moment(self._last.state)
         env = self.env

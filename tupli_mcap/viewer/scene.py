@@ -13,6 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes
+from tupli_mcap.recording.description import by_scale
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names, entity_of, escaped, title_of
@@ -207,7 +208,7 @@ def _distinct(labels: Sequence[str]) -> list[str]:
 
 def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Panel]:
     names = dimension_names(leaf, material.labels.dimensions.get(leaf.path))
-    groups = _by_scale(_magnitudes(material.values(leaf, column)), _RATIO, most)
+    groups = by_scale(_magnitudes(material.values(leaf, column)), _RATIO, most)
     stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
     panels: list[Panel] = []
     for dims in groups:
@@ -227,21 +228,6 @@ def _magnitudes(values: Array) -> list[float]:
         finite = np.abs(column[np.isfinite(column)])
         found.append(float(np.percentile(finite, 95)) if len(finite) else 0.0)
     return found
-
-
-def _by_scale(sizes: Sequence[float], ratio: float, most: int) -> list[list[int]]:
-    """Groups of dimensions that may share an axis: within `ratio` of the largest, at most `most` together.
-
-    Dimensions that are always zero go with the smallest others. Groups and dimensions keep their order.
-    """
-    groups: list[list[int]] = []
-    for i in sorted(range(len(sizes)), key=lambda i: -sizes[i]):
-        largest = sizes[groups[-1][0]] if groups else 0.0
-        if groups and len(groups[-1]) < most and (sizes[i] == 0 or sizes[i] * ratio >= largest):
-            groups[-1].append(i)
-        else:
-            groups.append([i])
-    return sorted(sorted(group) for group in groups)
 
 
 def _some(names: Sequence[str]) -> str:

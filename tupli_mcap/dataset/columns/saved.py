@@ -30,6 +30,7 @@ from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["SavedColumns", "open_columns", "save_columns"]
 
@@ -211,8 +212,10 @@ class SavedColumns(RandomAccess):
                 if isinstance(header.get("run"), int):
                     header["run"] = runs[header["run"]]
             return [EpisodeHeader.model_validate(header) for header in found]
-        except (FormatError, ValidationError, IndexError, AttributeError) as err:
-            raise _defect(self._directory / _MANIFEST, "headers of episodes", _first_line(err)) from err
+        except ValidationError as err:
+            raise _defect(self._directory / _MANIFEST, "headers of episodes", first_defect(err)) from err
+        except (FormatError, IndexError, AttributeError) as err:
+            raise _defect(self._directory / _MANIFEST, "headers of episodes", str(err)) from err
 
     def _values_now(self) -> Callable[[F | BaseFilter], Array]:
         return self.episode_values  # the headers are read only when values are needed
@@ -324,7 +327,7 @@ def _read_manifest(path: Path) -> _Manifest:
     try:
         return _Manifest.model_validate_json(path.read_bytes())
     except ValidationError as err:
-        raise _defect(path, "a manifest of columns, version 1", _first_line(err)) from err
+        raise _defect(path, "a manifest of columns, version 1", first_defect(err)) from err
 
 
 def _mapped(path: Path, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
@@ -367,10 +370,3 @@ def _opened_again(directory: Path, identity: str) -> Steps:
 
 def _defect(path: Path, expected: str, found: str) -> FormatError:
     return FormatError(f"{path}: expected {expected}, found {found:.200}; save the columns anew")
-
-
-def _first_line(err: Exception) -> str:
-    if isinstance(err, ValidationError):
-        first = err.errors(include_url=False, include_input=False)[0]
-        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    return str(err)
