@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import io
 import re
 import shutil
 import signal
@@ -22,6 +23,7 @@ from pages import EVIL, browsing, carts, robot, serving_app
 import tupli_mcap
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page.app import create_app
+from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
 from tupli_mcap.schema import EpisodeHeader
@@ -286,6 +288,23 @@ class TestChosen:
             assert [episode.id for episode in recording] == [best[0]["id"]]
         assert web.get("/download", params={"filter": "steps > 100000"}).status_code == 404
         assert web.get("/download", params={"filter": "steps >"}).status_code == 400
+
+    def test_those_of_too_many_recordings_are_not_downloaded(self, tmp_path: Path) -> None:
+        """All would be open at the same time, and a process may open so many files."""
+        box = gym.spaces.Box(-1, 1, (1,))
+        for number in range(MOST_MERGED + 1):
+            path = tmp_path / f"{number:03}.mcap"
+            with tupli_mcap.EpisodeWriter(path, box, gym.spaces.Discrete(2)) as writer:
+                writer.begin()
+                writer.step(np.zeros(1, np.float32), 0, reward=1.0, terminal=True)
+                writer.end(np.zeros(1, np.float32))
+        with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+            refused = client.get("/download")
+            assert refused.status_code == 400
+            assert "at most 256 recordings, found 257; choose fewer" in refused.text
+            few = client.get("/download", params={"filter": "recording != '256.mcap'"})
+            with tupli_mcap.Recording(io.BytesIO(few.content)) as recording:
+                assert len(recording) == MOST_MERGED
 
     def test_python_loads_them(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         for address in (

@@ -18,13 +18,24 @@ from starlette.types import Receive, Scope, Send
 
 from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.page.shelf import Shelf, opened
-from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["MOST_COMPARED", "film_file", "in_pieces", "recording_of", "replay_file", "sent", "streamed"]
+__all__ = [
+    "MOST_COMPARED",
+    "MOST_MERGED",
+    "film_file",
+    "in_pieces",
+    "recording_of",
+    "replay_file",
+    "sent",
+    "streamed",
+]
 
 MOST_COMPARED = 8
+MOST_MERGED = 256
+"""Most recordings of an answer: all of them are open at the same time."""
 _MEDIA = "application/octet-stream"
 
 
@@ -34,10 +45,16 @@ def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingRes
     Raises:
         SpaceError, RecordingError: the episodes cannot be merged into one recording.
     """
+    numbers_of: dict[str, list[int]] = {}
+    for header in headers:
+        numbers_of.setdefault(header.recording, []).append(header.episode)
+    if len(numbers_of) > MOST_MERGED:
+        raise UnmergeableError(
+            f"expected episodes of at most {MOST_MERGED} recordings, found {len(numbers_of)}; choose fewer"
+        )
     excerpts = []
-    for name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        recording = shelf.open(name)
-        numbers = [header.episode for header in group]
+    for name, numbers in numbers_of.items():
+        recording = shelf.open(name, of=len(numbers_of))
         excerpts.append(Excerpt(recording, recording.index[np.isin(recording.index["episode"], numbers)]))
     return streamed(contextlib.nullcontext(excerpts))
 

@@ -20,12 +20,11 @@ from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.entries import entry_of, put_entry
 from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 
-__all__ = ["CACHE_BYTES", "DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
+__all__ = ["DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
 
 T = TypeVar("T")
 _MOST_OPEN = 16
-CACHE_BYTES = 64 << 20
-"""The cache of each open recording (bytes)."""
+_CACHE_BYTES = 64 << 20  # of each open recording
 
 
 def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
@@ -48,16 +47,19 @@ class OpenedRecordings:
         self._kept: OrderedDict[Hashable, Recording] = OrderedDict()
         self._turn = threading.Lock()
 
-    def get(self, key: Hashable, opening: Callable[[], Recording]) -> Recording:
+    def get(self, key: Hashable, opening: Callable[[int], Recording], of: int = 1) -> Recording:
         """The open recording of a key, which names one version of a file; None for a file that is being written.
 
+        opening: opens it with a cache of so many bytes. of: how many are opened for one answer; several are not kept.
         A recording that was dropped here is closed once no caller holds it.
         """
+        if of > 1:
+            return opening(_CACHE_BYTES // of)
         with self._turn:
             if key is not None and key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        opened = opening()
+        opened = opening(_CACHE_BYTES)
         if key is not None and opened.complete:
             with self._turn:
                 self._kept[key] = opened
@@ -106,8 +108,8 @@ class DirectoryShelf(_OpenToAll):
     def ask(self, question: Callable[[Connection], T]) -> T:
         return self._storage.ask(question)
 
-    def open(self, recording: str) -> Recording:
-        return _opened(self._opened, self._storage.root, recording, self.path_of(recording))
+    def open(self, recording: str, *, of: int = 1) -> Recording:
+        return _opened(self._opened, self._storage.root, recording, self.path_of(recording), of)
 
     def path_of(self, recording: str) -> Path:
         return self._storage.recording_path(recording)
@@ -151,8 +153,8 @@ class FileShelf(_OpenToAll):
             put_entry(self._catalog, name, entry)
         self._known = None if entry.live else entry.stamp
 
-    def open(self, recording: str) -> Recording:
-        return _opened(self._opened, self._path.parent, recording, self.path_of(recording))
+    def open(self, recording: str, *, of: int = 1) -> Recording:
+        return _opened(self._opened, self._path.parent, recording, self.path_of(recording), of)
 
     def path_of(self, recording: str) -> Path:
         if recording != self._path.name:
@@ -165,10 +167,10 @@ class FileShelf(_OpenToAll):
         return []
 
 
-def _opened(kept: OpenedRecordings, root: Path, relative: str, path: Path) -> Recording:
+def _opened(kept: OpenedRecordings, root: Path, relative: str, path: Path, of: int) -> Recording:
     stamp = _stamp(root, relative)
     key = None if stamp is None else (relative, stamp)
-    return kept.get(key, lambda: Recording(path, cache_bytes=CACHE_BYTES))
+    return kept.get(key, lambda size: Recording(path, cache_bytes=size), of)
 
 
 def _stamp(root: Path, relative: str) -> RecordingStamp | None:

@@ -53,8 +53,10 @@ class Shelf(Protocol):
         """The condition on EPISODE for the episodes that the reader may see."""
         ...
 
-    def open(self, recording: str) -> Recording:
+    def open(self, recording: str, *, of: int = 1) -> Recording:
         """An open recording of the catalog. Others use it at the same time: do not close it.
+
+        of: how many recordings the caller opens for one answer; they share the memory of one cache.
 
         Raises:
             NotFoundError: there is no such recording.

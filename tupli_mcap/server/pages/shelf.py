@@ -11,7 +11,7 @@ from sqlalchemy import ColumnElement, Connection, select
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.datasets import of_recording
-from tupli_mcap.page.directory import CACHE_BYTES, OpenedRecordings
+from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.page.shelf import seen_episodes
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
@@ -61,12 +61,13 @@ class LibraryShelf:
     def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
         return readable_episodes(connection, self._caller)
 
-    def open(self, recording: str) -> Recording:
+    def open(self, recording: str, *, of: int = 1) -> Recording:
         """The recording; if the caller may read only some of its episodes, a recording of these."""
         place, numbers = self._readable(recording)
         if numbers is None:
-            return self._kept.get((place, None), lambda: self._opened(place, recording))
-        return self._kept.get((place, numbers), lambda: self._cut(Selected(recording, place, numbers)))
+            return self._kept.get((place, None), lambda size: self._opened(place, recording, size), of)
+        some = Selected(recording, place, numbers)
+        return self._kept.get((place, numbers), lambda size: self._cut(some, size), of)
 
     def _readable(self, recording: str) -> tuple[str, tuple[int, ...] | None]:
         """The place of a recording, and the episodes of it that the caller may read; None for all.
@@ -84,18 +85,18 @@ class LibraryShelf:
             raise NotFoundError(f"there is no recording {recording[:200]!r}")
         return unescape_text(found.place), None if len(seen) == found.episodes else seen
 
-    def _opened(self, place: str, name: str) -> Recording:
-        recording = Recording(self._library.blobs.place(place), cache_bytes=CACHE_BYTES)
+    def _opened(self, place: str, name: str, cache_bytes: int) -> Recording:
+        recording = Recording(self._library.blobs.place(place), cache_bytes=cache_bytes)
         recording.name = name  # for error messages, which must not reveal paths on the server
         return recording
 
-    def _cut(self, selected: Selected) -> Recording:
+    def _cut(self, selected: Selected, cache_bytes: int) -> Recording:
         """A recording of some episodes, in a temporary file that is deleted once it is open."""
         with tempfile.NamedTemporaryFile(prefix="tupli-mcap-", suffix=".mcap") as file:
             for piece in stream_excerpts(opened(self._library.blobs, [selected])):
                 file.write(piece)
             file.flush()
-            recording = Recording(file.name, cache_bytes=CACHE_BYTES)
+            recording = Recording(file.name, cache_bytes=cache_bytes)
         recording.name = selected.name
         return recording
 

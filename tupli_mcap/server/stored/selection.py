@@ -13,6 +13,7 @@ from pydantic import BaseModel, Field
 from sqlalchemy import Connection, select
 
 from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.merge import Excerpt
@@ -27,7 +28,6 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["EpisodeQuery", "Selected", "opened", "select_episodes"]
 
-_MOST: Final = 256  # most recordings of an answer: all of them are open at the same time
 _CACHE_BYTES: Final = 32 << 20  # cache of all recordings of an answer together
 
 
@@ -91,9 +91,9 @@ def select_episodes(
             numbers.setdefault(header.recording, []).append(header.episode)
     if not numbers:
         raise NotFoundError("there is no such episode")
-    if len(numbers) > _MOST:
+    if len(numbers) > MOST_MERGED:
         raise StorageError(
-            f"expected episodes of at most {_MOST} recordings, found {len(numbers)}; name some (`recordings`)"
+            f"expected episodes of at most {MOST_MERGED} recordings, found {len(numbers)}; name some (`recordings`)"
         )
     files = select(FILE.c.path, FILE.c.place).where(FILE.c.path.in_(map(escape_text, numbers)))
     places = {unescape_text(path): unescape_text(place) for path, place in connection.execute(files)}
