@@ -60,7 +60,7 @@ class Route(NamedTuple):
 def routes(url: str) -> list[Route]:
     """The routes that name an item."""
     found = []
-    document = httpx.get(f"{url}/openapi.json").json()
+    document = httpx.get(f"{url}/openapi.json", timeout=120).json()
     for path, item in document["paths"].items():
         for method, told in item.items():
             names = [each["name"] for each in told.get("parameters", ()) if each["name"].endswith("_id")]
