@@ -55,6 +55,14 @@ def test_of_transitions(dataset: tupli_mcap.Dataset) -> None:
     assert items[3].infos["step"] == 4
 
 
+def test_a_budget_is_that_of_the_recorded_steps(dataset: tupli_mcap.Dataset) -> None:
+    windows = dataset.windows(2, fields=["states", "infos"])
+    windows.source.limit(1000, 1)
+    recorded: Any = dataset.steps
+    assert (recorded.cache_bytes, recorded.threads) == (1000, 1)
+    assert windows[0].states.shape == (2, 1)
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is not installed")

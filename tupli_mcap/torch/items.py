@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from torch.utils.data import get_worker_info
 
@@ -14,13 +14,6 @@ from tupli_mcap.torch.packed import packed
 from tupli_mcap.torch.tensors import tensors
 
 WORKER_CACHE_BYTES = 64 << 20
-
-
-@runtime_checkable
-class Caching(Protocol):
-    """Steps that keep what they have read."""
-
-    def limit(self, cache_bytes: int, threads: int) -> None: ...
 
 
 class ReadItems:
@@ -40,8 +33,7 @@ class ReadItems:
             return found
         if self._limited_in != os.getpid():
             self._limited_in = os.getpid()
-            if isinstance(self.items.source, Caching):
-                self.items.source.limit(self._worker_cache_bytes, 1)
+            self.items.source.limit(self._worker_cache_bytes, 1)
         return packed(self.items[index].asdict())
 
 

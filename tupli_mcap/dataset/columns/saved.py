@@ -285,6 +285,9 @@ class SavedSteps:
     def blocks(self, rows: Array) -> Array:
         return rows // _BLOCK
 
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        """Does nothing: the system keeps mapped files as it has room."""
+
     def __reduce__(self) -> tuple[Callable[..., Steps], tuple[Path, str]]:
         return _opened_again, (self._directory, self.identity)
 

@@ -51,6 +51,9 @@ class StepsWith:
     def blocks(self, rows: Array) -> Array:
         return self._rest.blocks(rows)
 
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        self._rest.limit(cache_bytes, threads)
+
 
 class InfoValues:
     """Columns of infos by key, as `info_columns` makes them, all in memory."""

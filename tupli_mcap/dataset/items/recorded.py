@@ -126,7 +126,6 @@ class RecordedSteps:
         return int(sum(sizes)) // max(1, len(units.chunk_of))
 
     def limit(self, cache_bytes: int, threads: int) -> None:
-        """Empties the cache, and sets its budget and the number of threads."""
         self.cache_bytes, self.threads = cache_bytes, threads
         self._cache.clear()
         for rows in self._rows:

@@ -81,6 +81,10 @@ class Steps(Protocol):
         """The block of the storage of each of `rows`, int64; rows of one block are cheap to read together."""
         ...
 
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        """Empties what is kept of steps that were read, and sets its budget and the number of threads that read."""
+        ...
+
 
 class MemorySteps:
     """Steps with some columns in memory; the other fields are read from `rest`.
@@ -122,9 +126,7 @@ class MemorySteps:
         return rows // _BLOCK
 
     def limit(self, cache_bytes: int, threads: int) -> None:
-        """Sets another budget for the fields that are not in memory."""
-        if hasattr(self._rest, "limit"):
-            self._rest.limit(cache_bytes, threads)
+        self._rest.limit(cache_bytes, threads)
 
     def __reduce__(self) -> tuple[Callable[[Steps], Steps], tuple[Steps]]:
         return _same, (self._rest,)
