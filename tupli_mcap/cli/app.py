@@ -73,9 +73,8 @@ class _Group(TyperGroup):
             return super().make_context(*args, **extra)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if (
-            args and not args[0].startswith("-") and args[0] not in self.commands
-        ):  # Typer suggests hidden ones too
+        # Typer would suggest hidden ones, too.
+        if args and not args[0].startswith("-") and args[0] not in self.commands:
             ctx.fail(f"No such command {args[0]!r}{did_you_mean(args[0], _NAMES)}")
         return super().resolve_command(ctx, args)
 

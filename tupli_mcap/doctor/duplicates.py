@@ -28,11 +28,8 @@ class Digests(Statistic):
     """
 
     def __init__(self, measured: Measurements) -> None:
-        self.path, self.numbers, self.lengths = (
-            measured.path,
-            measured.rows["episode"].copy(),
-            measured.lengths,
-        )
+        self.path, self.lengths = measured.path, measured.lengths
+        self.numbers = measured.rows["episode"].copy()
         self.log_choices = _log_choices(measured.layout)
         self._arrays = [leaf.name for leaf in measured.layout.leaves if leaf.kind != "variable"]
         self._variable = measured.layout.variable

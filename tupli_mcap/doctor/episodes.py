@@ -107,10 +107,8 @@ def repeated_seed(measured: Measurements, *, least: int = 3, part: float = 0.5) 
     if count >= max(least, part * total):
         severity, advice = Severity.WARNING, "pass a seed to the first reset only, so that episodes differ"
     else:
-        severity, advice = (
-            Severity.INFO,
-            "put all episodes of a seed into the same set when you split the data",
-        )
+        severity = Severity.INFO
+        advice = "put all episodes of a seed into the same set when you split the data"
     places = measured.episodes(seeded & (measured.rows["seed"] == seed))
     yield measured.finding("repeated-seed", severity, message, advice, count, total, places)
 

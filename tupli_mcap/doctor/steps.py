@@ -160,11 +160,8 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
         if scale == 0 or not outliers:
             continue
         outliers.sort(key=lambda item: (-abs(item[0] - median), item[1]))
-        count, total, places = (
-            len(outliers),
-            rewards.sample.seen,
-            measured.places(place for _, place in outliers),
-        )
+        count, total = len(outliers), rewards.sample.seen
+        places = measured.places(place for _, place in outliers)
         message = (
             f"{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than {factor:g} times the usual "
             f"deviation ({scale:.3g}) from the median ({median:.3g}), {'among' if rewards.last else 'before'} the last "

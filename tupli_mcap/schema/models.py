@@ -199,9 +199,7 @@ def unchecked_header(values: dict[str, Any]) -> EpisodeHeader:
     Built without validation, and without `model_construct`: they would cost more than the rest of listing episodes.
     """
     made = _NEW(EpisodeHeader)
-    _SET(
-        made, "__pydantic_fields_set__", _HEADER_FIELDS
-    )  # shared by all headers: nothing is ever added to it
+    _SET(made, "__pydantic_fields_set__", _HEADER_FIELDS)  # one set for all: nothing is ever added to it
     _SET(made, "__pydantic_extra__", None)
     _SET(made, "__pydantic_private__", None)
     _SET(made, "__dict__", values)

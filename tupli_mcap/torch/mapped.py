@@ -15,10 +15,8 @@ from tupli_mcap.errors import did_you_mean
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import collate
 
-_OF_ITEMS: Final = {
-    True: ("stride", "pad", "history"),
-    False: ("n_step", "discount"),
-}  # of windows, of transitions
+# The further arguments of windows (True) and of transitions.
+_OF_ITEMS: Final = {True: ("stride", "pad", "history"), False: ("n_step", "discount")}
 _OF_LOADER: Final = ("length", "batch_size", "shuffle", "num_workers", "fields", "seed", "drop_last")
 
 

@@ -56,11 +56,8 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         worker_cache_bytes: int = WORKER_CACHE_BYTES,
     ) -> None:
         self._reader = ReadItems(items, worker_cache_bytes)
-        self._size, self._drop_last, self._seed = (
-            checked_count(batch_size, 1, "a batch size"),
-            drop_last,
-            seed,
-        )
+        self._size = checked_count(batch_size, 1, "a batch size")
+        self._drop_last, self._seed = drop_last, seed
         self._rank, self._ranks = _place(rank, ranks)
         self._streams = None if streams is None else checked_count(streams, 1, "a number of streams")
         if seed is not None:

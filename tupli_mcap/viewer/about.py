@@ -47,8 +47,8 @@ def send_about(
     stream.log("/card", document, static=True)
     import pyarrow as pa
 
-    for name, column in (("return", "return"), ("length", "length")):
-        values = np.concatenate([recording.index[column] for recording in recordings]).astype(np.float64)
+    for name in ("return", "length"):
+        values = np.concatenate([recording.index[name] for recording in recordings]).astype(np.float64)
         number = rr.TimeColumn("episode", sequence=np.arange(len(values)))
         stream.send_columns(
             f"/overview/{name}", [number], [column_of(rr.Scalars.descriptor_scalars(), pa.array(values))]

@@ -11,23 +11,12 @@ from tupli_mcap.viewer.scene import Scene
 _STACKED, _A_PAGE = 4, 12
 _WINDOW = 500  # rows that are shown of a running rollout
 _SHARE = 3.0  # the share of a usual panel in the height of its column
-_LANES, _LANE, _MOST_LANES = (
-    1.2,
-    0.8,
-    6.0,
-)  # the share of a panel of lanes: without lanes, for each lane, at most
-_ABOVE, _ALONE, _BESIDE = (
-    8.0,
-    12.0,
-    6.0,
-)  # of all pictures: above plots of states, without them, in the other column
+# The share of a panel of lanes: without lanes, for each lane, at most.
+_LANES, _LANE, _MOST_LANES = 1.2, 0.8, 6.0
+# The share of all pictures: above plots of states, without them, in the other column.
+_ABOVE, _ALONE, _BESIDE = 8.0, 12.0, 6.0
 _CROWDED = 10.0  # above this sum of shares of plots, the column has no room for pictures
-_SHARES: dict[type, float] = {
-    Words: 2.0,
-    Infos: 2.0,
-    Grid: 4.0,
-    HeatMap: 6.0,
-}
+_SHARES: dict[type, float] = {Words: 2.0, Infos: 2.0, Grid: 4.0, HeatMap: 6.0}
 
 
 def blueprint_of(

@@ -20,9 +20,8 @@ Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
 _CHUNK: Final = 256 * 1024
 _TOGETHER: Final = 1 << 13  # steps that are written at once; a killed process loses their final states
-_MANY: Final = (
-    16  # up to this many streams, chunks are as large as those of one: they all have room in the journal
-)
+# Up to this many streams, chunks are as large as those of one: they all have room in the journal.
+_MANY: Final = 16
 _CHOOSE: Final = (
     'pass autoreset="next-step" if the step after an end is a reset, whose action was ignored, "same-step" if the step '
     'that ends an episode already resets, "disabled" if you have reset between the steps'

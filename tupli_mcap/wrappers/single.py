@@ -184,9 +184,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         except Exception:  # the environment may have taken no step
             work.state = DONE
             raise
-        except (
-            BaseException
-        ):  # Ctrl-C: wherever the environment is now, it is not where the last step has led to
+        except BaseException:  # Ctrl-C: the environment may have taken a part of the step
             self._recorder.refuse()
             work.state = DONE
             raise
@@ -252,9 +250,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             if self._stepped:
                 work.ask(self._reset_callback)
         except BaseException as err:
-            if work.is_whole_after(
-                err
-            ):  # the state of the environment is unknown: the running episode is over
+            # the state of the environment is unknown: the running episode is over
+            if work.is_whole_after(err):
                 work.state = BEGUN
                 self._recorder.forget_reset()
                 if self._frames is not None:

@@ -11,10 +11,8 @@ from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
 from tupli_mcap.spaces.leaves import Leaf
 
-_SIZES = (
-    "stack_size",
-    "num_stack",
-)  # attributes of FrameStackObservation, and of Gymnasium's older FrameStack
+# Attributes of FrameStackObservation, and of Gymnasium's older FrameStack.
+_SIZES = ("stack_size", "num_stack")
 
 
 def with_stacks(env: Any, spaces: StepLayout, stack_size: int | None = None) -> StepLayout:

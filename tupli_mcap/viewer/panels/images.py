@@ -179,9 +179,7 @@ class Camera:
         """Sends nothing: everything is sent with the frames."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        if (
-            self.name not in block.recording.cameras
-        ):  # another recording in the same view may have such a camera
+        if self.name not in block.recording.cameras:  # of another recording in the same view
             return
         for piece in block.pieces:
             frames = block.recording.frames(piece.position, self.name)
