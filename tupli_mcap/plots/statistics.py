@@ -15,6 +15,7 @@ from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
 
 LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float
+_TINY = 1e-300  # a part of a smaller value may be 0
 MAX_ELEMENTS = 256  # of a leaf that are looked at one by one; of larger leaves, so many evenly chosen ones
 _SMALLEST_PICTURE = 16  # pixels
 _RESAMPLES = 2000  # of a bootstrap
@@ -183,7 +184,7 @@ def bin_edges(values: Array, most: int) -> tuple[Array, int]:
     else:
         edges = np.linspace(low, high, bins + 1)
     if not (np.diff(edges) > 0).all():  # numbers that hardly differ, or do not
-        edges = low + max(1.0, abs(low)) * np.array([-0.5, 0.5])
+        edges = low + (abs(low) / 10 if abs(low) > _TINY else 1.0) * np.array([-0.5, 0.5])
     if len(edges) == 2:  # a bar in the middle, not a wall
-        edges = edges[0] + (edges[1] - edges[0]) * np.arange(-4.0, 6.0)
+        edges = edges[0] + (edges[1] - edges[0]) * np.arange(-1.0, 3.0)
     return edges, beyond
