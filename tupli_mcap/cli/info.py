@@ -185,7 +185,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
-        *([("rollouts", f"{time_of(d.start_ns)} to {time_of(d.end_ns)}")] if d.episodes else []),
+        *([("rollouts", _times_text(d.start_ns, d.end_ns))] if d.episodes else []),
         ("environment", f"{environment}, {d.num_envs} sub-environments" if d.num_envs > 1 else environment),
         ("benchmark", d.benchmark_id or "none"),
         *([("signed by", f"{d.signed_by} (not checked)")] if d.signed_by else []),
@@ -201,6 +201,11 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([("infos", _some(d.info_keys))] if d.info_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
+
+
+def _times_text(start_ns: int, end_ns: int) -> str:
+    start, end = time_of(start_ns), time_of(end_ns)
+    return start if start == end else f"{start} to {end}"
 
 
 def _runs_text(runs: Sequence[dict[str, Any]]) -> str:
