@@ -15,7 +15,8 @@ from hypothesis.extra import numpy as hnp
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
-from tupli_mcap.jsonvalue import MAX_DEPTH, dumps, dumps_any, dumps_plain, loads
+from tupli_mcap.jsonvalue import MAX_DEPTH, dumps, dumps_any, dumps_plain, loads, spelled
+from tupli_mcap.schema import parse_filter
 
 
 def same(one: Any, other: Any) -> bool:
@@ -356,3 +357,19 @@ def test_a_damaged_text_is_a_value_or_a_format_error(text, data):
     except FormatError:
         return
     assert same(loads(dumps(value)), value)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [True, False, None, 3, -0.5, 1e300, math.inf, "true", "None", "3", "1_0", "nan", "-inf", np.bool_(True)],
+)
+def test_what_is_spelled_is_what_a_filter_takes(value: Any) -> None:
+    read = parse_filter(f"metadata.x == {spelled(value)}").value
+    assert same(read, value.item() if isinstance(value, np.generic) else value)
+
+
+def test_other_values_are_spelled_for_people() -> None:
+    values = ["good", "", [1, True, "a"], {"a": None}, b"x", np.arange(2), [np.arange(2)]]
+    assert [spelled(value) for value in values] == [
+        "good", "", '[1, true, "a"]', '{"a": null}', "b'x'", "array([0, 1])", "[array([0, 1])]",
+    ]  # fmt: skip

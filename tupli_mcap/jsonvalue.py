@@ -106,6 +106,32 @@ def shown(value: Any) -> str:
         return f"<{type(value).__module__}.{type(value).__qualname__}>"
 
 
+def spelled(value: Any) -> str:
+    """Return a value for people, as filters write it: `true`, `null`, `0.5`; lists and dicts as JSON.
+
+    A text has quotes only if it would read as another value: `good`, but `"true"` and `"3"`. Any value that JSON has no
+    form for is its `repr`.
+    """
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False) if _reads_otherwise(value) else value
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    try:
+        return json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError, RecursionError):
+        return shown(value)
+
+
+def _reads_otherwise(text: str) -> bool:
+    try:
+        float(text)  # also nan and inf
+    except ValueError:
+        return text.lower() in ("true", "false", "null", "none")
+    return True
+
+
 def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH) -> str:
     """Return JSON text for filters: NumPy scalars are numbers, arrays and tuples are lists.
 

@@ -212,16 +212,14 @@ def number(value: float | None, decimals: int = 2) -> str:
 
 
 def short_value(value: object) -> str:
-    """A metadata value as a cell of a table."""
+    """A metadata value as a cell of a table, see `spelled`; a list of texts without brackets."""
     if isinstance(value, float):
         return f"{value:.4g}"
-    if isinstance(value, str):
-        return value
-    if isinstance(value, list) and all(isinstance(one, str) for one in value):
-        return ", ".join(value)
-    from tupli_mcap.jsonvalue import shown
+    from tupli_mcap.jsonvalue import spelled
 
-    return shown(value)
+    if isinstance(value, list) and all(isinstance(one, str) for one in value):
+        return ", ".join(map(spelled, value))
+    return spelled(value)
 
 
 def pairs_of(values: Mapping[str, Any]) -> str:

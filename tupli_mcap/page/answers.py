@@ -148,7 +148,7 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {name: getattr(texts, name) for name in texts.__all__}
+    made.filters |= {name: getattr(texts, name) for name in texts.__all__} | {"spelled": jsonvalue.spelled}
     made.globals |= {
         "can_film": importlib.util.find_spec("av") is not None,
         "can_replay": importlib.util.find_spec("rerun") is not None,

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.messages.topics import INFO
-from tupli_mcap.page.texts import said
 from tupli_mcap.plots.measure import numbers_in, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Episode, Recording
@@ -114,7 +114,7 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
         told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
     if _few_infos(recording):
         info = (episode.infos or [None] * len(episode))[step] or {}
-        told["info"] = {str(key): said(value) for key, value in info.items()}
+        told["info"] = {str(key): spelled(value) for key, value in info.items()}
     return told
 
 
@@ -122,7 +122,7 @@ def _told(leaves: Sequence[Leaf], labels: Labels, columns: Any) -> dict[str, str
     told = {}
     for leaf in leaves:
         if leaf.kind == "variable":
-            told[short_path(leaf)] = said(leaf.get(columns)[0])
+            told[short_path(leaf)] = spelled(leaf.get(columns)[0])
         elif not leaf.apart:
             values = LeafValues(leaf, labels, np.asarray(leaf.get(columns)).reshape(1, leaf.size))
             for name, value in zip(values.names, values.values, strict=False):

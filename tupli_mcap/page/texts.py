@@ -6,10 +6,9 @@ import datetime
 import math
 from typing import Any
 
-from tupli_mcap.jsonvalue import shown
 from tupli_mcap.schema.times import time_ns
 
-__all__ = ["day", "duration", "iso", "minute", "number", "percent", "said", "size", "spread"]
+__all__ = ["day", "duration", "iso", "minute", "number", "percent", "size", "spread"]
 
 
 def number(value: float | None) -> str:
@@ -27,11 +26,6 @@ def number(value: float | None) -> str:
 def percent(part: int, whole: int) -> str:
     """A share such as `40%`; a dash if the whole is 0."""
     return f"{100 * part / whole:.0f}%" if whole else "–"
-
-
-def said(value: Any) -> str:
-    """A value of metadata or infos."""
-    return value if isinstance(value, str) else shown(value)
 
 
 def size(count: float) -> str:
