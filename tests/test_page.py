@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,8 +20,10 @@ import httpx
 import numpy as np
 import pytest
 from pages import EVIL, browsing, carts, robot, serving_app
+from typer.testing import CliRunner
 
 import tupli_mcap
+from tupli_mcap.cli import app
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.copies import MOST_MERGED
@@ -177,7 +180,9 @@ class TestTables:
             (code,) = re.findall(
                 "This makes one: <code>(.*?)</code>", client.get("/episodes", params=asked).text
             )
-            exec(html.unescape(code), {"tupli_mcap": tupli_mcap})
+            program, *words = shlex.split(html.unescape(code))
+            assert program == "tupli-mcap"
+            assert CliRunner().invoke(app, words).stdout == "metadata.score has an index\n"
             assert "No index" not in client.get("/episodes", params=asked).text
 
     def test_filters(self, web: httpx.Client) -> None:

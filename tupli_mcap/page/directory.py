@@ -99,7 +99,7 @@ class DirectoryShelf(_OpenToAll):
         self._opened = OpenedRecordings()
         self.title = self._storage.root.name or str(self._storage.root)
         self.opened_by = str(self._storage.root)
-        self.storage = f"tupli_mcap.FileStorage({self.opened_by!r})"
+        self.changes = True
 
     @property
     def skipped(self) -> Mapping[str, str]:
@@ -133,7 +133,7 @@ class FileShelf(_OpenToAll):
         self.skipped: Mapping[str, str] = {}
         self.title = self._path.name
         self.opened_by = str(self._path)
-        self.storage = ""
+        self.changes = False
 
     def ask(self, question: Callable[[Connection], T]) -> T:
         with self._turn:

@@ -24,7 +24,7 @@ class Shelf(Protocol):
     Attributes:
         title: a name for the whole.
         opened_by: the argument with which `tupli_mcap.open` opens it.
-        storage: Python code that makes the `TupliStorage` of it; empty if there is none, or the reader changes nothing.
+        changes: whether the reader may declare keys.
         user: the reader; empty if nobody is signed in.
         places: further pages for the reader: address and title.
         skipped: files that cannot be shown, and why, as of the last call of `ask`.
@@ -32,7 +32,7 @@ class Shelf(Protocol):
 
     title: str
     opened_by: str
-    storage: str
+    changes: bool
     user: str
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
 from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
+from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
 from tupli_mcap.schema.facts import comparisons, path_in
 from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, declared_keys, find_episodes
@@ -164,14 +166,14 @@ def table_of(
         keys=_common_keys(rows),
         before=rows[0].id if rows and (after or (before and more)) else None,
         after=rows[-1].id if rows and (before or more) else None,
-        slow=_slow(shelf, connection, wanted, order) if shelf.storage else (),
+        slow=_slow(shelf, connection, wanted, order) if shelf.changes else (),
     )
 
 
 def _slow(
     shelf: Shelf, connection: Connection, filter: BaseFilter | None, sort: Sort | None
 ) -> list[tuple[str, str]]:
-    """The keys of metadata that are not declared, if there are many episodes, and code that declares them."""
+    """The keys of metadata that are not declared, if there are many episodes, and the command that declares each."""
     named = [part.key or "" for part in comparisons(filter)] if filter is not None else []
     paths = {path_in(key, EpisodeHeader) for key in [*named, *([sort.key] if sort else [])]}
     paths -= {path_in(key, EpisodeHeader) for key in declared_keys(connection)}
@@ -180,7 +182,8 @@ def _slow(
     episodes = select(func.sum(TALLY.c.episodes)).where(seen)
     if not keys or (connection.execute(episodes).scalar() or 0) <= _MANY:
         return []
-    return [(key, f"{shelf.storage}.declare_key({key!r})") for key in keys]
+    option = "--url" if is_url(shelf.opened_by) else "--storage"
+    return [(key, shlex.join(["tupli-mcap", "declare-key", key, option, shelf.opened_by])) for key in keys]
 
 
 def _both(a: str, b: str) -> str:

@@ -41,7 +41,7 @@ class LibraryShelf:
         self.title = library.settings.directory.name or "tupli-mcap"
         self.opened_by = address
         self.user = "" if caller.is_guest else caller.name
-        self.storage = "" if caller.is_guest else f"tupli_mcap.TupliAPIClient({address!r})"
+        self.changes = not caller.is_guest
         self.skipped: Mapping[str, str] = {}
 
     @property
