@@ -29,6 +29,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.errors import FilterError
+from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.recording import (
     annotate_episodes,
     edit_run,
@@ -323,7 +324,7 @@ class TestAnnotations:
     )
     def test_of_the_command_line(self, word: str, value: Any, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap")
-        assert json.dumps(value) in command("tag", str(path), f"good={word}", "--episode", "0")
+        assert f"good={spelled(value)}\n" in command("tag", str(path), f"good={word}", "--episode", "0")
         assert Recording(path).episodes[0].metadata["good"] is value or value not in (True, False)
 
     def test_count_more_than_what_was_recorded(self, tmp_path: Path) -> None:

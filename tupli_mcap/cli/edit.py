@@ -130,6 +130,7 @@ def tag(
     it and when. Its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.dataset.which import choose_episodes
+    from tupli_mcap.jsonvalue import spelled
     from tupli_mcap.recording import Recording, annotate_episodes, undo_annotation
 
     given = [text for text in files if "=" not in text or is_url(text)]
@@ -158,7 +159,9 @@ def tag(
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
     for one in done:
-        noted = pairs_of({key: "" if value is None else value for key, value in one["values"].items()})
+        noted = ", ".join(
+            f"{key}={'' if value is None else spelled(value)}" for key, value in one["values"].items()
+        )
         count = counted(len(one["episodes"]), "episode")
         if undo:
             say(f"{one['path']}: {'would take' if dry_run else 'took'} {noted} back from {count}")

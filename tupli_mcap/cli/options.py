@@ -72,6 +72,7 @@ StoragePath = Annotated[
     typer.Option(
         "--storage",
         envvar="TUPLI_MCAP_STORAGE",
+        metavar="DIR",
         help="The storage's directory.",
         parser=local_path,
         readable=False,

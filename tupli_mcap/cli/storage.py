@@ -192,18 +192,27 @@ def delete(
     )
 
 
-def restore(paths: _Paths, episodes: Episodes = None, dry_run: DryRun = False, as_json: Json = False) -> None:
+def restore(
+    paths: _Paths,
+    episodes: Annotated[
+        str | None,
+        typer.Option("--episodes", "--episode", "-e", metavar="WHICH", help="Numbers such as 3,7-9, or all."),
+    ] = None,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
     """Bring deleted episodes back, by default all.
 
-    It cannot bring back episodes whose space compact has freed.
+    It cannot bring back episodes whose space compact has freed, nor a recording all of whose
+    episodes were deleted.
     """
     from tupli_mcap.dataset import restore_episodes
     from tupli_mcap.dataset.which import bounds_of
 
-    if episodes is None:
+    if episodes in (None, "all"):
         restored = restore_episodes(paths, dry_run=dry_run)
     else:
-        bounds = [bounds_of(item.strip(), episodes) for item in episodes.split(",")]
+        bounds = [bounds_of(item.strip(), episodes, ["all"]) for item in episodes.split(",")]
         found = [restore_episodes(paths, range(low, high + 1), dry_run=dry_run) for low, high in bounds]
         restored = list(dict.fromkeys(one for ids in found for one in ids))
     print_result(

@@ -5,7 +5,7 @@ Storages take long to import, and most files need none, so they are imported whe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -141,13 +141,14 @@ def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
     return [extreme(item, returns)]
 
 
-def bounds_of(item: str, text: str) -> tuple[int, int]:
-    """The first and the last number of `3` or `7-9` in a text."""
+def bounds_of(item: str, text: str, words: Sequence[str] = WORDS) -> tuple[int, int]:
+    """The first and the last number of `3` or `7-9` in a text; FilterError, which names the `words` that may stand in
+    its place, if it is something else."""
     first, dash, last = (part.strip() for part in item.partition("-"))
     if not all(part.isdecimal() and len(part) <= _MAX_DIGITS for part in (first, last if dash else first)):
+        named = " or ".join(filter(None, (", ".join(words[:-1]), words[-1])))
         raise FilterError(
-            f"expected numbers of episodes such as '3,7-9', or {', '.join(WORDS[:-1])} or {WORDS[-1]}, "
-            f"found {item[:40]!r} in {text[:80]!r}"
+            f"expected numbers of episodes such as '3,7-9', or {named}, found {item[:40]!r} in {text[:80]!r}"
         )
     return int(first), int(last or first)
 

@@ -156,7 +156,9 @@ def backup_server(
     directory: _Served,
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", help="The backup's directory: a new one, or an earlier backup."),
+        typer.Option(
+            "-o", "--output", metavar="DIR", help="The backup's directory: a new one, or an earlier backup."
+        ),
     ],
     database: _Database = "",
     blobs: _Blobs = "",
