@@ -54,7 +54,7 @@ def served(recording: Path, *options: str) -> Iterator[tuple[str, set[str]]]:
         sys.executable,
         "-c",
         "from tupli_mcap.cli import main; main()",
-        "replay",
+        "view",
         str(recording),
         *options,
         "--web",

@@ -55,7 +55,7 @@ def test_of_a_file_and_back(runs: Path) -> None:
     assert "would restore 2 episodes" in run("restore", str(runs), "--dry-run")
     assert "restored 1 episode" in run("restore", str(file), "--episodes", "2-3")
     assert seeds(file) == [0, 2, 3]
-    assert "such as '3,7-9', or all, found 'best'" in run("restore", str(runs), "-e", "best", code=1)
+    assert "such as '3,7-9', or all, found 'best'" in run("restore", str(runs), "-e", "best", code=2)
     assert json.loads(run("restore", str(runs), "-e", "all", "--json"))["result"]["episodes"] == [
         f"{Recording(file).uuid}-1"
     ]

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
@@ -143,7 +143,7 @@ class Dataset(RandomAccess):
         position = int(np.searchsorted(recording.index["episode"], header.episode))
         episode = recording.episodes[position]
         episode.listed = header
-        episode.listed_in = self
+        episode.alone = partial(Dataset, self._source, [header])
         if episode.number != header.episode:
             raise DatasetError(f"{header.recording} has lost episode {header.episode}; open it again")
         return episode

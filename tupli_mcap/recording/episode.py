@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
 
@@ -70,8 +70,8 @@ class Episode(GymnasiumNames):
         self._row = recording.index[position]
         self.listed: Described | None = None
         """The dataset's entry of this episode; its metadata follow later annotations."""
-        self.listed_in: Dataset | None = None
-        """The dataset that it is an episode of."""
+        self.alone: Callable[[], Dataset] | None = None
+        """Makes a dataset of this episode only, if it comes from a dataset."""
 
     def __len__(self) -> int:
         return int(self._row["length"])
@@ -183,8 +183,8 @@ class Episode(GymnasiumNames):
 
         To delete many, `dataset.filter(function).delete()` is quicker.
         """
-        dataset = self._recording.dataset if self.listed_in is None else self.listed_in
-        return dataset.filter(F("id") == self.id).delete(force=force, dry_run=dry_run)
+        alone = self._recording.filter(F("id") == self.id) if self.alone is None else self.alone()
+        return alone.delete(force=force, dry_run=dry_run)
 
     @cached_property
     def start(self) -> EpisodeStart:
