@@ -74,6 +74,10 @@ def robot(path: Path, episodes: int = 2, text: str = "open the drawer", images: 
                 if images:
                     values["wrist"] = np.full((24, 32, 3), 10 * i, np.uint8)
                 writer.step(
-                    values, i % 3, reward=i / 10, terminal=i == 19, info={"force": 0.5 * i, "said": text}
+                    values,
+                    i % 3,
+                    reward=i / 10,
+                    terminal=i == 19,
+                    info={"force": 0.5 * i + 1e-9, "said": text},
                 )
             writer.end(values)

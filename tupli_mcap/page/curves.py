@@ -114,7 +114,10 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
         told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
     if _few_infos(recording):
         info = (episode.infos or [None] * len(episode))[step] or {}
-        told["info"] = {str(key): spelled(value) for key, value in info.items()}
+        told["info"] = {
+            str(key): f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
+            for key, value in info.items()
+        }
     return told
 
 
