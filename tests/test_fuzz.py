@@ -44,10 +44,12 @@ def test_the_right_data_or_one_error(fuzzer: Fuzzer, part: int) -> None:
 
 def test_every_mutator_gets_through_to_the_reader(fuzzer: Fuzzer) -> None:
     for name in MUTATORS:
-        for number in range(3):
+        for number in range(1, 30):
             fuzzer.run(case_of(1, number, fuzzer.seeds, only=[name]))
-    for name, outcomes in fuzzer.outcomes.items():
-        assert set(outcomes) - {"refused"}, f"{name} makes files that are all refused at once"
+            if set(fuzzer.outcomes[name]) - {"refused"}:
+                break
+        else:
+            pytest.fail(f"{name} makes files that are all refused at once")
 
 
 @pytest.mark.parametrize("name", SEEDS)
