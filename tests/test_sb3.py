@@ -164,7 +164,9 @@ def test_ppo(tmp_path: Path, env: Any) -> None:
 
 
 def test_processes(tmp_path: Path) -> None:
-    witness = Witness(make_vec_env("CartPole-v1", n_envs=2, seed=5, vec_env_cls=SubprocVecEnv))
+    forked = {"start_method": "fork"}  # others import PyTorch anew
+    venv = make_vec_env("CartPole-v1", n_envs=2, seed=5, vec_env_cls=SubprocVecEnv, vec_env_kwargs=forked)
+    witness = Witness(venv)
     with VecRecordEpisodes(witness, f"{tmp_path}/runs/") as venv:
         assert venv.path.name.startswith("CartPole-v1_")
         venv.set_options({"low": -0.01, "high": 0.01})
