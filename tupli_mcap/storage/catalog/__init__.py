@@ -5,7 +5,7 @@ pages               finds a page of episodes without checking all others
 queries             changes and queries of the tables, in any SQL database
 database, tables    the SQLite database, and its tables
 place               its path, in a directory of this user alone
-entries             reads the entry of a recording, here or in other processes
+entries             reads the entry of a recording
 rows                episodes as rows
 filter_sql          turns filters into SQL that finds all candidates; Python checks them again
 compare_sql         turns one comparison into SQL

@@ -1,25 +1,10 @@
-"""Reads the catalog's entry of a recording from its index and the notes beside it; with several processes if there are
-many recordings.
-
-Such a process does not run the caller's script again, as one of `multiprocessing` would. It ends with its parent, which
-alone handles Ctrl-C. If it fails to read a recording, this process reads it.
-"""
+"""Reads the catalog's entry of a recording from its index and the notes beside it."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
-import multiprocessing
-import os
-import signal
-import sys
-import threading
-import time
-import warnings
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from multiprocessing.context import SpawnContext, SpawnProcess
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,12 +18,7 @@ from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
-__all__ = ["Entry", "entry_of", "put_entry", "read_ahead", "rows_of", "runs_of"]
-
-_MOST_EPISODES = 50_000  # of a recording that another process reads, since its rows are in memory twice
-_TRIAL = 1.0  # seconds of reading in this process, to estimate whether more processes pay
-_WORTH = 3.0  # estimated seconds that must be left for them
-_MOST_WORKERS = 8
+__all__ = ["Entry", "entry_of", "put_entry", "rows_of", "runs_of"]
 
 
 class Entry(NamedTuple):
@@ -92,73 +72,6 @@ def runs_of(recording: Recording) -> str:
     """JSON: a list of the runs of a recording's episodes."""
     known = {id(run): run for run in recording.listed_runs()}
     return jsonvalue.dumps(list(known.values()))
-
-
-def read_ahead(root: Path, names: Sequence[str]) -> Generator[Entry | None]:
-    """An entry for each recording that another process has read; None for each that the caller has to read, as long as
-    more processes do not pay."""
-    begun, workers = time.monotonic(), min(len(os.sched_getaffinity(0)), _MOST_WORKERS)
-    if workers == 1 or multiprocessing.current_process().daemon:  # which may start none
-        workers = 0
-    for done in range(len(names)):
-        taken = time.monotonic() - begun
-        if workers and taken > _TRIAL and taken / max(1, done) * (len(names) - done) > _WORTH:
-            yield from _read_elsewhere(root, names[done:], workers)
-            return
-        yield None
-
-
-def _read_elsewhere(root: Path, names: Sequence[str], workers: int) -> Generator[Entry | None]:
-    pool = ProcessPoolExecutor(workers, _Context(), initializer=_end_with_parent)
-    done = 0
-    try:
-        for start in range(0, len(names), 8 * workers):
-            block = names[start : start + 8 * workers]
-            for entry in pool.map(functools.partial(_read, root), block):
-                yield entry
-                done += 1
-    except (BrokenExecutor, OSError):  # one was killed, or cannot be started
-        yield from [None] * (len(names) - done)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-class _Process(SpawnProcess):
-    def start(self) -> None:
-        main = vars(sys.modules["__main__"])
-        kept: dict[str, object] = {name: main[name] for name in ("__spec__", "__file__") if name in main}
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # as it is in the process then
-        main.update(dict.fromkeys(kept))  # with which it would be found
-        try:
-            super().start()
-        finally:
-            main.update(kept)
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-class _Context(SpawnContext):
-    Process = _Process
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-
-    def wait() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def _read(root: Path, relative: str) -> Entry | None:
-    """In another process: a recording's entry with its rows; None if it is too long, fails, or causes a warning."""
-    with contextlib.suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with entry_of(root, relative) as entry:
-            if len(entry.numbers) <= _MOST_EPISODES:
-                return entry._replace(rows=list(entry.rows))
-    return None
 
 
 def rows_of(

@@ -25,7 +25,7 @@ from tupli_mcap.storage.catalog.catalog import (
     CatalogUnusableError,
     RecordingStamp,
 )
-from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry, read_ahead
+from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.listing import scan, stamp_of
 
@@ -201,16 +201,12 @@ class SyncedCatalog:
 
     def _follow(self, changes: Mapping[str, Path | None]) -> None:
         """Applies changes of files to the catalog."""
-        present = [relative for relative, path in changes.items() if path is not None]
-        with (
-            progress(len(changes), "Cataloguing recordings") as bar,
-            contextlib.closing(read_ahead(self._root, present)) as entries,
-        ):
+        with progress(len(changes), "Cataloguing recordings") as bar:
             for relative, path in changes.items():
                 if path is None:
                     self._catalog.remove_recording(relative)
                 else:
-                    self._try_to_put(relative, next(entries))
+                    self._try_to_put(relative)
                 bar.advance(1)
 
     def _changes(self) -> dict[str, Path | None]:
@@ -236,15 +232,12 @@ class SyncedCatalog:
                 changes[item.relative] = path
         return changes
 
-    def _try_to_put(self, relative: str, entry: Entry | None) -> None:
-        """Catalogue a recording by its entry; without one, read the recording here."""
+    def _try_to_put(self, relative: str) -> None:
+        """Catalogue a recording; one that cannot be read is skipped."""
         stamp = RecordingStamp(0, 0, 0)
         try:
-            if entry is None:
-                stamp = stamp_of(self._root, relative)
-                with entry_of(self._root, relative) as entry:
-                    self._put(relative, entry)
-            else:
+            stamp = stamp_of(self._root, relative)
+            with entry_of(self._root, relative) as entry:
                 self._put(relative, entry)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
