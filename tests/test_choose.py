@@ -13,6 +13,7 @@ from tupli_mcap.dataset.chosen import chosen_from
 from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import EpisodeData, Recording, write_recording
+from tupli_mcap.recording.recover.from_file import metadata_at
 from tupli_mcap.schema import F, parse_filter
 from tupli_mcap.storage.sidecar import Sidecar
 
@@ -76,8 +77,12 @@ def test_a_filter_is_what_the_choice_is_among(file: Path) -> None:
             choose_episodes(recording, "all", F("length") > 2)
 
 
+def delete(file: Path, numbers: set[int]) -> None:
+    Sidecar(uuid=metadata_at(file)["uuid"], deleted=numbers).write(file)
+
+
 def test_deleted_episodes_are_not_there(file: Path) -> None:
-    Sidecar(deleted={0, 1, 4}).write(file)
+    delete(file, {0, 1, 4})
     with Recording(file) as recording:
         assert [e.number for e in choose_episodes(recording, "first,best,all")] == [2, 3, 5]
         with pytest.raises(RecordingError, match="has no episode 1; choose from 3 episodes between 2 and 5"):
@@ -105,10 +110,10 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
         pytest.raises(RecordingError, match=r"returns\.mcap has no episode 6; choose from 0 to 5$"),
     ):
         choose_episodes(recording, "2,6")
-    Sidecar(deleted=set(range(5))).write(file)
+    delete(file, set(range(5)))
     with Recording(file) as recording, pytest.raises(RecordingError, match="choose from episode 5 only"):
         choose_episodes(recording, "0")
-    Sidecar(deleted=set(range(6))).write(file)
+    delete(file, set(range(6)))
     with Recording(file) as recording, pytest.raises(RecordingError, match="has no episode$"):
         choose_episodes(recording, "all")
 

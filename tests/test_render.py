@@ -25,6 +25,7 @@ from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.recording.recover.from_file import metadata_at
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.replay import render
@@ -185,7 +186,7 @@ class TestOutput:
 
     def test_deleted_episodes_stay_out(self, tmp_path: Path) -> None:
         path = recorded(tmp_path / "r.mcap")
-        Sidecar(deleted={1}).write(path)
+        Sidecar(uuid=metadata_at(path)["uuid"], deleted={1}).write(path)
         render(path, tmp_path / "new.mcap")
         with Recording(tmp_path / "new.mcap") as recording:
             assert [e.number for e in recording.episodes] == [0, 2]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -59,15 +58,6 @@ def numbers(storage: FileStorage, name: str = "run.mcap") -> list[int]:
 
 def delete(storage: FileStorage, *episodes: int) -> None:
     assert storage.delete_episodes(F("episode").isin(list(episodes))) > 0
-
-
-def forget(path: Path, key: str) -> None:
-    """Notes as earlier versions wrote them, with the time they had."""
-    times = path.stat()
-    notes = json.loads(path.read_bytes())
-    del notes[key]
-    path.write_text(json.dumps(notes))
-    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
 class TestAReplacedRecording:
@@ -216,37 +206,6 @@ class TestADeletionBrokenOff:
         assert not (storage.root / "deleting.json").exists()
         run.write_bytes(whole)
         assert numbers(storage) == [1, 2]
-
-
-class TestNotesThatNameNoRecording:
-    def test_count_until_it_is_replaced(self, storage: FileStorage, run: Path) -> None:
-        delete(storage, 0)
-        forget(sidecar_path(run), "uuid")
-        record(run, 1, mode="a")
-        assert numbers(storage) == [1, 2, 3]
-        record(run, 3)
-        assert numbers(storage) == [0, 1, 2]
-        storage.compact()
-        assert numbers(storage) == [0, 1, 2]
-
-    def test_name_it_once_they_are_written_again(self, storage: FileStorage, run: Path) -> None:
-        delete(storage, 0)
-        forget(sidecar_path(run), "uuid")
-        delete(storage, 1)
-        found = Sidecar.read(run)
-        assert (found.uuid, found.deleted) == (metadata_at(run)["uuid"], {0, 1})
-
-    @pytest.mark.parametrize("replaced", [False, True])
-    def test_of_a_deletion_broken_off(self, storage: FileStorage, run: Path, *, replaced: bool) -> None:
-        deletion = Deletion(deleted={run.name: {0}}, uuids={run.name: metadata_at(run)["uuid"]})
-        deletion.write(storage.root)
-        forget(storage.root / "deleting.json", "uuids")
-        if replaced:
-            record(run, 3)
-        left = [0, 1, 2] if replaced else [1, 2]
-        assert numbers(storage) == left
-        storage.compact()
-        assert numbers(storage) == left
 
 
 def fail_after(changes: int, patch: pytest.MonkeyPatch) -> None:

@@ -40,10 +40,7 @@ __all__ = [
 ]
 
 _NEW = "new"  # name of the file in its directory; without a suffix it does not look like a recording
-# The last two are from earlier versions; those with the number of a process were not locked.
-_TEMPORARY = re.compile(
-    r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp|\.[0-9a-f]{16}\.tmp|\..+\.(?P<pid>[0-9]{1,9})\.tmp"
-)
+_TEMPORARY = re.compile(r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp")
 _MOMENT = 60.0  # seconds after which a writer has surely locked its new file
 _NO_SYNC = (errno.EINVAL, errno.ENOTSUP)  # not every file system syncs directories
 
@@ -232,21 +229,8 @@ def _is_unheld(fd: int, path: Path) -> bool:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         return False
-    found = _TEMPORARY.fullmatch(path.name)
-    if found is not None and found["pid"] is not None and _lives(int(found["pid"])):
-        return False
     is_empty = not status.st_size if stat.S_ISREG(status.st_mode) else not os.listdir(fd)
     return not is_empty or time.time() - status.st_mtime > _MOMENT
-
-
-def _lives(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
 
 
 def _remove(path: Path) -> None:

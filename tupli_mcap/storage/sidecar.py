@@ -16,19 +16,15 @@ Another recording may replace one (`mode="w"`), with episodes of the same number
 4. A sidecar, and each entry of `deleting.json`, names the UUID of its recording. A recording that is appended to or
    compacted keeps its UUID.
 5. A note about another recording than the one at the path does not count, and the next note replaces it.
-6. A note without a UUID (from earlier versions) counts for a recording that was begun before the note was written, by
-   the file's time: a recording that replaces another one is begun after all notes about that one. When the note is
-   written again, it gets the UUID.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.storage.atomic import os_errors, write_bytes
@@ -45,7 +41,7 @@ class Sidecar(BaseModel):
     """The notes beside a recording.
 
     Attributes:
-        uuid: of the recording; empty if the note names none.
+        uuid: of the recording; empty if there are no notes.
         deleted: numbers of deleted episodes.
         published_in: by number of an episode, the groups that see it.
     """
@@ -54,7 +50,6 @@ class Sidecar(BaseModel):
     uuid: RecordingUuid = ""
     deleted: set[EpisodeNumber] = Field(default_factory=set)
     published_in: dict[EpisodeNumber, list[str]] = Field(default_factory=dict)
-    _written_ns: int = PrivateAttr(0)
 
     @classmethod
     def read(cls, recording: Path) -> Sidecar:
@@ -65,18 +60,14 @@ class Sidecar(BaseModel):
         """
         path = sidecar_path(recording)
         try:
-            data, written_ns = _content(path)
-            found = cls() if data is None else cls.model_validate_json(data)
+            data = _content(path)
+            return cls() if data is None else cls.model_validate_json(data)
         except ValidationError as err:
             raise FormatError(f"{path}: expected facts about a recording: {first_defect(err)}") from err
-        found._written_ns = written_ns
-        return found
 
     def is_about(self, metadata: Mapping[str, str]) -> bool:
         """Whether it counts for the recording with these metadata."""
-        if self.uuid:
-            return self.uuid == metadata.get("uuid")
-        return int(metadata.get("created_ns", "0")) <= self._written_ns
+        return self.uuid == metadata.get("uuid")
 
     def is_empty(self) -> bool:
         """Whether it has no notes."""
@@ -99,7 +90,6 @@ class Deletion(BaseModel):
     version: Literal[1] = 1
     deleted: dict[str, set[EpisodeNumber]] = Field(default_factory=dict)
     uuids: dict[str, RecordingUuid] = Field(default_factory=dict)
-    _written_ns: int = PrivateAttr(0)
 
     @classmethod
     def read(cls, root: Path) -> Deletion:
@@ -110,22 +100,18 @@ class Deletion(BaseModel):
         """
         path = root / DELETING
         try:
-            data, written_ns = _content(path)
+            data = _content(path)
             named = cls() if data is None else cls.model_validate_json(data)
         except ValidationError as err:
             raise FormatError(f"{path}: expected episodes to delete: {first_defect(err)}; delete it") from err
-        found = cls(
+        return cls(
             deleted={unescape_text(name): numbers for name, numbers in named.deleted.items()},
             uuids={unescape_text(name): uuid for name, uuid in named.uuids.items()},
         )
-        found._written_ns = written_ns
-        return found
 
     def of(self, relative: str) -> Sidecar:
         """The part about the recording at a path below the root, as a sidecar."""
-        found = Sidecar(uuid=self.uuids.get(relative, ""), deleted=self.deleted.get(relative, set()))
-        found._written_ns = self._written_ns
-        return found
+        return Sidecar(uuid=self.uuids.get(relative, ""), deleted=self.deleted.get(relative, set()))
 
     def stamp(self, relative: str) -> tuple[int, ...]:
         """Numbers that change with the notes about a recording; not a hash of text, which differs between processes."""
@@ -183,14 +169,13 @@ class Notes(NamedTuple):
         return found
 
 
-def _content(path: Path) -> tuple[bytes | None, int]:
-    """The content of a file (None if there is none) and the time when it was written (ns)."""
+def _content(path: Path) -> bytes | None:
+    """The content of a file; None if there is none."""
     with os_errors("cannot read", path):
         try:
-            with path.open("rb") as file:
-                return file.read(), os.fstat(file.fileno()).st_mtime_ns
+            return path.read_bytes()
         except FileNotFoundError:
-            return None, 0
+            return None
 
 
 def storage_of(recording: Path) -> Path:

@@ -23,7 +23,6 @@ from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles"]
 
-_OLD_CATALOG = [f"catalog.sqlite{end}" for end in ("", "-wal", "-shm", "-journal", ".lock", ".new")]
 _EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
@@ -289,9 +288,6 @@ class RecordingFiles:
         freed = files.remove_left(files.left_below(self._root))
         with self._lock:
             self._finish_deletion()
-        for name in _OLD_CATALOG:  # left by earlier versions, which had the catalog here
-            with contextlib.suppress(OSError):
-                (self._root / name).unlink()
         for item in self._recordings(only):
             path = self._root / item.relative
             with self._lock:
