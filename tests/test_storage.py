@@ -602,7 +602,9 @@ class TestFileStorage(StorageContract):
         (storage.root / "link").symlink_to(tmp_path / "outside")
         names = ["../outside/a.mcap", "link/a.mcap", str(outside), made[0].recording]
         deleting = storage.root / "deleting.json"
-        deleting.write_text(json.dumps({"version": 1, "deleted": {name: [0] for name in names}}))
+        uuids = dict.fromkeys(names, made[0].id.partition("-")[0])
+        notes = {"version": 1, "deleted": {name: [0] for name in names}, "uuids": uuids}
+        deleting.write_text(json.dumps(notes))
         assert [h.id for h in storage.list_episodes()] == [made[1].id]
         assert storage.delete_episodes(F("episode") == 0) == 0
         assert list(outside.parent.iterdir()) == [outside]
