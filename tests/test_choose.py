@@ -13,7 +13,7 @@ from tupli_mcap.dataset.chosen import chosen_from
 from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import EpisodeData, Recording, write_recording
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import F, parse_filter
 from tupli_mcap.storage.sidecar import Sidecar
 

@@ -32,7 +32,7 @@ from tupli_mcap.cli.output import begin_json
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import RowArea, read_journal
-from tupli_mcap.mcap.compression import MAX_RATIO, decompress
+from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore

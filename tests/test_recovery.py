@@ -34,7 +34,7 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.journal.committed import CommittedRows
 from tupli_mcap.journal.file import JournalContents, RowArea, read_journal
-from tupli_mcap.journal.seals import checksum
+from tupli_mcap.journal.logs import checksum
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records, with_crc
 from tupli_mcap.messages.episodes import EpisodeStart

@@ -25,7 +25,7 @@ from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.edit.attach import add_attachments
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.replay import render

@@ -34,7 +34,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.mcap.chunk_records import message_headers
+from tupli_mcap.mcap.chunks import message_headers
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
@@ -42,10 +42,9 @@ from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
+from tupli_mcap.recording.recover.damaged import gather, read_tail
 from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
-from tupli_mcap.recording.recover.evidence import RecordedChannels
-from tupli_mcap.recording.recover.file_end import Tail, read_tail
-from tupli_mcap.recording.recover.from_file import gather
+from tupli_mcap.recording.recover.evidence import RecordedChannels, Tail
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -19,9 +19,8 @@ import pytest
 from gymnasium import spaces
 
 from tupli_mcap.journal.committed import CommittedRows, committed_records, rows_of, running_record
-from tupli_mcap.journal.file import Area, Journal, JournalContents, LogArea, RowArea, read_journal
+from tupli_mcap.journal.file import Area, Journal, JournalContents, LogArea, RowArea, boot_id, read_journal
 from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.journal.seals import boot_id
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder

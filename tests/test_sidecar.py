@@ -16,7 +16,7 @@ from tupli_mcap import TupliDataset
 from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import F
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.bundles import bundle_recording

@@ -38,7 +38,7 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import chunk_records, message_headers
+from tupli_mcap.mcap.chunks import chunk_records, message_headers
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart

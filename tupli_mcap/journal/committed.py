@@ -11,8 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea, RowArea
-from tupli_mcap.journal.logs import as_rows
-from tupli_mcap.journal.seals import SECTOR, STATE, checksum, seal_of
+from tupli_mcap.journal.logs import STATE, as_rows, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
 from tupli_mcap.messages.decoder import MessageDecoder
@@ -21,6 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 
 Taken = TypeVar("Taken")
 Taken_co = TypeVar("Taken_co", covariant=True)
+SECTOR = 512  # bytes a disk writes as one
 SEQUENCE_END = 15  # offset after `sequence` in a Message record
 EPISODE_END = BODY + 4  # offset after `episode` in a step's record
 

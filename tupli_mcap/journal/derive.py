@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.seals import STATE
+from tupli_mcap.journal.logs import STATE
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import mmap
 import os
@@ -28,7 +29,6 @@ import numpy as np
 
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError, os_reason, warn
-from tupli_mcap.journal.seals import boot_id, sync_directory
 from tupli_mcap.mcap.source import open_regular
 
 MAGIC = b"TMCAPJ1\0"
@@ -397,3 +397,43 @@ def _area(entry: Mapping[str, Any]) -> Area:
     if type(entry["name"]) is not str or any(type(n) is not int or not 0 < n < 1 << 48 for n in sizes):
         raise ValueError(entry)
     return RowArea(**values) if entry["kind"] == "rows" else LogArea(**values)
+
+
+# ---- power losses
+
+
+def boot_id() -> str:
+    """A text that differs for each boot of each machine; empty if the system has none."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+def sync_file(fd: int, name: str) -> None:
+    """Waits until the file's data and size are on the disk.
+
+    Raises:
+        RecordingError: the disk refused; how much it has is unknown.
+    """
+    try:
+        if hasattr(fcntl, "F_FULLFSYNC"):  # macOS: its fsync stops at the drive's cache
+            fcntl.fcntl(fd, fcntl.F_FULLFSYNC)
+        elif hasattr(os, "fdatasync"):
+            os.fdatasync(fd)
+        else:
+            os.fsync(fd)
+    except OSError as err:
+        raise RecordingError(f"{name}: could not be synced to the disk: {os_reason(err)}") from err
+
+
+def sync_directory(path: Path) -> None:
+    """Waits until the names in a directory are on the disk.
+
+    Raises:
+        RecordingError: the disk refused.
+    """
+    try:
+        files.sync(path)
+    except OSError as err:
+        raise RecordingError(f"{path}: could not be synced to the disk: {os_reason(err)}") from err

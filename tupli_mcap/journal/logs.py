@@ -2,6 +2,10 @@
 
 Each half of a log is a u64 end offset and the records up to it. The end is stored after the records, as one machine
 word, and commits them. A log of events also holds the size of the file after its earlier records went there.
+
+A sealed record has checksums in place of `publish_time`, which is derived when it goes to a chunk. If a process is
+killed, the kernel still has all pages of its journal. If the kernel goes down, pages it has not written are lost, in
+any order and in parts: after another boot, only records count that are known to be whole.
 """
 
 from __future__ import annotations
@@ -21,6 +25,27 @@ from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
 Sink = Callable[[Rows], None]
 FRONT = struct.Struct("<BQHIQ")  # a record up to publish_time, where a journal has a checksum
 _LOG_TIME = FRONT.size - 8
+_SEAL = struct.Struct("<II")
+_SEAL_END = FRONT.size + _SEAL.size
+STATE = BODY + 8  # offset of the state in a step's record
+
+
+def checksum(record: bytes | bytearray | memoryview) -> int:
+    """CRC-32 of a Message record without its `publish_time`."""
+    view = memoryview(record)
+    return crc32(view[_SEAL_END:], crc32(view[: FRONT.size]))
+
+
+def seal(view: bytearray | memoryview, start: int, end: int, running: bytes | bytearray | memoryview) -> None:
+    """Writes the checksums of a record, and of the state that follows its step, in place of `publish_time`."""
+    whole = checksum(memoryview(view)[start:end])
+    _SEAL.pack_into(view, start + FRONT.size, whole, crc32(running))
+
+
+def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
+    """The two checksums of the record at `start`."""
+    whole, running = _SEAL.unpack_from(view, start + FRONT.size)
+    return whole, running
 
 
 def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:

@@ -5,6 +5,5 @@ lock                        tells whether the process that writes a file is aliv
 container                   writes header, metadata, attachments, chunks, summary
 records                     parses and checks records, their checksums, the footer and the summary
 walk                        goes over the records of a file, beyond damage too
-chunk_records               the messages of a chunk, as arrays
-compression                 decompresses within bounds
+chunks                      decompresses a chunk within bounds; its messages, as arrays
 """

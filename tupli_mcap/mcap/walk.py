@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.compression import MAX_RATIO, decompress
+from tupli_mcap.mcap.chunks import MAX_RATIO, Chunk, decompress
 from tupli_mcap.mcap.records import (
     CHUNK_HEAD,
     MAGIC,
@@ -62,17 +62,6 @@ class ChunkClaim(NamedTuple):
     def packed(self) -> int:
         """Bytes of compressed data."""
         return self.length - CHUNK_HEAD.size - len(self.compression) - 8
-
-
-class Chunk(NamedTuple):
-    """A chunk's header and its decompressed records, `data`, whose CRC was checked."""
-
-    start_time: int
-    end_time: int
-    crc: int
-    compression: str
-    packed: int
-    data: memoryview
 
 
 class Found(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import headers_at
+from tupli_mcap.mcap.chunks import headers_at
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.step import StepLayout

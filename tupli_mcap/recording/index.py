@@ -16,7 +16,7 @@ import zstandard
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.compression import MAX_RATIO, decompress
+from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAGIC, MAX_CHUNK, MAX_ROWS_A_BYTE
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE

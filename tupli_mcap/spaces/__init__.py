@@ -1,7 +1,7 @@
 """Gymnasium spaces.
 
 leaves       the arrays and scalars that a value of a space is made of
-space_json   a space as JSON, and back; space_fields has its bounds, dtypes and shapes
+space_json   a space as JSON, and back
 labels       names of actions and dimensions, for people
 exact        casts values to leaves exactly, or refuses
 """

@@ -17,16 +17,20 @@ from gymnasium import spaces
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.spaces.space_fields import Fields, Json, dtype_name, numbers, short
+from tupli_mcap.spaces.leaves import ROS_TYPES
+
+Json = dict[str, Any]
 
 MAX_DEPTH = 64
 """Deepest nesting of spaces."""
 
-_MAX_ELEMENTS = (
-    2**26
-)  # of all leaves together: a space holds its bounds in memory, and a file only claims its size
+# of all leaves together: a space holds its bounds in memory, and a file only claims its size
+_MAX_ELEMENTS = 2**26
 _MAX_COPIED = 2**22  # of those below a stacked Sequence or a Graph, where Gymnasium makes its own arrays
 _MAX_SPACES = 2**16
+_DTYPES = {name: np.dtype(name) for name in ROS_TYPES}
+_MAX_DIMENSIONS = 32  # of NumPy 1
+_LARGE = 2**16  # elements
 _FLAGS = ("bounded_below", "bounded_above")
 
 
@@ -79,8 +83,7 @@ def space_from_json(obj: Any) -> gym.Space[Any]:
 
 def _write(space: gym.Space[Any], path: str, depth: int, copies: int, budget: _Budget) -> Json:
     kind = type(space)
-    writer = _WRITERS.get(kind)
-    if writer is None:
+    if kind not in _CODECS:
         raise SpaceError(
             f"{path}: expected a space of Gymnasium itself, found {kind.__module__}.{kind.__qualname__}; "
             "wrap the environment so that it returns one"
@@ -94,18 +97,19 @@ def _write(space: gym.Space[Any], path: str, depth: int, copies: int, budget: _B
     def write_sub(sub: gym.Space[Any], step: str, copied: bool = False) -> Json:
         return _write(sub, path + step, depth + 1, 2 * copies if copied else copies, budget)
 
+    writer, _ = _CODECS[kind]
     return {"type": kind.__name__, **writer(space, path, write_sub)}
 
 
 def _read(obj: Any, path: str, depth: int, copies: int, budget: _Budget) -> gym.Space[Any]:
     if not isinstance(obj, dict):
-        raise FormatError(f"{path}: expected the object of a space, found {short(obj)}")
+        raise FormatError(f"{path}: expected the object of a space, found {_short(obj)}")
     reader = _READERS.get(obj["type"]) if isinstance(obj.get("type"), str) else None
     if reader is None:
-        raise FormatError(f"{path}: expected the type of a space, found {short(obj.get('type'))}")
+        raise FormatError(f"{path}: expected the type of a space, found {_short(obj.get('type'))}")
     if depth > MAX_DEPTH:
         raise FormatError(f"{path}: expected at most {MAX_DEPTH} nested spaces, found more")
-    fields = Fields(obj, path)
+    fields = _Fields(obj, path)
     if (wrong := budget.take(fields.shape("shape") if "shape" in obj else (), copies)) is not None:
         raise FormatError(f"{path}: expected {wrong}")
 
@@ -114,16 +118,9 @@ def _read(obj: Any, path: str, depth: int, copies: int, budget: _Budget) -> gym.
 
     try:
         return reader(fields, read_sub)
-    except (
-        ValueError,
-        TypeError,
-        OverflowError,
-        AssertionError,
-        ArithmeticError,
-        NotImplementedError,
-    ) as err:
+    except (ValueError, TypeError, AssertionError, ArithmeticError, NotImplementedError) as err:
         raise FormatError(
-            f"{path}: expected a space of Gymnasium, which refuses this one: {short(err)}"
+            f"{path}: expected a space of Gymnasium, which refuses this one: {_short(err)}"
         ) from err
 
 
@@ -135,21 +132,21 @@ ReadSub = Callable[..., "gym.Space[Any]"]
 
 
 def _write_box(space: Any, path: str, _: WriteSub) -> Json:
-    obj = {"dtype": dtype_name(space.dtype, path), "shape": list(space.shape)}
+    obj = {"dtype": _dtype_name(space.dtype, path), "shape": list(space.shape)}
     for name in ("low", "high"):
         bound = getattr(space, name)
         if bound.dtype != space.dtype or bound.shape != space.shape or np.isnan(bound).any():
             raise SpaceError(
-                f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {short(bound)}"
+                f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {_short(bound)}"
             )
-        obj[name] = numbers(bound)
+        obj[name] = _numbers(bound)
     if space.dtype.kind == "i":  # an infinite bound of a float says that there is none
-        obj["bounded_below"] = numbers(space.bounded_below)
-        obj["bounded_above"] = numbers(space.bounded_above)
+        obj["bounded_below"] = _numbers(space.bounded_below)
+        obj["bounded_above"] = _numbers(space.bounded_above)
     return obj
 
 
-def _read_box(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+def _read_box(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
     dtype, shape = fields.dtype(), fields.shape("shape")
     built = fields.built_shape(shape, "low", "high", *(_FLAGS if dtype.kind == "i" else ()))
     low, high = fields.array("low", dtype, built), fields.array("high", dtype, built)
@@ -173,21 +170,21 @@ def _spread(space: Any, shape: tuple[int, ...], *names: str) -> gym.Space[Any]:
 
 
 def _write_discrete(space: Any, path: str, _: WriteSub) -> Json:
-    return {"dtype": dtype_name(space.dtype, path), "n": int(space.n), "start": int(space.start)}
+    return {"dtype": _dtype_name(space.dtype, path), "n": int(space.n), "start": int(space.start)}
 
 
-def _read_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+def _read_discrete(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
     dtype: Any = fields.dtype().type
     of_dtype = {} if dtype is np.int64 else {"dtype": dtype}  # Gymnasium 1.0 has int64 only
     return spaces.Discrete(fields.integer("n"), start=fields.integer("start"), **of_dtype)
 
 
 def _write_multi_discrete(space: Any, path: str, _: WriteSub) -> Json:
-    obj = {"dtype": dtype_name(space.dtype, path), "shape": list(space.nvec.shape)}
-    return {**obj, "nvec": numbers(space.nvec), "start": numbers(space.start)}
+    obj = {"dtype": _dtype_name(space.dtype, path), "shape": list(space.nvec.shape)}
+    return {**obj, "nvec": _numbers(space.nvec), "start": _numbers(space.start)}
 
 
-def _read_multi_discrete(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+def _read_multi_discrete(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
     dtype, shape = fields.dtype(), fields.shape("shape")
     built = fields.built_shape(shape, "nvec", "start")
     nvec, start = fields.array("nvec", dtype, built), fields.array("start", dtype, built)
@@ -202,7 +199,7 @@ def _write_multi_binary(space: Any, _path: str, _: WriteSub) -> Json:
     return {"shape": list(space.shape), "flat": isinstance(space.n, int)}
 
 
-def _read_multi_binary(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+def _read_multi_binary(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
     shape, flat = fields.shape("shape"), fields.flag("flat")
     if flat and len(shape) != 1:
         raise fields.wrong("shape", "one length")
@@ -231,7 +228,7 @@ def _text_lengths(space: Any) -> Json:
     return {"min_length": space.min_length, "max_length": space.max_length}
 
 
-def _read_text(fields: Fields, _: ReadSub) -> gym.Space[Any]:
+def _read_text(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
     lengths = {"min_length": fields.integer("min_length"), "max_length": fields.integer("max_length")}
     characters = fields.take("characters")
     if isinstance(characters, list):
@@ -247,19 +244,19 @@ def _write_dict(space: Any, path: str, write_sub: WriteSub) -> Json:
     }
 
 
-def _read_dict(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+def _read_dict(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
     pairs = list(_read_pairs(fields, read_sub))
     if len(dict(pairs)) != len(pairs):
         raise fields.wrong("spaces", "different keys")
     return spaces.Dict(pairs)
 
 
-def _read_pairs(fields: Fields, read_sub: ReadSub) -> Iterator[tuple[Any, gym.Space[Any]]]:
+def _read_pairs(fields: _Fields, read_sub: ReadSub) -> Iterator[tuple[Any, gym.Space[Any]]]:
     for pair in fields.items("spaces"):
         if not isinstance(pair, list) or len(pair) != 2:
             raise fields.wrong("spaces", "pairs of a key and a space")
         key = _read_key(pair[0], fields)
-        yield key, read_sub(pair[1], f"[{short(key)}]")
+        yield key, read_sub(pair[1], f"[{_short(key)}]")
 
 
 def _write_key(key: Any, path: str) -> Any:
@@ -267,16 +264,16 @@ def _write_key(key: Any, path: str) -> Any:
     try:
         text = jsonvalue.dumps(key)
     except (TypeError, ValueError) as err:
-        raise SpaceError(f"{path}: expected keys with a JSON form, found {short(key)}: {err}") from err
+        raise SpaceError(f"{path}: expected keys with a JSON form, found {_short(key)}: {err}") from err
     restored = jsonvalue.loads(text)
     if (
         type(restored) is not type(key) or restored != key
     ):  # an enumeration, a named tuple, an object equal to nothing
-        raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {short(key)}")
+        raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {_short(key)}")
     return key if text.startswith('"') else {"key": text}
 
 
-def _read_key(obj: Any, fields: Fields) -> Any:
+def _read_key(obj: Any, fields: _Fields) -> Any:
     if isinstance(obj, dict) and obj.keys() == {"key"} and isinstance(obj["key"], str):
         return jsonvalue.loads(obj["key"])
     if not isinstance(obj, str):
@@ -288,11 +285,11 @@ def _write_tuple(space: Any, _path: str, write_sub: WriteSub) -> Json:
     return {"spaces": [write_sub(sub, f"[{i}]") for i, sub in enumerate(space.spaces)]}
 
 
-def _read_tuple(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+def _read_tuple(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
     return spaces.Tuple([read_sub(sub, f"[{i}]") for i, sub in enumerate(fields.items("spaces"))])
 
 
-def _read_one_of(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+def _read_one_of(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
     return spaces.OneOf([read_sub(sub, f"[{i}]") for i, sub in enumerate(fields.items("spaces"))])
 
 
@@ -300,7 +297,7 @@ def _write_sequence(space: Any, _path: str, write_sub: WriteSub) -> Json:
     return {"stack": bool(space.stack), "space": write_sub(space.feature_space, "[]", bool(space.stack))}
 
 
-def _read_sequence(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+def _read_sequence(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
     stack = fields.flag("stack")
     return spaces.Sequence(read_sub(fields.take("space"), "[]", stack), stack=stack)
 
@@ -310,34 +307,138 @@ def _write_graph(space: Any, _path: str, write_sub: WriteSub) -> Json:
     return {"node_space": write_sub(space.node_space, ".nodes", True), "edge_space": edges}
 
 
-def _read_graph(fields: Fields, read_sub: ReadSub) -> gym.Space[Any]:
+def _read_graph(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
     nodes: Any = read_sub(fields.take("node_space"), ".nodes", True)
     edges: Any = fields.take("edge_space")
     return spaces.Graph(nodes, None if edges is None else read_sub(edges, ".edges", True))
 
 
-_WRITERS: dict[type, Callable[[Any, str, WriteSub], Json]] = {
-    spaces.Box: _write_box,
-    spaces.Discrete: _write_discrete,
-    spaces.MultiDiscrete: _write_multi_discrete,
-    spaces.MultiBinary: _write_multi_binary,
-    spaces.Text: _write_text,
-    spaces.Dict: _write_dict,
-    spaces.Tuple: _write_tuple,
-    spaces.Sequence: _write_sequence,
-    spaces.Graph: _write_graph,
-    spaces.OneOf: _write_tuple,
+_Writer = Callable[[Any, str, WriteSub], Json]
+_Reader = Callable[["_Fields", ReadSub], "gym.Space[Any]"]
+_CODECS: dict[type, tuple[_Writer, _Reader]] = {
+    spaces.Box: (_write_box, _read_box),
+    spaces.Discrete: (_write_discrete, _read_discrete),
+    spaces.MultiDiscrete: (_write_multi_discrete, _read_multi_discrete),
+    spaces.MultiBinary: (_write_multi_binary, _read_multi_binary),
+    spaces.Text: (_write_text, _read_text),
+    spaces.Dict: (_write_dict, _read_dict),
+    spaces.Tuple: (_write_tuple, _read_tuple),
+    spaces.Sequence: (_write_sequence, _read_sequence),
+    spaces.Graph: (_write_graph, _read_graph),
+    spaces.OneOf: (_write_tuple, _read_one_of),
 }
+_READERS = {kind.__name__: reader for kind, (_, reader) in _CODECS.items()}
 
-_READERS: dict[str, Callable[[Fields, ReadSub], gym.Space[Any]]] = {
-    "Box": _read_box,
-    "Discrete": _read_discrete,
-    "MultiDiscrete": _read_multi_discrete,
-    "MultiBinary": _read_multi_binary,
-    "Text": _read_text,
-    "Dict": _read_dict,
-    "Tuple": _read_tuple,
-    "Sequence": _read_sequence,
-    "Graph": _read_graph,
-    "OneOf": _read_one_of,
-}
+
+# ---- the fields of a space's object: bounds, dtypes and shapes
+
+
+class _Fields:
+    """Takes the fields of one object, and checks each of them."""
+
+    def __init__(self, obj: Json, path: str) -> None:
+        self._obj = obj
+        self.path = path
+
+    def take(self, name: str) -> Any:
+        if name not in self._obj:
+            raise FormatError(f"{self.path}: expected a field {name!r}, found none")
+        return self._obj[name]
+
+    def wrong(self, name: str, expected: str) -> FormatError:
+        return FormatError(f"{self.path}: expected {expected} in {name!r}, found {_short(self.take(name))}")
+
+    def integer(self, name: str) -> int:
+        value = self.take(name)
+        if type(value) is not int:
+            raise self.wrong(name, "an integer")
+        return value
+
+    def items(self, name: str) -> list[Any]:
+        value = self.take(name)
+        if not isinstance(value, list):
+            raise self.wrong(name, "a list")
+        return value
+
+    def flag(self, name: str) -> bool:
+        value = self.take(name)
+        if type(value) is not bool:
+            raise self.wrong(name, "true or false")
+        return value
+
+    def dtype(self) -> np.dtype[Any]:
+        value = self.take("dtype")
+        if not isinstance(value, str) or value not in _DTYPES:
+            raise self.wrong("dtype", "the name of a dtype")
+        return _DTYPES[value]
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        value = self.items(name)
+        if len(value) > _MAX_DIMENSIONS or not all(type(n) is int and 0 <= n < 2**63 for n in value):
+            raise self.wrong(name, f"a list of at most {_MAX_DIMENSIONS} lengths")
+        return tuple(value)
+
+    def array(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+        """An array of `shape`, from one number or from one for each element."""
+        value = self.take(name)
+        if not isinstance(value, list):
+            return np.full(shape, self._number(name, value, dtype), dtype)
+        if len(value) != math.prod(shape):
+            raise FormatError(
+                f"{self.path}: expected {math.prod(shape)} numbers in {name!r}, found {len(value)}"
+            )
+        array = np.array([self._number(name, item, dtype) for item in value], dtype)
+        return array.reshape(shape)
+
+    def built_shape(self, shape: tuple[int, ...], *names: str) -> tuple[int, ...]:
+        """`shape`, or a shape of one element with as many dimensions if a large space has the same bounds everywhere.
+
+        Such a space takes a few bytes in a file, and must take few in memory.
+        """
+        uniform = not any(isinstance(self._obj.get(name), list) for name in names)
+        return (1,) * len(shape) if uniform and math.prod(shape) > _LARGE else shape
+
+    def _number(self, name: str, value: Any, dtype: np.dtype[Any]) -> Any:
+        if dtype.kind == "b":
+            exact = type(value) is bool
+        elif dtype.kind == "f":
+            if isinstance(value, str) and value in ("inf", "-inf"):
+                return float(value)
+            with np.errstate(all="ignore"):
+                exact = type(value) is float and value == float(dtype.type(value))
+        else:
+            exact = type(value) is int and np.iinfo(dtype).min <= value <= np.iinfo(dtype).max
+        if not exact:
+            raise FormatError(f"{self.path}: expected a number of {dtype} in {name!r}, found {_short(value)}")
+        return value
+
+
+def _short(value: Any) -> str:
+    """A value for an error message, in one line of bounded length."""
+    try:
+        text = str(value) if isinstance(value, Exception) else repr(value)
+    except ValueError:  # an integer of too many digits to show
+        text = f"a huge {type(value).__name__}"
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _dtype_name(dtype: np.dtype[Any], path: str) -> str:
+    if _DTYPES.get(dtype.name) != dtype:  # big-endian ones have the same name
+        raise SpaceError(
+            f"{path}: expected a dtype of {', '.join(_DTYPES)}, found {dtype.str} ({dtype.name})"
+        )
+    return str(dtype.name)
+
+
+def _numbers(array: np.ndarray[Any, Any]) -> Any:
+    """One number if all elements are the same bits, else the list of them; the opposite of `_Fields.array`."""
+    if array.size and not any(array.strides):  # one element, spread
+        array = array[(slice(1),) * array.ndim]
+    flat = np.ascontiguousarray(array).reshape(-1)
+    if flat.size == 0:
+        return []
+    items = flat.view(f"u{flat.itemsize}")
+    values = flat[:1].tolist() if (items == items[0]).all() else flat.tolist()
+    if flat.dtype.kind == "f":
+        values = [value if math.isfinite(value) else str(value) for value in values]
+    return values[0] if len(values) == 1 else values

@@ -19,7 +19,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import is_url, matching, shown
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem
 from tupli_mcap.storage.base import by_recording

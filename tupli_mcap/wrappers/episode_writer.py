@@ -16,14 +16,13 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, StepError
-from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.options import Capture, Mode, RecordOptions
+from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.infos import entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work

@@ -14,7 +14,6 @@ from gymnasium.envs.registration import EnvSpec
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import resets_itself
 from tupli_mcap.errors import StepError
-from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
@@ -24,6 +23,7 @@ from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
+    Durability,
     Mode,
     RecordInfo,
     RecordOptions,

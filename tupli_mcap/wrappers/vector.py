@@ -14,7 +14,6 @@ from gymnasium.vector.utils import iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import SpaceError, StepError, warn
-from tupli_mcap.journal.seals import Durability
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success, with_success
@@ -23,6 +22,7 @@ from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
+    Durability,
     Mode,
     RecordInfo,
     RecordOptions,

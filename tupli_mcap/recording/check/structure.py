@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
+from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
 from tupli_mcap.mcap.container import CHUNK_ROWS
 from tupli_mcap.mcap.records import (
     CDR_HEADER,
@@ -24,7 +24,7 @@ from tupli_mcap.mcap.records import (
     records,
 )
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.walk import Chunk, Damage, Found, Walk
+from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
@@ -35,7 +35,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.file_end import Tail
+from tupli_mcap.recording.recover.evidence import Tail
 
 _CDR = int.from_bytes(CDR_HEADER, "little")
 _SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length

@@ -28,8 +28,8 @@ from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.recover.file_end import read_tail
-from tupli_mcap.recording.recover.from_file import head, may_be_recording
+from tupli_mcap.recording.recover.damaged import may_be_recording, read_tail
+from tupli_mcap.recording.recover.evidence import head
 from tupli_mcap.recording.recover.from_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 

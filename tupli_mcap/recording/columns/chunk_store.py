@@ -20,8 +20,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import headers_at, message_places, messages
-from tupli_mcap.mcap.compression import decompress
+from tupli_mcap.mcap.chunks import decompress, headers_at, message_places, messages
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source

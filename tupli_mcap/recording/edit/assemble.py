@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.journal.logs import group_records
-from tupli_mcap.mcap.compression import decompress
+from tupli_mcap.mcap.chunks import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows, library
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record

@@ -39,8 +39,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
-from tupli_mcap.recording.recover.from_file import head
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, head
 from tupli_mcap.spaces.leaves import Leaf
 
 STEPS_IN_JOURNAL = "steps that are not yet in a chunk are nowhere else"

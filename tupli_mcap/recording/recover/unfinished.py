@@ -26,8 +26,14 @@ from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, step_channels
 from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.recover.episodes import IN_A_HOLE, RUNNING, PlannedEpisode, final_state, make_plan
-from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, memory_entry
-from tupli_mcap.recording.recover.from_file import head, prefix
+from tupli_mcap.recording.recover.evidence import (
+    Evidence,
+    PackedStore,
+    RecordedChannels,
+    head,
+    memory_entry,
+    prefix,
+)
 from tupli_mcap.recording.recover.from_journal import belongs, find_journal, misplaced_journal, take_journal
 
 

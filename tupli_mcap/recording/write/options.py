@@ -7,12 +7,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.journal.seals import Durability, check_durability
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.remote import is_url
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import EpisodeMetadataCallback
 
 Mode = Literal["x", "w", "a"]
+Durability = Literal["os", "chunk", "step"]
 CaptureEnv = Literal["spec", "pickle"] | None
 Capture = Literal["all", "versions", "none"]
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
@@ -100,7 +100,10 @@ class RecordOptions:
                 "metadata_callback: expected an EpisodeMetadataCallback, which is called with each step and has "
                 f"reset(), found {callback!r:.80}; what is the same for all episodes of a run is metadata="
             )
-        check_durability(self.durability)
+        if self.durability not in get_args(Durability):
+            raise RecordingError(
+                f"durability: expected one of {list(get_args(Durability))}, found {self.durability!r:.80}"
+            )
         check_image_format(self.image_format)
         _check_directory(self.journal_dir)
 

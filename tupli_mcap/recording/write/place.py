@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import journal_aside, journal_in, journal_info, journal_path, owner_among
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 
 
 class Place:

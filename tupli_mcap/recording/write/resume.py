@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal
-from tupli_mcap.journal.seals import sync_file
+from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal, sync_file
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary
 from tupli_mcap.mcap.source import PathSource, Source
@@ -22,7 +21,7 @@ from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.opened import read_contents
-from tupli_mcap.recording.recover.from_file import head, metadata_at
+from tupli_mcap.recording.recover.evidence import head, metadata_at
 from tupli_mcap.recording.recover.from_journal import belongs, misplaced_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
@@ -113,8 +112,7 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
     """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
     if contents.complete or source.size == contents.data_end:
         return
-    from tupli_mcap.recording.recover.file_end import read_tail
-    from tupli_mcap.recording.recover.from_file import gather
+    from tupli_mcap.recording.recover.damaged import gather, read_tail
     from tupli_mcap.recording.recover.from_journal import add_journal
 
     evidence = gather(source, read_tail(source))

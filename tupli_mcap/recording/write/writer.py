@@ -19,9 +19,8 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError, TupliError, os_reason
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
-from tupli_mcap.journal.file import Area, Journal
+from tupli_mcap.journal.file import Area, Journal, boot_id, sync_directory, sync_file
 from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.journal.seals import boot_id, sync_directory, sync_file
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves

@@ -13,7 +13,7 @@ from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path, rewrite_recording
-from tupli_mcap.recording.recover.from_file import metadata_at
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
 from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in

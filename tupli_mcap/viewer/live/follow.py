@@ -40,9 +40,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics, parse
 from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.evidence import Evidence, Piece, RecordedChannels
-from tupli_mcap.recording.recover.file_end import Tail
-from tupli_mcap.recording.recover.from_file import prefix
+from tupli_mcap.recording.recover.evidence import Evidence, Piece, RecordedChannels, Tail, prefix
 from tupli_mcap.recording.recover.from_journal import belongs, define, take_rows
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels

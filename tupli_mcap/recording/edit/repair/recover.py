@@ -24,10 +24,9 @@ from tupli_mcap.recording.edit.repair.write import RepairWriter
 from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_tail
 from tupli_mcap.recording.recover.episodes import Plan, losses, make_plan
 from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
-from tupli_mcap.recording.recover.file_end import read_tail
-from tupli_mcap.recording.recover.from_file import gather, is_recording, may_be_recording
 from tupli_mcap.recording.recover.from_journal import add_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions

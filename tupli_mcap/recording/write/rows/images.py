@@ -11,8 +11,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import Sink
-from tupli_mcap.journal.seals import seal
+from tupli_mcap.journal.logs import Sink, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import CDR_HEADER, RECORD_HEADER
 from tupli_mcap.messages.encode_rows import HOLE, SEQUENCE_OFFSET

@@ -11,8 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeDeriver, RowDeriver, StartedEpisode, even_rows
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import Sink
-from tupli_mcap.journal.seals import STATE, seal
+from tupli_mcap.journal.logs import STATE, Sink, seal
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, make_row_encoder
 from tupli_mcap.messages.episodes import EpisodeEnd

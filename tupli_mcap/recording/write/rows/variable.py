@@ -13,8 +13,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
-from tupli_mcap.journal.logs import FRONT, Sink, as_rows, group_records
-from tupli_mcap.journal.seals import STATE, seal
+from tupli_mcap.journal.logs import FRONT, STATE, Sink, as_rows, group_records, seal
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check

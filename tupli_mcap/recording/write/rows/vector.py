@@ -17,7 +17,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.seals import STATE, seal
+from tupli_mcap.journal.logs import STATE, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.encode_rows import HOLE

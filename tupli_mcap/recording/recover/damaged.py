@@ -1,147 +1,126 @@
-"""Collects what is good in a recording's file: up to its first damage (`prefix`), or anywhere (`gather`)."""
+"""Collects what is good anywhere in a damaged recording's file: its summary and index, then every record.
+
+Opening a recording does not need this; repair and verification do.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Metadata, MetadataIndex, Schema
+from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunk_records import ChunkRecords, chunk_records
-from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import MAGIC, PROFILE, check_crc, foreign, message_index, parse_record
-from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.walk import Chunk, ChunkClaim, Damage, Found, Walk
+from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
+from tupli_mcap.mcap.records import (
+    FOOTER,
+    MAGIC,
+    PROFILE,
+    Summary,
+    attachment_index,
+    check_crc,
+    checked_attachment,
+    has_summary,
+    message_index,
+    parse_record,
+    read_attachment,
+    read_summary,
+    records,
+)
+from tupli_mcap.mcap.source import Source
+from tupli_mcap.mcap.walk import ChunkClaim, Damage, Found, Walk
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
     RECORDING_METADATA,
     REPEATED_METADATA,
-    check_metadata,
     check_version,
     is_ours,
 )
-from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk
-from tupli_mcap.recording.recover.file_end import Tail
+from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
+from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk, Tail
 
+_NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
+_BEFORE_NAME = 9 + 16  # opcode, length and two times
+_WINDOW = 1 << 20
 _HEAD = 4096  # the recording's metadata record begins within this many bytes
 
-# ---- up to the first damage
+# ---- the end of the file
 
 
-def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
-    """Reads records until the file or its data section ends, or a record is damaged.
-
-    The rows of a last chunk without its message index are taken, but `good_end` is before that chunk. With
-    `only_metadata`, it reads only the records before the first chunk.
-
-    Raises:
-        FormatError: the chunks of a channel do not hold its rows without gaps. A damaged end raises nothing.
-    """
-    evidence, walk = Evidence(source, Tail(), strict=True, good_end=len(MAGIC)), Walk(source)
-    waiting: tuple[tuple[int, ...], Rows] | None = None  # a chunk whose message index comes next
-    for opcode, position, length in walk.places():
-        if opcode == Opcode.MESSAGE_INDEX:
-            if waiting is None:
-                break
-            entry, rows = waiting
-            _check_follows(evidence, rows)
-            evidence.pieces.setdefault(rows.channel, []).append(Piece(rows.first, len(rows.offsets), entry))
-            waiting = None
-        elif waiting is not None or (opcode == Opcode.CHUNK and only_metadata):
-            break
-        elif opcode == Opcode.HEADER:  # the contents do not depend on it
-            evidence.profile = _profile(source, position, length)
-        else:
-            record = walk.at(position)
-            if isinstance(record, str) or record.repaired:
-                break
-            if record.chunk is not None:
-                waiting = _chunk(evidence, record, record.chunk)
-            if waiting is None and not _take_next(evidence, record):
-                break
-        if waiting is None:
-            evidence.good_end = position + length
-    if waiting is not None:
-        _check_follows(evidence, waiting[1])
-        evidence.add_rows(waiting[1].channel, [waiting[1]])
-    return evidence
-
-
-def _check_follows(evidence: Evidence, rows: Rows) -> None:
-    if rows.first != evidence.stop(rows.channel):
-        raise FormatError(
-            f"{evidence.source.name}: the chunks of channel {rows.channel} do not hold its rows without gaps"
-        )
-
-
-def _profile(source: Source, position: int, length: int) -> str:
-    body = source.read(position + 9, length - 9)
-    return body[4 : 4 + int.from_bytes(body[:4], "little")].decode(errors="replace")
-
-
-def _take_next(evidence: Evidence, record: Found) -> bool:
-    """Takes the record after those of the prefix; returns False at the end of the data section."""
-    if record.attachment is not None:
-        if record.attachment.name == INDEX_NAME:
-            return False
-        evidence.attachments[record.attachment.name] = record.attachment
-        return True
-    if record.opcode not in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
-        return False
-    parsed = parse_record(record.opcode, record.body, record.offset, evidence.source.name)
-    if isinstance(parsed, Metadata):
-        evidence.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
-        if parsed.name == RECORDING_METADATA:
-            evidence.metadata = parsed.metadata
-    elif isinstance(parsed, Schema):
-        evidence.schemas[parsed.id] = parsed
-    else:
-        evidence.channels[parsed.id] = parsed
-    return True
-
-
-def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, ...], Rows] | None:
-    """A chunk's row of the chunk table, and its rows; None if they are damaged.
-
-    Takes the definitions in the chunk: its CRC covers them, while those outside of chunks have none.
-    """
+def read_tail(source: Source) -> Tail:
+    """Reads summary and index; raises nothing if they are missing or damaged."""
+    tail = Tail(finished=has_summary(source))
+    if tail.finished:
+        try:
+            tail.summary = read_summary(source)
+            tail.statistics = _statistics(source, tail.summary)
+        except FormatError as err:
+            tail.why.append(str(err).removeprefix(f"{source.name}: "))
+    place = None if tail.summary is None else tail.summary.attachments.get(INDEX_NAME)
+    if place is None:
+        place = _find_index(source)
+    if place is None:
+        return tail
     try:
-        content = chunk_records(chunk.data, evidence.source.name, chunk.packed)
+        tail.index = EpisodeIndex.decode(read_attachment(source, place), source.name)
+        tail.finished = True
+    except FormatError as err:
+        tail.why.append(str(err).removeprefix(f"{source.name}: "))
+    return tail
+
+
+def _statistics(source: Source, summary: Summary) -> Statistics | None:
+    data = source.read(summary.start, source.size - len(MAGIC) - FOOTER.size - summary.start)
+    for opcode, position, body in records(data, summary.start, source.name):
+        if opcode == Opcode.STATISTICS:
+            statistics: Statistics = parse_record(opcode, body, position, source.name)
+            return statistics
+    return None
+
+
+def _find_index(source: Source) -> AttachmentIndex | None:
+    """The last attachment with the index's name and a right CRC; the search goes backwards from the end.
+
+    Attachments do not overlap, so damaged ones have no more bytes together than the file. If they claim more, the
+    search ends; otherwise each of many claims could take a checksum over the whole file.
+    """
+    end = budget = source.size
+    while end > 0:
+        start = max(0, end - _WINDOW)
+        window = source.read(start, min(_WINDOW + len(_NAME), source.size - start))
+        at = window.rfind(_NAME)
+        while at >= 0:
+            place = start + at - _BEFORE_NAME
+            length = _length_at(source, place)
+            if length:
+                with contextlib.suppress(FormatError):
+                    return checked_attachment(source, place, length)
+                budget -= length
+                if budget < 0:
+                    return None
+            at = window.rfind(_NAME, 0, at)
+        end = start
+    return None
+
+
+def _length_at(source: Source, place: int) -> int:
+    """The length of the record at an offset if its header is that of an episode index, else 0."""
+    if place < 0:
+        return 0
+    length = int.from_bytes(source.read(place + 1, 8), "little")
+    if source.read(place, 1) != b"\x09" or length > source.size - place - 9:
+        return 0
+    try:
+        attachment = attachment_index(source, place, length)
     except FormatError:
-        return None
-    evidence.schemas |= {schema.id: schema for schema in content.schemas}
-    evidence.channels |= {channel.id: channel for channel in content.channels}
-    headers = content.headers
-    data = bytes(chunk.data[content.skip :])
-    rows = Rows(content.channel, content.first, data, headers["#offset"], headers["#log_time"])
-    return content.row(record.offset, record.length, chunk), rows
+        return 0
+    return length if (attachment.name, attachment.media_type) == (INDEX_NAME, INDEX_MEDIA_TYPE) else 0
 
 
-def head(source: Source) -> dict[str, str]:
-    """The metadata of a recording, from its first records; raises FormatError if they are missing or foreign."""
-    evidence = prefix(source, only_metadata=True)
-    if evidence.metadata is None:
-        if evidence.profile in (PROFILE, ""):
-            raise FormatError(
-                f"{source.name}: the file is cut off or damaged before its first step; nothing can be read from it"
-            )
-        raise foreign(source, f"its profile is {evidence.profile!r}")
-    return check_metadata(source, evidence.metadata)
-
-
-def metadata_at(path: Path) -> dict[str, str]:
-    """The same for the file at a path; raises RecordingError if it cannot be opened."""
-    with contextlib.closing(PathSource(path)) as source:
-        return head(source)
-
-
-# ---- anywhere
+# ---- all of it
 
 
 def gather(source: Source, tail: Tail) -> Evidence:

@@ -1,14 +1,17 @@
-"""The Message records of a chunk as arrays: their offsets and headers."""
+"""What a chunk holds: decompresses it within bounds, and finds its Message records, as arrays of their headers."""
 
 from __future__ import annotations
 
 import struct
 import sys
+import threading
 from collections import deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import lz4.frame
 import numpy as np
+import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
@@ -16,13 +19,72 @@ from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
-from tupli_mcap.mcap.walk import Chunk
+
+MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
+"""Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
+least 4 bytes and holds at most 128 KiB. Zeros come close to both."""
 
 _LENGTH = struct.Struct("<Q")  # of a record, after its opcode
 _BLOCK = 1 << 16  # headers that are copied at once
 _NAMES, _KINDS, _OFFSETS = map(list, zip(*HEADER_FIELDS, strict=True))
 _HEADER: DType = np.dtype({"names": _NAMES, "formats": _KINDS, "offsets": _OFFSETS, "itemsize": BODY})
 HEADERS: DType = np.dtype([*zip(_NAMES, _KINDS, strict=True), ("#offset", "<u8")])
+_local = threading.local()
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    if not hasattr(_local, "zstd"):
+        _local.zstd = zstandard.ZstdDecompressor()
+    found: zstandard.ZstdDecompressor = _local.zstd
+    return found
+
+
+def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
+    """Decompresses one frame to `size` bytes; no more is produced or allocated.
+
+    Raises:
+        FormatError: the frame is damaged, has another size, or bytes follow it, which other readers would read.
+    """
+    if size > len(data) * MAX_RATIO.get(name, size):
+        raise FormatError(
+            f"{where}: {len(data)} compressed bytes cannot hold the {size} bytes that the file declares"
+        )
+    try:
+        if name == "zstd":
+            if zstandard.frame_content_size(data) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+                raise FormatError(
+                    f"{where}: expected {size} bytes, the zstd frame says {zstandard.frame_content_size(data)}"
+                )
+            found: Any = _decompressor().decompress(data, max_output_size=size, allow_extra_data=False)
+        elif name == "lz4":
+            frame = lz4.frame.LZ4FrameDecompressor()
+            found = frame.decompress(bytes(data), max_length=size + 1)
+            if frame.unused_data:
+                raise FormatError(
+                    f"{where}: expected one lz4 frame, found {len(frame.unused_data)} bytes behind it"
+                )
+            if len(found) == size and not frame.eof:
+                raise FormatError(f"{where}: expected the end of the lz4 frame, found more of it")
+        elif name == "":
+            found = data
+        else:
+            raise FormatError(f"{where}: expected compression zstd, lz4 or none, found {name[:20]!r}")
+    except (zstandard.ZstdError, RuntimeError) as err:
+        raise FormatError(f"{where}: the compressed data is damaged: {err}") from err
+    if len(found) != size:
+        raise FormatError(f"{where}: expected {size} bytes after decompression, found {len(found)}")
+    return found
+
+
+class Chunk(NamedTuple):
+    """A chunk's header and its decompressed records, `data`, whose CRC was checked."""
+
+    start_time: int
+    end_time: int
+    crc: int
+    compression: str
+    packed: int
+    data: memoryview
 
 
 class ChunkRecords(NamedTuple):
