@@ -23,7 +23,7 @@ from tupli_mcap.mcap.container import CHUNK_ROWS
 from tupli_mcap.mcap.records import crc32
 from tupli_mcap.mcap.source import PathSource, open_source
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
-from tupli_mcap.recording.columns.threads import do_all
+from tupli_mcap.recording.columns.gather import do_all
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "next_states", "times")

@@ -19,7 +19,7 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import made_of, merge_recordings, say_made_of, verify_recording
+from tupli_mcap.recording import merge_recordings, say_made_of, verify_recording
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
@@ -57,7 +57,7 @@ def test_rewards_change_and_all_else_stays(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.read(fields=["times"]).times, before.read(fields=["times"]).times)
     assert after.uuid != before.uuid
     assert verify_recording(new).ok
-    said = made_of(after)
+    said = after.made_of
     jsonschema.validate(said, json.loads(SCHEMA.read_text()))
     assert said is not None
     assert (said["how"], said["fields"], said["sources"][0]["uuid"]) == ("map", ["rewards"], before.uuid)
@@ -78,7 +78,7 @@ def test_actions_and_rewards_of_some_episodes_of_several_recordings(tmp_path: Pa
     np.testing.assert_array_equal(after.read().actions, 1 - ds.read().actions)
     np.testing.assert_array_equal(after.returns, 2 * ds.returns)
     assert [episode.run.name for episode in after] == ["w0", "w0", "w1", "w1"]
-    said = made_of(Recording(new))
+    said = Recording(new).made_of
     assert said is not None
     assert (said["how"], said["fields"]) == ("map", ["actions", "rewards"])
     assert [Path(one["name"]).name for one in said["sources"]] == ["0.mcap", "1.mcap"]
@@ -236,17 +236,17 @@ def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
     paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
     merge_recordings(paths, tmp_path / "all.mcap")
     both = tupli_mcap.open(paths).filter("seed = 1").save(tmp_path / "both.mcap")
-    said = made_of(Recording(both))
+    said = Recording(both).made_of
     assert said is not None
     assert (said["how"], "seed" in said["query"]) == ("filter", True)
     some = tupli_mcap.open(tmp_path / "all.mcap").filter("seed = 1").save(tmp_path / "some.mcap")
-    said = made_of(Recording(some))
+    said = Recording(some).made_of
     assert said is not None
     jsonschema.validate(said, json.loads(SCHEMA.read_text()))
     assert (said["how"], said["earlier"][0]["how"]) == ("filter", "merge")
     assert len(said["earlier"][0]["sources"]) == 2
     assert "seed" in said["query"]
-    assert made_of(Recording(paths[0])) is None
+    assert Recording(paths[0]).made_of is None
 
 
 def test_sources_are_named_without_folders_and_queries(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from waiting import wait_for
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, TupliDataset, verify_recording, write_recording
 from tupli_mcap.errors import FormatError, NotFoundError
-from tupli_mcap.recording import made_of
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.remote import is_cut_cheaper
@@ -115,7 +114,7 @@ def test_fields_that_are_not_asked_for_are_left_out(users: Users, names: list[st
         assert (few.observation_space, few.action_space) == (spaces.Dict({}), merged.action_space)
         assert np.array_equal(few.read().actions, merged.read().actions)
         assert [e.metadata for e in few.episodes] == [e.metadata for e in merged.episodes]
-        told = made_of(few)
+        told = few.made_of
         assert told is not None and told["without"] == ["frames", "infos", "states"]
         validator("made_of.schema.json").validate(told)
     unlike = asked(users.ann, fields=["actions"])  # their states differ, their actions do not

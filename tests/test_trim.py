@@ -19,7 +19,7 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, doctor
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import Episode, made_of, verify_recording
+from tupli_mcap.recording import Episode, verify_recording
 from tupli_mcap.replay.starts import plan_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -84,7 +84,7 @@ def test_says_where_it_comes_from_and_what_no_reset_leads_to(tmp_path: Path) -> 
     ]  # fmt: skip
     assert after.returns.tolist() == [float(len(episode)) for episode in after]
     assert [episode.run.name for episode in after] == ["ppo"] * 4
-    said = made_of(after)
+    said = after.made_of
     jsonschema.validate(said, json.loads((ROOT / "schemas" / "made_of.schema.json").read_text()))
     assert said is not None
     lengths = [len(episode) for episode in ds]

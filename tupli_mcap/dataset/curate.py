@@ -20,9 +20,9 @@ from tupli_mcap.recording import (
     trim_recording,
 )
 from tupli_mcap.recording.edit import merge, split
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
-from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.schema import BaseFilter, parse_filter

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.check.report import Problem, VerifyReport
     from tupli_mcap.recording.check.verify import verify_recording
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
-    from tupli_mcap.recording.edit.made_of import made_of, say_made_of
+    from tupli_mcap.recording.edit.carried import say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording
@@ -43,7 +43,7 @@ __getattr__ = imported_on_use(
         "check.report": "Problem VerifyReport",
         "check.verify": "verify_recording",
         "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
-        "edit.made_of": "made_of say_made_of",
+        "edit.carried": "say_made_of",
         "edit.merge": "MergeReport merge_recordings",
         "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
         "edit.rewrite": "rewrite_recording",
@@ -71,7 +71,6 @@ __all__ = [
     "edit_run",
     "finish_recording",
     "journal_path",
-    "made_of",
     "merge_recordings",
     "recover_recording",
     "rewrite_recording",

@@ -14,7 +14,7 @@ from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Episode, Recording, rewrite_recording
-from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch

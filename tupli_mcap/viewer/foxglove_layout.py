@@ -19,7 +19,7 @@ from tupli_mcap.dataset.chosen import Source, chosen_from
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names
 from tupli_mcap.viewer.scene import MOST_LINES

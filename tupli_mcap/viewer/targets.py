@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
     LOCAL,

@@ -10,9 +10,8 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
-from tupli_mcap.recording.columns.gather import Column, Rows
+from tupli_mcap.recording.columns.gather import Column, Rows, do_all
 from tupli_mcap.recording.columns.runs import Part, Segments
-from tupli_mcap.recording.columns.threads import do_all
 
 __all__ = ["NumberedRows"]
 

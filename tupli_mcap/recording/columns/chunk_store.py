@@ -6,7 +6,6 @@ the rows' headers must agree with the chunk table.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import struct
@@ -32,11 +31,8 @@ _U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
 _SEQUENCE_AT = 11  # in a record
 _LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
-_MANY_ROWS = 1 << 16
-_HEAD, _REST = (
-    np.dtype("V8"),
-    np.dtype("V4"),
-)  # bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
+# bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
+_HEAD, _REST = np.dtype("V8"), np.dtype("V4")
 
 
 class Span(NamedTuple):
@@ -117,23 +113,13 @@ class Decoder(Protocol):
 _numbers = itertools.count()
 
 
-@functools.lru_cache(maxsize=4)
-def _heads(rows: int, length: int, channel: int) -> tuple[bytes, bytes]:
-    """The bytes with which every row of a chunk begins, as `_HEAD` and `_REST`."""
-    head = _ROW_HEAD.pack(5, length, channel)
-    return head[:8] * rows, head[7:] * rows
-
-
 def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
     """Whether each of the rows, `size` bytes long, begins as a row of the channel does."""
-    if not rows:
-        return True
-    if rows < _MANY_ROWS:  # few sizes of such chunks occur, so their heads are cached
-        heads, rests = _heads(1 << rows.bit_length(), size - 9, channel)
-    else:
-        heads, rests = _heads.__wrapped__(rows, size - 9, channel)
-    found = heads.startswith(np.ndarray(rows, _HEAD, data, 0, (size,)).tobytes())
-    return found and rests.startswith(np.ndarray(rows, _REST, data, 7, (size,)).tobytes())
+    head = _ROW_HEAD.pack(5, size - 9, channel)
+    starts, rests = (
+        np.ndarray(rows, kind, data, at, (size,)).tobytes() for kind, at in ((_HEAD, 0), (_REST, 7))
+    )
+    return starts == head[:8] * rows and rests == head[7:] * rows
 
 
 def _check_sequence(sequences: Array, first: int, where: str) -> None:

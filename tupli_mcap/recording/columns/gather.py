@@ -9,7 +9,9 @@ from __future__ import annotations
 import itertools
 import math
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -22,12 +24,12 @@ from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.runs import Part
-from tupli_mcap.recording.columns.threads import do_all
 from tupli_mcap.spaces.leaves import Leaf
 
 EPISODE = "episode"  # the column with the episode's number in rows of final states
 _BOOL, _U32, _U64 = np.dtype(np.bool_), np.dtype(np.uint32), np.dtype(np.uint64)
 _FEW = 2048  # bytes
+_FEW_TASKS = 4  # up to this many tasks take less time than to start a thread
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": LOG_TIME}
 _LITTLE = sys.byteorder == "little"  # the byte order of rows
 _MANY_ROWS = 1000  # from this many rows on, `_items_dtype` pays
@@ -297,6 +299,45 @@ def _times(values: list[Any]) -> Array:
     if (signed < 0).any():
         raise FormatError(f"expected times of steps below 2**63 ns, found {values[0].max()}")
     return signed
+
+
+# ---- threads
+
+
+def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
+    """Runs all tasks on `threads` threads, the calling one included.
+
+    After an error no further task begins; the first error is raised once running tasks have ended.
+    """
+    # No future for each task: a thread that waits for them wakes up at every one, and takes the interpreter lock.
+    left = deque(tasks)
+    if threads < 2 or len(left) <= _FEW_TASKS:
+        _work(left, left.popleft)
+        return
+    # From both ends: neighbouring tasks write to neighbouring pages, and threads that touch new pages there at the same
+    # time wait for each other.
+    ends = itertools.cycle((left.pop, left.popleft))
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [
+            pool.submit(_work, left, take) for take in itertools.islice(ends, min(threads, len(left)) - 1)
+        ]
+        _work(left, left.popleft)
+    for other in others:
+        other.result()
+
+
+def _work(left: deque[Callable[[], None]], take: Callable[[], Callable[[], None]]) -> None:
+    """Runs one task after the other until none is left."""
+    try:
+        while True:
+            try:
+                task = take()
+            except IndexError:
+                return
+            task()
+    except BaseException:
+        left.clear()
+        raise
 
 
 # ---- copying

@@ -1,14 +1,12 @@
 """Makes new recordings of others.
 
-assemble                          writes or copies the chunks of the new file, its index and summary
+assemble                          writes or copies the chunks of the new file, its index and summary; puts it in place
 copy_episodes                     copies episodes of a recording into it
 merge, split                      joins several recordings into one; splits one into several
 stream                            yields the bytes of a recording of some episodes while it is made
 rewrite                           a recording with fewer episodes
 relabel, trim                     a recording with other values of steps; with fewer steps of episodes
-made_of                           names the recordings that a recording was made of
 attach, annotate                  adds attachments; annotates episodes, and edits the run
-carry_runs                        runs and annotations of a recording that is made of others
+carried                           runs, annotations and sources of a recording that is made of others
 repair                            a recording made of a damaged one
-replacing                         puts a new file in the place of an old one
 """

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import files
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.chunks import decompress
@@ -230,3 +235,33 @@ def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtyp
     starts = store.records(chunk)[1][:, 0].tolist()
     times = [int.from_bytes(memoryview(data)[start + 15 : start + 23], "little") for start in starts]
     return Rows(channel, first, data, np.array(starts, np.uint64), np.array(times, np.uint64))
+
+
+# ---- the file
+
+
+@contextlib.contextmanager
+def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]]:
+    """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
+
+    Missing directories are made.
+
+    Raises:
+        RecordingError: the system refuses, here or in the block; `goal` is unchanged.
+    """
+    try:
+        goal.parent.mkdir(parents=True, exist_ok=True)
+        with files.replacing(goal) as new:
+            fd = files.create(new, permissions)
+            try:
+                yield fd, new
+            finally:
+                os.close(fd)
+    except OSError as err:
+        raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
+
+
+def tidy(directory: Path) -> None:
+    """Removes files that killed processes left in a directory."""
+    with contextlib.suppress(OSError):  # writing there will raise it
+        files.remove_left(files.left_in(directory))

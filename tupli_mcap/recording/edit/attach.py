@@ -14,8 +14,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.edit.assemble import Assembler
-from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.assemble import Assembler, replacing
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.write.resume import restore_container

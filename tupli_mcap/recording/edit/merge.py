@@ -26,11 +26,9 @@ from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler
-from tupli_mcap.recording.edit.carry_runs import carry_runs
+from tupli_mcap.recording.edit.assemble import Assembler, replacing, tidy
+from tupli_mcap.recording.edit.carried import carry_runs, say_made_of
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
-from tupli_mcap.recording.edit.made_of import say_made_of
-from tupli_mcap.recording.edit.replacing import replacing, tidy
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS

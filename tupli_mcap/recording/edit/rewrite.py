@@ -15,10 +15,9 @@ from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler
-from tupli_mcap.recording.edit.carry_runs import carry_runs
+from tupli_mcap.recording.edit.assemble import Assembler, replacing
+from tupli_mcap.recording.edit.carried import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
-from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed

@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.recording.edit.replacing import replacing
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.rewrite import new_metadata, write
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS

@@ -10,9 +10,9 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.recording.edit.assemble import replacing
+from tupli_mcap.recording.edit.carried import say_made_of
 from tupli_mcap.recording.edit.copy_episodes import Trim
-from tupli_mcap.recording.edit.made_of import say_made_of
-from tupli_mcap.recording.edit.replacing import replacing
 from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording

@@ -24,7 +24,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents, step_channels
-from tupli_mcap.recording.index import EpisodeIndex, EpisodeRow, IndexBuilder
+from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.recover.episodes import IN_A_HOLE, RUNNING, PlannedEpisode, final_state, make_plan
 from tupli_mcap.recording.recover.evidence import (
     Evidence,
@@ -174,7 +174,8 @@ def _index(
             start_row, end_row, final, episode.number, end.env, end.end,
         )  # fmt: skip
         builder.add(row, end.metadata)
-    return EpisodeIndex.decode(builder.encode(table.tobytes()), "recovered index")
+    rows = np.frombuffer(bytes(builder.rows), EPISODE_ROWS)
+    return EpisodeIndex(rows, table, bytes(builder.metadata))
 
 
 def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedChannels) -> Iterator[str]:

@@ -19,9 +19,8 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.edit.repair.frames import OldCameras, frames_lost
-from tupli_mcap.recording.edit.repair.write import RepairWriter
-from tupli_mcap.recording.edit.replacing import replacing, tidy
+from tupli_mcap.recording.edit.assemble import replacing, tidy
+from tupli_mcap.recording.edit.repair.write import OldCameras, RepairWriter, frames_lost
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_tail

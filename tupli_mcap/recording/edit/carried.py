@@ -1,16 +1,23 @@
-"""Runs and annotations of a recording that is made of others."""
+"""What a recording that is made of others carries: their runs, their annotations, and which ones they are."""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
-from collections.abc import Sequence
+import json
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
-from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.about.described import MADE_OF_NAME, MAX_MADE_OF
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.recording import Recording
+
+_MADE_OF_MEDIA_TYPE: Final = "application/json"
 
 
 def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple[str, bytes]]:
@@ -45,3 +52,41 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
     if annotations.said:
         found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, annotations.to_json())
     return found
+
+
+def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[str, tuple[str, bytes]]:
+    """The attachment that names the sources of a new recording.
+
+    Args:
+        how: "merge", "filter", "map", "trim".
+        facts: other facts: the query, the function's name, the steps.
+    """
+    sources = list(sources)
+    document = {
+        "how": how,
+        **facts,
+        "sources": [
+            {
+                # without the folder, or the rest of a URL, which are private
+                "name": file_name(recording.name),
+                "uuid": recording.uuid,
+                "episodes": len(recording),
+                "sha256": hashlib.sha256(
+                    bytes.fromhex(recording.uuid) + recording.index.tobytes()
+                ).hexdigest(),
+            }
+            for recording in sources
+        ],
+    }
+    earlier = [said for recording in sources if (said := _said(recording)) is not None]
+    data = json.dumps({**document, "earlier": earlier} if earlier else document).encode()
+    if len(data) > MAX_MADE_OF:
+        data = json.dumps(document).encode()
+    return {MADE_OF_NAME: (_MADE_OF_MEDIA_TYPE, data)}
+
+
+def _said(recording: Recording) -> dict[str, Any] | None:
+    try:
+        return recording.made_of
+    except FormatError:  # damage of this attachment does not concern the steps
+        return None
