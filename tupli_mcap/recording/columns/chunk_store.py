@@ -115,6 +115,8 @@ _numbers = itertools.count()
 
 def _are_rows(data: Any, rows: int, size: int, channel: int) -> bool:
     """Whether each of the rows, `size` bytes long, begins as a row of the channel does."""
+    if not rows:
+        return True
     head = _ROW_HEAD.pack(5, size - 9, channel)
     starts, rests = (
         np.ndarray(rows, kind, data, at, (size,)).tobytes() for kind, at in ((_HEAD, 0), (_REST, 7))
