@@ -328,20 +328,6 @@ def test_same_step_declared_by_an_environment_that_gives_no_final_states(tmp_pat
         run(env)
 
 
-@pytest.mark.filterwarnings("ignore:same-step autoreset without final states")
-@pytest.mark.parametrize("rests", [False, True])
-def test_same_step_given_for_an_environment_that_resets_in_the_next_step(tmp_path: Path, rests: bool) -> None:
-    """A step without reward after an end may be one, where others have none either."""
-    envs = Counting(next_step=True, reward=lambda states: np.where(rests & (states[:, 2] == 1), 0.0, 1.0))
-    with RecordEpisodes(envs, tmp_path / "r.mcap", autoreset_mode="SameStep") as env:
-        if rests:
-            run(env)
-        else:
-            with pytest.raises(StepError, match=r'found no reward, which all other steps had.*"NextStep"'):
-                run(env)
-    assert verify_recording(tmp_path / "r.mcap").ok
-
-
 @pytest.mark.parametrize("states", [np.zeros((N + 1, 3), np.float32), [None]])
 def test_another_number_of_final_states(tmp_path: Path, states: Any) -> None:
     env = RecordEpisodes(Counting(lambda *_: {"final_obs": states}), tmp_path / "r.mcap")

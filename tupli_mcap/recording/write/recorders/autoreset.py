@@ -14,8 +14,6 @@ reset. An environment may declare no mode, or a wrong one, so:
    it too. That batch is refused. (Wrappers may give rewards to resets, so a declared mode takes precedence over a
    reward.)
 3. Where no mode is declared, an end is written with the batch after it: if that is refused, without a final state.
-4. Under same-step autoreset without final states, which the caller has asked for, a step after an end without reward
-   and flags shows that this was a reset, if every other step had a reward. That batch is refused.
 """
 
 from __future__ import annotations
@@ -44,7 +42,6 @@ class Autoreset:
         mode: the mode that is recorded by; "SameStep" once rule 1 applied.
         is_assumed: neither the environment nor the caller has said which mode it is.
         needs_no_finals: the caller has given same-step autoreset, whether infos hold final states or not.
-        watches_steps: `check_steps` must be called, because no final state was seen yet.
         is_plain: next-step autoreset, and not because it is assumed.
         has_ended: ends are recorded by the mode.
         doubt: what the caller should be told, if anything.
@@ -53,13 +50,12 @@ class Autoreset:
     def __init__(self, mode: Mode, *, given: bool, assumed: bool = False) -> None:
         self.mode = mode
         self.is_assumed = assumed
-        self.needs_no_finals = self.watches_steps = given and mode == "SameStep"
+        self.needs_no_finals = given and mode == "SameStep"
         self.doubt = ""
         self.has_ended = False
         self.is_plain = mode == "NextStep" and not assumed
         self._given = given
         self._has_told = False
-        self._rests = False  # a step that came after no end went without a reward
 
     @classmethod
     def of(cls, env: Any, given: Any) -> Autoreset:
@@ -130,32 +126,11 @@ class Autoreset:
                 + _OTHERWISE
             )
 
-    def check_steps(self, ended: Array, done: Array, rewards: Array) -> None:
-        """Checks a batch under same-step autoreset, after one in which the sub-environments `ended`.
-
-        Raises:
-            StepError: one of them was reset only now.
-        """
-        if not self._has_told:  # no final state was missing yet
-            ended = np.zeros_like(ended)
-        rests = ~(_rewarded(rewards, done) | done)
-        late = rests & ended
-        if late.any() and not self._rests:
-            i = int(late.argmax())
-            raise StepError(
-                f"expected a step of sub-environment {i} after its end, as same-step autoreset goes on, "
-                "found no reward, which all other steps had: a reset, as next-step autoreset does it; pass "
-                'autoreset_mode="NextStep", or let infos["final_obs"] hold the final states'
-            )
-        self._rests = self._rests or bool((rests & ~ended).any())
-
     def note_ends(self, *, known: bool) -> None:
         """Chooses the warning for the caller once ends are recorded. `known`: with their final states."""
         if self._has_told:
             return
-        if known:
-            self.watches_steps = False
-        else:
+        if not known:
             self._has_told = True
             self.doubt = (
                 "same-step autoreset without final states in infos (final_obs): "

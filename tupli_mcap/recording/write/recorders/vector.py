@@ -160,10 +160,7 @@ class VectorRecorder:
             holes = self._ended if self._any_ended and resets.mode == "NextStep" else None
             active = None if holes is None else ~holes
             ended = done & active if any_done and active is not None else done
-            if holes is None:
-                if resets.watches_steps:
-                    resets.check_steps(self._ended, done, rewards)
-            elif resets.is_assumed or ended.tobytes() != flags:
+            if holes is not None and (resets.is_assumed or ended.tobytes() != flags):
                 self._check_resets(holes, done, rewards)
             # the whole batch is checked, then episodes are started, then it is written: recorded or refused as one
             final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
