@@ -38,18 +38,12 @@ class Counting(gym.vector.VectorEnv[Any, Any, Any]):
         declared: Any = None,
         next_step: bool = False,
         lengths: tuple[int, ...] = (2, 3, 4),
-        reward: Callable[[Any], Any] = lambda states: np.ones(N),
     ) -> None:
         self.num_envs = N
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, N)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, N)
         self.metadata = {} if declared is None else {"autoreset_mode": declared}
-        self._infos, self._next_step, self._lengths, self._reward = (
-            infos,
-            next_step,
-            np.array(lengths),
-            reward,
-        )
+        self._infos, self._next_step, self._lengths = infos, next_step, np.array(lengths)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         self.states = np.zeros((N, 3), np.float32)

@@ -171,9 +171,8 @@ class CommittedRows(Committed[Array]):
             return []
         halves, places = self._halves[ended], self._places[ended]
         last = rows[halves, places]
-        beyond = (
-            places + 1 == self._area.rows
-        )  # the spare row: its state was copied to the other half's first row
+        # the spare row: its state was copied to the other half's first row
+        beyond = places + 1 == self._area.rows
         halves, places = np.where(beyond, 1 - halves, halves), np.where(beyond, 0, places + 1)
         after = rows[halves, places]
         valid = (after["#sequence"] == HOLE) & (after["episode"] == last["episode"])

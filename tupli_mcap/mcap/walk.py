@@ -36,11 +36,8 @@ _PARSING = 16  # cost of parsing a byte, in CRC checks of a byte
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 _END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
 _PARSED = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, *_SUMMARY)
-_SIZES: dict[int, int] = {
-    Opcode.DATA_END: 4,
-    Opcode.FOOTER: 20,
-    Opcode.SUMMARY_OFFSET: 17,
-}  # of bodies of constant size
+# of bodies of constant size
+_SIZES: dict[int, int] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
 _LEAST: dict[int, int] = {
     Opcode.HEADER: 8, Opcode.SCHEMA: 14, Opcode.CHANNEL: 16, Opcode.MESSAGE: 22, Opcode.CHUNK: 40,
     Opcode.MESSAGE_INDEX: 6, Opcode.CHUNK_INDEX: 64, Opcode.ATTACHMENT: 36, Opcode.STATISTICS: 46,
@@ -107,9 +104,8 @@ class Walk:
         self._known = dict(known or {})
         self._known_offsets = sorted(self._known)
         self._end = source.size if end is None else min(end, source.size)
-        self._budget = 4 * source.size + (
-            64 << 20
-        )  # bytes of CRC checks for false starts while looking for a record
+        # bytes of CRC checks for false starts while looking for a record
+        self._budget = 4 * source.size + (64 << 20)
 
     def __iter__(self) -> Iterator[Found | Damage]:
         position = len(MAGIC)

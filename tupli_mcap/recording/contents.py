@@ -26,10 +26,8 @@ CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
 _VERSIONS = ("1", "2")
-_KEYS = {
-    "image": "leaf",
-    "frame": "camera",
-}  # kind of a channel -> key of its metadata that has the name in its topic
+# kind of a channel -> key of its metadata that has the name in its topic
+_KEYS = {"image": "leaf", "frame": "camera"}
 _VALUES = (
     ("uuid", "32 hexadecimal digits", re.compile("[0-9a-f]{32}")),
     ("created_ns", "a time in decimal digits", re.compile("[0-9]{1,19}")),

@@ -191,9 +191,8 @@ def _distribution(leaf: Leaf | None, name: str, values: Array, points: int) -> S
     if leaf is not None and isinstance(leaf.space, spaces.Discrete):  # values that never occur are shown, too
         least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
     bins, end = points, most
-    if (
-        np.array_equal(values, np.round(values)) and most - least < 2**52
-    ):  # each bin has the same number of whole numbers
+    # each bin has the same number of whole numbers
+    if np.array_equal(values, np.round(values)) and most - least < 2**52:
         width = np.ceil((most - least + 1) / points)
         bins = int(np.ceil((most - least + 1) / width))
         end = least + width * bins

@@ -266,9 +266,8 @@ def _write_key(key: Any, path: str) -> Any:
     except (TypeError, ValueError) as err:
         raise SpaceError(f"{path}: expected keys with a JSON form, found {_short(key)}: {err}") from err
     restored = jsonvalue.loads(text)
-    if (
-        type(restored) is not type(key) or restored != key
-    ):  # an enumeration, a named tuple, an object equal to nothing
+    # an enumeration, a named tuple, an object equal to nothing
+    if type(restored) is not type(key) or restored != key:
         raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {_short(key)}")
     return key if text.startswith('"') else {"key": text}
 

@@ -47,11 +47,8 @@ def fill(path: Path) -> Iterator[Path]:
     with files.replacing(path, overwrite=False) as new:
         try:
             yield new
-        except (
-            FormatError,
-            RecordingError,
-            SignatureError,
-        ) as err:  # the user does not know the temporary name
+        except (FormatError, RecordingError, SignatureError) as err:
+            # the user does not know the temporary name
             raise type(err)(str(err).replace(str(new), str(path))) from err
         finally:
             with contextlib.suppress(OSError):  # left by an interrupted writer

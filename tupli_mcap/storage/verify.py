@@ -79,10 +79,8 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
                 report = VerifyReport(str(path), kind="storage")
                 message, _, advice = str(err).removeprefix(f"{path}: ").partition("; ")
                 if isinstance(err, OSError):
-                    message, advice = (
-                        f"it cannot be read: {err.strerror}",
-                        "check the directory's permissions",
-                    )
+                    message = f"it cannot be read: {err.strerror}"
+                    advice = "check the directory's permissions"
                 Findings(report).error("file", message, advice=advice)
                 yield report
                 continue

@@ -163,10 +163,8 @@ class _Checker:
         dtype = (self._layout.step_message if step else self._layout.final_message).dtype
         try:
             for chunk in self._store.chunks(channel):
-                rows, first = (
-                    self._store.rows(chunk, dtype, keep=False),
-                    int(self._store.table["first"][chunk]),
-                )
+                rows = self._store.rows(chunk, dtype, keep=False)
+                first = int(self._store.table["first"][chunk])
                 for name in names:
                     wrong = (rows[name].view(np.uint8) > 1).reshape(len(rows), -1).any(axis=1)
                     for i in np.flatnonzero(wrong)[:3].tolist():

@@ -60,11 +60,8 @@ class _Pair:
             self._error(
                 f"row {i + 1} is of an earlier step than the row before, or the same", self._pair_topic
             )
-        runs = (
-            episodes[np.flatnonzero(np.append(True, episodes[1:] != episodes[:-1]))]
-            if len(rows)
-            else episodes
-        )
+        starts = np.append(True, episodes[1:] != episodes[:-1])[: len(rows)]
+        runs = episodes[starts]
         if len(np.unique(runs)) != len(runs):
             self._error("frames of an episode are not one after another", self._pair_topic)
         order = np.argsort(self._rows["episode"], kind="stable")

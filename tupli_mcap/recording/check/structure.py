@@ -322,9 +322,8 @@ class Structure:
             if not self._tail.why:
                 self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
-        last = {
-            index.name: index for index in self._attachments
-        }  # the bytes of a replaced one may still be there
+        # the bytes of a replaced one may still be there
+        last = {index.name: index for index in self._attachments}
         self._attachments = sorted(last.values(), key=lambda index: index.offset)
         self._summary(self._tail.summary.start)
 

@@ -175,10 +175,8 @@ class ColumnReader:
                 continue
             if leaf is not None:
                 moved = runs._replace(channels=self._image_channels(leaf, runs.channels))
-            own, parts = (
-                {name: rows.columns[name].empty(total) for name in names},
-                parts_of(moved, self._store),
-            )
+            own = {name: rows.columns[name].empty(total) for name in names}
+            parts = parts_of(moved, self._store)
             columns |= own
             tasks += rows.tasks(own, parts, keep)
             chunks += [part.chunk for part in parts]

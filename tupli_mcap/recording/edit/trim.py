@@ -62,10 +62,8 @@ def trim_recording(
         raise RecordingError(f"{target} is the recording itself; write to another path")
     trims = trims_of(source, steps)
     rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
-    total, lengths = (
-        int(rows["length"].sum()),
-        dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True)),
-    )
+    total = int(rows["length"].sum())
+    lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
     left_out = sum(lengths[number] - (trim.stop - trim.start) for number, trim in trims.items())
     report = TrimReport(target, len(rows), total - left_out, left_out)
     if dry_run:

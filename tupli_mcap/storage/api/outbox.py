@@ -227,9 +227,7 @@ class Outbox:
             if len(recording):
                 try:
                     send_file(self._session, path, sent_before=before, tell=tell)
-                except (
-                    ConflictError
-                ):  # some of what was sent is not here any more, since the power failed, say
+                except ConflictError:  # some of what was sent is not here any more
                     if not before:
                         raise
                     self._send_part(path, recording, numbers_of(recording, before))

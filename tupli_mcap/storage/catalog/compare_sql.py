@@ -290,10 +290,8 @@ def _in_metadata(filter: BaseFilter) -> Condition:
         return true()
     if len(wanted) > _MOST_VALUES:
         return true()
-    value, parts = (
-        value_at(path),
-        [EPISODE.c.metadata.contains('"$', autoescape=True)],
-    )  # tags stand for other values
+    value = value_at(path)
+    parts = [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
     for scalar in wanted:
         if filter.type is FilterType.CONTAINS:
             parts.append(_occurs(scalar.value, text_at(path)))

@@ -24,9 +24,8 @@ from tupli_mcap.storage.catalog.tables import APPLICATION_ID, METADATA, VERSION
 
 BUSY_MS: Final = 30_000
 _ATTEMPTS: Final = 100  # to open a file that others replace
-_CACHE_KIB: Final = (
-    32 * 1024
-)  # the index of a declared key has to stay in memory: rows do not come in its order
+# the index of a declared key has to stay in memory: rows do not come in its order
+_CACHE_KIB: Final = 32 * 1024
 _UNUSABLE: Final = (
     sqlite3.SQLITE_FULL,
     sqlite3.SQLITE_IOERR,

@@ -66,9 +66,8 @@ RECORDING: Final = Table(
     Column("mixed", NUMBER, nullable=False),
     Column("uuid", TEXT, nullable=False, index=True),
     Column("benchmark_id", TEXT, nullable=False, index=True),
-    Column(
-        "environment", TEXT, nullable=False, server_default=""
-    ),  # that of its first run, "" if it does not say
+    # that of its first run, "" if it does not say
+    Column("environment", TEXT, nullable=False, server_default=""),
     Column("runs", TEXT, nullable=False),  # JSON: those that its episodes are of
 )
 
@@ -87,9 +86,8 @@ EPISODE: Final = Table(
     Column("created_by", TEXT, nullable=False),
     Column("published_in", TEXT, nullable=False),
     Column("metadata", TEXT, nullable=False),
-    Column(
-        "readable", Boolean, nullable=False, server_default=false()
-    ),  # whether SQL may look into the metadata
+    # whether SQL may look into the metadata
+    Column("readable", Boolean, nullable=False, server_default=false()),
     Column("success", NUMBER),  # 0 or 1 where the metadata say it
     Column("run", NUMBER, nullable=False),  # its place among the recording's
     Column("exact", TEXT),  # JSON of the fields that the columns cannot hold exactly

@@ -44,9 +44,8 @@ class ImageRows:
     ) -> None:
         self._start_chunks = start_chunks
         self._sealed = sealed
-        self._jobs: dict[
-            int, Callable[[], None]
-        ] = {}  # write a chunk that is being made, by the half it is in
+        # write a chunk that is being made, by the half it is in
+        self._jobs: dict[int, Callable[[], None]] = {}
         self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
         self._leaf = leaf
         self._layout = layout

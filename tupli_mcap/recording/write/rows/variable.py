@@ -344,10 +344,8 @@ class StepLogs:
 def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
     """Encodes a final state that is in no row, as it follows `episode` and `env` in `/final_state`; StepError if it
     cannot be stored exactly."""
-    check, encoders = (
-        structure_check(layout.observation_space, "state"),
-        leaf_encoders(layout, layout.final_leaves),
-    )
+    check = structure_check(layout.observation_space, "state")
+    encoders = leaf_encoders(layout, layout.final_leaves)
 
     def encode(state: Any) -> bytes:
         check(state)

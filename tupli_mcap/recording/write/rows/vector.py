@@ -30,9 +30,8 @@ from tupli_mcap.spaces.leaves import Leaf
 
 _ACTION, _REWARD, _STATE = range(3)
 _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
-_Values = list[
-    tuple[Array, Any, int]
-]  # of leaves: their place in the rows, values, 1 if it is in the next rows
+# of leaves: their place in the rows, values, 1 if it is in the next rows
+_Values = list[tuple[Array, Any, int]]
 _Images = Sequence[tuple[Sequence[ImageRows], list[Array]]]  # of leaves: the stores, and what each is given
 # values, images, terminals, timeouts, and who took a step; not a class: one is made in every step
 Batch = tuple[_Values, _Images, Array, Array, Array | None]
