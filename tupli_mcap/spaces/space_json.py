@@ -60,16 +60,16 @@ class _Budget:
         return None
 
 
-def space_to_json(space: gym.Space[Any], name: str = "space") -> Json:
+def space_to_json(space: gym.Space[Any]) -> Json:
     """Return an object of `str`, `int`, `float`, `bool`, `list` and `dict` only, which describes `space`.
 
     The state of the space's random generator is left out.
 
     Raises:
         SpaceError: a space is not Gymnasium's own (or is a subclass), no message can hold a dtype, or a key has no JSON
-            form; the message starts with the path of the leaf: `name['a'][1]`.
+            form; the message starts with the path of the leaf: `space['a'][1]`.
     """
-    return _write(space, name, 0, 1, _Budget())
+    return _write(space, "space", 0, 1, _Budget())
 
 
 def space_from_json(obj: Any) -> gym.Space[Any]:

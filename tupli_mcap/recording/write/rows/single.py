@@ -206,10 +206,9 @@ class SingleRows:
         start = self._offset()
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
-    def _seal(self, offset: int, *, alone: bool = False) -> None:
+    def _seal(self, offset: int) -> None:
         end = offset + self._area.row_size
-        running = b"" if alone else self._buffer[end + STATE : end + self._state_end]
-        seal(self._buffer, offset, end, running)
+        seal(self._buffer, offset, end, self._buffer[end + STATE : end + self._state_end])
 
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
