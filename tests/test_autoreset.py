@@ -60,7 +60,7 @@ class Counting(gym.vector.VectorEnv[Any, Any, Any]):
         self.states[:, 2] += 1
         self._restart(resets)
         done = ~resets & (self.states[:, 2] == self._lengths)
-        rewards = np.where(resets, 0.0, self._reward(self.states))
+        rewards = np.where(resets, 0.0, 1.0)
         final = self.states.copy()
         if not self._next_step:
             self._restart(done)
