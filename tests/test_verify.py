@@ -393,7 +393,7 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
         artifact.write_bytes(b"other")
         flip(root / "recordings" / "one.mcap", 2000)
         (root / "recordings" / "gone.mcap.journal").write_bytes(b"x")
-        (root / "recordings" / ".0123456789abcdef.tmp").write_bytes(b"x")
+        (root / "recordings" / f".tupli-mcap-{32 * '0'}.tmp").write_bytes(b"x")
         notes = {"version": 1, "uuid": Recording(root / "recordings" / "two.mcap").uuid, "deleted": [77]}
         (root / "recordings" / "two.mcap.json").write_text(json.dumps(notes))
         report = verify_storage(storage)
