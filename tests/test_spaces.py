@@ -149,8 +149,8 @@ class MyBox(spaces.Box):
 )
 def test_refused_leaves_are_named(leaf):
     space = spaces.Dict({"a": spaces.Tuple([spaces.Discrete(2), spaces.Sequence(leaf)])})
-    with pytest.raises(SpaceError, match=r"^observation\['a'\]\[1\]\[\]: expected a (space|dtype) of"):
-        space_to_json(space, "observation")
+    with pytest.raises(SpaceError, match=r"^space\['a'\]\[1\]\[\]: expected a (space|dtype) of"):
+        space_to_json(space)
 
 
 def test_refused_keys_and_depth_are_named():
