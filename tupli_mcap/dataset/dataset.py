@@ -491,8 +491,8 @@ class Dataset(RandomAccess):
         Raises:
             RecordingError: all episodes of a file would be deleted (without `force`), or a file is at a URL; then none
                 is deleted.
-            DeniedError: an episode on a server is somebody else's.
-            StorageError: the server cannot be reached, the notes cannot be written, ...
+            StorageError: an episode on a server is somebody else's, the server cannot be reached, the notes beside a
+                file cannot be written, ...
         """
         doomed: dict[tuple[str, str], list[int]] = {}
         for header in self.headers:
