@@ -166,6 +166,29 @@ def test_questions_that_take_too_long_are_given_up(of: str, tmp_path: Path, requ
             assert queries.count_episodes(connection, F("metadata.x") != 5) == 50_000
 
 
+@pytest.mark.parametrize(
+    ("method", "path", "told"),
+    [
+        ("POST", "/episodes/record", {"benchmark_id": "x", "metadata": {}, "tuples": [{}] * 1000}),
+        ("POST", "/access/groups/add-members", {"group_name": "x", "members": [{}] * 1000}),
+        (
+            "POST",
+            "/access/groups/add-members",
+            {"group_name": "x", "members": [{"user": "a", "roles": [1] * 1000}]},
+        ),
+        ("POST", "/access/roles/create", {"role": "x", "rights": ["x"] * 1000}),
+    ],
+)
+def test_a_body_of_many_defects_is_refused_at_the_first_one(
+    tmp_path: Path, method: str, path: str, told: Any
+) -> None:
+    """A list of all of them would fill the memory."""
+    with server_with(tmp_path / "served") as admin:
+        refused = httpx.request(method, admin.url + path, json=told, headers=token_of(admin))
+        assert refused.status_code == 422
+        assert len(refused.json()["detail"]) <= 3  # of one item
+
+
 def test_lists_come_in_pages(tmp_path: Path) -> None:
     with server_with(tmp_path / "served", max_page=3) as admin:
         benchmarks = [admin.store_benchmark(query(name=f"b{i}")).id for i in range(7)]

@@ -163,7 +163,7 @@ class Episode(BaseModel):
 
     benchmark_id: str
     metadata: dict[str, Any]
-    tuples: list[RLTuple]
+    tuples: list[RLTuple] = Field(fail_fast=True)  # a defect in each would fill the memory
 
 
 class EpisodeHeader(DBItem):

@@ -53,7 +53,7 @@ class UserRole(BaseModel):
     """A role and the rights that it gives."""
 
     role: str
-    rights: list[Right]
+    rights: list[Right] = Field(fail_fast=True)
     description: str | None = None
 
 
@@ -68,14 +68,14 @@ class GroupMembership(BaseModel):
     """A user of a group; without roles, a `member`, or all of their roles."""
 
     user: str
-    roles: list[str] | None = None
+    roles: list[str] | None = Field(default=None, fail_fast=True)
 
 
 class GroupMembershipQuery(BaseModel):
     """Users to add to a group, or to remove from it."""
 
     group_name: str
-    members: list[GroupMembership]
+    members: list[GroupMembership] = Field(fail_fast=True)
 
 
 class GroupWithMembers(Group):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import APIRouter
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, FailFast, Field
 
 from tupli_mcap.schema import Group, UserRole
 from tupli_mcap.server.database import audit
@@ -72,7 +72,10 @@ class Member(BaseModel):
     """A user in a group."""
 
     user: str
-    roles: list[str] = Field(default_factory=lambda: ["member"])
+    roles: list[str] = Field(default_factory=lambda: ["member"], fail_fast=True)
+
+
+_Members = Annotated[list[Member], FailFast()]
 
 
 class GroupWithMembers(Group):
@@ -197,7 +200,9 @@ def delete_group(library: Served, caller: Writer, name: str) -> None:
 
 
 @router.put("/groups/{name}/members")
-def add_members(library: Served, caller: Writer, name: str, told: list[Member]) -> GroupWithMembers:
+def add_members(
+    library: Served, caller: Writer, name: str, told: Annotated[list[Member], FailFast()]
+) -> GroupWithMembers:
     """Gives users roles in a group: to all of them, or to none."""
     with library.database.writing() as connection:
         accounts.add_members(connection, caller, name, [(member.user, member.roles) for member in told])

@@ -40,9 +40,9 @@ class EpisodeQuery(BaseModel):
 
     filter: AskedFilter | None = None
     benchmark_filter: AskedFilter | None = None
-    recordings: list[str] | None = Field(default=None, max_length=10_000)
-    episodes: list[int] | None = None
-    fields: list[str] | None = None
+    recordings: list[str] | None = Field(default=None, max_length=10_000, fail_fast=True)
+    episodes: list[int] | None = Field(default=None, fail_fast=True)
+    fields: list[str] | None = Field(default=None, fail_fast=True)
 
     @property
     def left_out(self) -> list[str]:
