@@ -38,8 +38,8 @@ _UNNAMED: Final = "Recordings without an environment"
 
 @dataclass(frozen=True)
 class Dataset:
-    """The facts of a dataset that the catalog has without reading its episodes. They are sums over its files: an episode
-    that two files have, which lists show once, counts twice.
+    """The facts of a dataset that the catalog has without reading its episodes. They are sums over its files: an
+    episode that two files have, which lists show once, counts twice.
 
     key: its name in addresses. benchmark: None for recordings without one, or if the reader may not see it.
     recordings: empty only for a benchmark without recordings.
