@@ -25,8 +25,8 @@ END_SCHEMA = (
 )
 
 _SEED = re.compile(r"-?[0-9]{1,80}", re.ASCII)
-_START = struct.Struct("<IIQ??2x")
-_END = struct.Struct("<IIQQdB?2x")
+START_FIELDS = struct.Struct("<IIQ??2x")
+END_FIELDS = struct.Struct("<IIQQdB?2x")
 
 
 def record(channel: int, sequence: int, time_ns: int, body: bytes) -> bytes:
@@ -70,16 +70,28 @@ class EpisodeStart(NamedTuple):
         return int(self.seed) if _SEED.fullmatch(self.seed) else None
 
     def encode(self) -> bytes:
-        return _START.pack(*self[:5]) + _strings(self.seed, self.options, self.reset_info)
+        return START_FIELDS.pack(*self[:5]) + start_texts(*self[5:])
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeStart:
-        if len(body) < _START.size:
-            raise FormatError(f"/episode_start: expected at least {_START.size} bytes, found {len(body)}")
-        seed, at = cdr.read_string(body, _START.size, 0)
+        if len(body) < START_FIELDS.size:
+            raise FormatError(
+                f"/episode_start: expected at least {START_FIELDS.size} bytes, found {len(body)}"
+            )
+        seed, at = cdr.read_string(body, START_FIELDS.size, 0)
         options, at = cdr.read_string(body, at, 0)
         reset_info, _ = cdr.read_string(body, at, 0)
-        return cls._make([*_START.unpack_from(body, 0), seed, options, reset_info])
+        return cls._make([*START_FIELDS.unpack_from(body, 0), seed, options, reset_info])
+
+
+_PLAIN_START = _strings("", "", "{}")
+
+
+def start_texts(seed: str, options: str, reset_info: str) -> bytes:
+    """The end of an `EpisodeStart`'s CDR body, which follows its `START_FIELDS`."""
+    if seed == "" and options == "" and reset_info == "{}":
+        return _PLAIN_START
+    return _strings(seed, options, reset_info)
 
 
 class EpisodeEnd(NamedTuple):
@@ -95,14 +107,22 @@ class EpisodeEnd(NamedTuple):
     metadata: str
 
     def encode(self) -> bytes:
-        return _END.pack(*self[:7]) + _strings(self.metadata)
+        return END_FIELDS.pack(*self[:7]) + end_texts(self.metadata)
 
     @classmethod
     def decode(cls, body: memoryview) -> EpisodeEnd:
-        if len(body) < _END.size:
-            raise FormatError(f"/episode_end: expected at least {_END.size} bytes, found {len(body)}")
-        metadata, _ = cdr.read_string(body, _END.size, 0)
-        message = cls._make([*_END.unpack_from(body, 0), metadata])
+        if len(body) < END_FIELDS.size:
+            raise FormatError(f"/episode_end: expected at least {END_FIELDS.size} bytes, found {len(body)}")
+        metadata, _ = cdr.read_string(body, END_FIELDS.size, 0)
+        message = cls._make([*END_FIELDS.unpack_from(body, 0), metadata])
         if message.end >= len(END_NAMES):
             raise FormatError(f"/episode_end: expected an end of 0, 1 or 2, found {message.end}")
         return message
+
+
+_PLAIN_END = _strings("{}")
+
+
+def end_texts(metadata: str) -> bytes:
+    """The end of an `EpisodeEnd`'s CDR body, which follows its `END_FIELDS`."""
+    return _PLAIN_END if metadata == "{}" else _strings(metadata)

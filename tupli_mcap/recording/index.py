@@ -85,21 +85,33 @@ class IndexBuilder:
         self.metadata = bytearray() if index is None else bytearray(index.metadata)
         self.count = 0 if index is None else len(index.episodes)
 
-    def add(self, row: EpisodeRow, metadata: str) -> None:
-        """Adds an episode and its metadata as JSON."""
-        *places, seed, start_row, end_row, final_row, number, env, end = row
+    def add(self, row: tuple[Any, ...], metadata: str) -> None:
+        """Adds an episode and its metadata as JSON; `row` is an `EpisodeRow`, or a plain tuple of its fields."""
+        (
+            first_row,
+            length,
+            total,
+            start_time,
+            end_time,
+            seed,
+            start_row,
+            end_row,
+            final_row,
+            number,
+            env,
+            end,
+        ) = row
         text = b"" if metadata == "{}" else metadata.encode()
         indexed, has_seed = indexed_seed(seed)
         try:
             self.rows += _ROW.pack(
-                *places, indexed, start_row, end_row, final_row, len(self.metadata), len(text), number, env, end,
-                has_seed,
+                first_row, length, total, start_time, end_time, indexed, start_row, end_row,
+                final_row, len(self.metadata), len(text), number, env, end, has_seed,
             )  # fmt: skip
         except struct.error as err:  # values from a damaged journal
             raise FormatError(
                 f"episode {number}: expected times before 2^63 ns, and numbers that fit the index, found a start at "
-                f"{row.start_time} and an end at {row.end_time} ns: a clock was set wrong, or the journal is damaged "
-                f"({err})"
+                f"{start_time} and an end at {end_time} ns: a clock was set wrong, or the journal is damaged ({err})"
             ) from err
         self.metadata += text
         self.count += 1

@@ -1,4 +1,7 @@
-"""Puts the starts and ends of episodes into the journal."""
+"""Puts the starts and ends of episodes into the journal.
+
+This runs once an episode, with cold processor caches: keep the chains of calls short.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import functools
 import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
+from zlib import crc32
 
 import numpy as np
 
@@ -13,13 +17,23 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
-from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, crc32_each
-from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
-from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeRow, IndexBuilder, indexed_seed
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, crc32_each
+from tupli_mcap.messages.episodes import (
+    END_FIELDS,
+    START_FIELDS,
+    EpisodeEnd,
+    EpisodeStart,
+    end_texts,
+    record,
+    start_texts,
+)
+from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
+_RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
+_LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")
 _Fields = tuple[tuple[str, str, int], ...]
 # the fields that differ between messages of plain episodes: name, format, offset in the CDR body
@@ -46,6 +60,10 @@ class ResetFacts(NamedTuple):
         return self.seed is None and self.drawn_seed is None and not self.continued
 
 
+# makes a StartedEpisode of its fields without a call of Python
+_new: Callable[[type[StartedEpisode], tuple[Any, ...]], StartedEpisode] = tuple.__new__
+
+
 class EpisodeLog(EventLog):
     """The log of `/episode_start`, `/final_state` and `/episode_end`; every end is added to `index`."""
 
@@ -69,13 +87,25 @@ class EpisodeLog(EventLog):
 
     def start(self, number: int, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Adds an `/episode_start`."""
-        given = reset.seed is not None
-        seed = reset.seed if given else reset.drawn_seed
-        text = "" if seed is None else str(seed)
-        start = EpisodeStart(number, env, first_row, given, reset.continued, text, reset.options, reset.info)
-        row = self.sequences[self._start]
-        time_ns = self.append(reset.time_ns, (self._start, start.encode()))
-        return StartedEpisode(number, env, first_row, time_ns, seed, row)
+        given, drawn, options, info, time_ns, continued = reset
+        seed = drawn if given is None else given
+        texts = start_texts("" if seed is None else str(seed), options, info)
+        tail = CDR_HEADER + START_FIELDS.pack(number, env, first_row, given is not None, continued) + texts
+        channel, sequences, position = self._start, self.sequences, self._position
+        row, end = sequences[channel], position + _RECORD + len(tail)
+        if end > self._capacity:
+            self.append(time_ns, (channel, tail[len(CDR_HEADER) :]))
+        else:
+            if time_ns > self.latest_ns:
+                self.latest_ns = time_ns
+            front = FRONT.pack(5, _LENGTH + len(tail), channel, row, self.latest_ns)
+            record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
+            sequences[channel] = row + 1
+            self._whole[channel].append(record)
+            self._records[position:end] = record
+            self._last, self._last_channel, self._can_drop = position, channel, True
+            self._position = self._commit[0] = end
+        return _new(StartedEpisode, (number, env, first_row, self.latest_ns, seed, row))
 
     def end(
         self,
@@ -93,17 +123,37 @@ class EpisodeLog(EventLog):
         Without a state `/episode_end` alone: the final state is row `final_row` of its channel, or not known (-1).
         """
         number, env, first_row, start_time, seed, start_row = episode
-        messages = []
-        if state is not None:
-            final_row = self.sequences[self._final]
-            messages.append((self._final, EPISODE_AND_ENV.pack(number, env) + state))
-        ended = EpisodeEnd(number, env, first_row, length, total, end, final_row >= 0, metadata)
-        messages.append((self._end, ended.encode()))
-        end_row = self.sequences[self._end]
-        now = self.append(now, *messages)
-        row = EpisodeRow(
-            first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
-        )
+        has_final = state is not None or final_row >= 0
+        end_tail = CDR_HEADER + END_FIELDS.pack(number, env, first_row, length, total, end, has_final)
+        end_tail += end_texts(metadata)
+        final, last, sequences, position = self._final, self._end, self.sequences, self._position
+        end_row = sequences[last]
+        if state is None:
+            now = self.append(now, (last, end_tail[len(CDR_HEADER) :]))
+        else:
+            final_row = sequences[final]
+            final_tail = CDR_HEADER + EPISODE_AND_ENV.pack(number, env) + state
+            stop = position + 2 * _RECORD + len(final_tail) + len(end_tail)
+            if stop > self._capacity:
+                header = len(CDR_HEADER)
+                now = self.append(now, (final, final_tail[header:]), (last, end_tail[header:]))
+            else:
+                if now > self.latest_ns:
+                    self.latest_ns = now
+                else:
+                    now = self.latest_ns
+                front = FRONT.pack(5, _LENGTH + len(final_tail), final, final_row, now)
+                final_record = front + crc32(final_tail, crc32(front)).to_bytes(8, "little") + final_tail
+                front = FRONT.pack(5, _LENGTH + len(end_tail), last, end_row, now)
+                end_record = front + crc32(end_tail, crc32(front)).to_bytes(8, "little") + end_tail
+                sequences[final], sequences[last] = final_row + 1, end_row + 1
+                self._whole[final].append(final_record)
+                self._whole[last].append(end_record)
+                self._records[position:stop] = final_record + end_record
+                self._can_drop = False
+                self._position = self._commit[0] = stop
+        # no EpisodeRow: to make one takes as long as to add it
+        row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)
 
     def expect_end(self, episode: StartedEpisode) -> None:
@@ -160,7 +210,7 @@ class EpisodeLog(EventLog):
         goes_on[at[here]] = False
         names = ["episode", "env", "first_row", "#log_time", "#sequence"]
         for number, env, first_row, time_ns, start_row in begun[goes_on][names].tolist():
-            self._running[number] = StartedEpisode(number, env, first_row, time_ns, None, start_row)
+            self._running[number] = _new(StartedEpisode, (number, env, first_row, time_ns, None, start_row))
 
     def _add(self, tables: dict[int, Array]) -> None:
         """Adds whole records by channel, all or none of them after a crash."""
