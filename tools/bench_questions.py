@@ -68,7 +68,7 @@ def fill(url: str, directory: Path, episodes: int) -> None:
         accounts.create_group(connection, ann or nobody(), "lab", None)
         ann = accounts.caller_named(connection, "ann")
         for name in LAB[1:]:
-            accounts.add_member(connection, ann or nobody(), "lab", name, ["contributor"])
+            accounts.add_members(connection, ann or nobody(), "lab", [(name, ["contributor"])])
     rng = random.Random(0)
     for number in range(-(-episodes // EACH)):
         with library.database.writing() as connection:
