@@ -148,13 +148,13 @@ def recorded_wrong(client: TupliStorage, token: int, ledger: Path) -> Iterator[s
 def copied_wrong(one: TupliStorage, other: TupliStorage, uri: str) -> Iterator[str]:
     """Sentences on differences between two storages of a benchmark."""
     of_it = FilterEQ(key="benchmark_id", value=uri)
-    first, second = (
-        sorted(storage.list_episodes(of_it, include_tuples=True), key=lambda item: item.id)
-        for storage in (one, other)
-    )
+    items: list[list[Any]] = [
+        list(storage.list_episodes(of_it, include_tuples=True)) for storage in (one, other)
+    ]
+    first, second = (sorted(of_one, key=lambda item: item.id) for of_one in items)
     if [item.id for item in first] != [item.id for item in second]:
         yield f"expected {len(first)} episodes, found {len(second)}"
-    elif any(a.tuples != b.tuples for a, b in zip(first, second, strict=True)):  # type: ignore[union-attr]
+    elif any(a.tuples != b.tuples for a, b in zip(first, second, strict=True)):
         yield "episodes have other contents"
     digests = {unpack(storage.load_benchmark(uri).serialized).record.digest for storage in (one, other)}
     if len(digests) > 1:

@@ -298,9 +298,11 @@ class Other(Worker):
             list(check_recording(recording))
 
     def items(self) -> None:
-        for item in self.storage.list_episodes(None, True, limit=20, offset=self.random.randrange(50)):
+        items: list[Any] = self.storage.list_episodes(None, True, limit=20, offset=self.random.randrange(50))
+        for item in items:
             rows = [(t.state, t.action, t.reward, t.terminal or t.timeout) for t in item.tuples]
-            check_rows(*zip(*rows, strict=True), None)
+            states, actions, rewards, flags = zip(*rows, strict=True)
+            check_rows(states, actions, rewards, flags, None)
 
     def _any(self) -> Any:
         headers = self.storage.list_episodes(F("metadata.token") < FOREIGN)

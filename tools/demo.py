@@ -72,8 +72,8 @@ def energy_pumping(state: np.ndarray) -> int:
 
 
 def record_mountain_car(storage: FileStorage, episodes: int) -> str:
-    env = gym.wrappers.TimeLimit(WindyMountainCar(), max_episode_steps=400)
-    with TupliEnvWrapper(env, storage=storage, metadata_callback=Height()) as env:
+    windy = gym.wrappers.TimeLimit(WindyMountainCar(), max_episode_steps=400)
+    with TupliEnvWrapper(windy, storage=storage, metadata_callback=Height()) as env:
         benchmark = env.store(name="windy mountain car", description="MountainCar slowed down by wind")
         env.action_space.seed(1)
         for episode in range(episodes):

@@ -16,6 +16,7 @@ import faulthandler
 import json
 import multiprocessing as mp
 import os
+import queue
 import resource
 import signal
 import sys
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     while (
         waiting and not stopped and not (options.minutes and time.monotonic() - begun > 60 * options.minutes)
     ):
-        with contextlib.suppress(mp.queues.Empty):
+        with contextlib.suppress(queue.Empty):
             start, found, counts = outbox.get(timeout=1)
             waiting.discard(start)
             for name, outcome in counts.items():

@@ -79,7 +79,7 @@ class CustomMountainCarEnv(MountainCarEnv):
 class MyTupliEnvWrapper(TupliEnvWrapper):
     """Keeps the wind beside the environment, where other benchmarks can use the same file."""
 
-    def _serialize(self, env: gym.Env) -> tuple[gym.Env, list[str]]:
+    def _serialize(self, env: Any) -> tuple[gym.Env, list[str]]:
         content = env.unwrapped.data.to_csv().encode()
         metadata = ArtifactMetadata(name="wind.csv", description="head wind (m/s) at each step")
         artifact = self.storage.store_artifact(artifact=content, metadata=metadata)
@@ -87,7 +87,7 @@ class MyTupliEnvWrapper(TupliEnvWrapper):
         return env, [artifact.id]
 
     @classmethod
-    def _deserialize(cls, env: gym.Env, storage: TupliStorage) -> gym.Env:
+    def _deserialize(cls, env: Any, storage: TupliStorage) -> gym.Env:
         env.unwrapped.data = read_wind(io.BytesIO(storage.load_artifact(env.unwrapped.data)))
         return env
 
