@@ -31,7 +31,8 @@ from tupli_mcap.dataset.sources import (
 )
 from tupli_mcap.errors import plural
 from tupli_mcap.recording import Episode, Recording
-from tupli_mcap.recording.columns.read import FIELDS, FIVE, Columns, field_names
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
+from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter

@@ -13,7 +13,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
-from tupli_mcap.recording.columns.read import GymnasiumNames
+from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.schema import F, RLTuple
 
 if TYPE_CHECKING:

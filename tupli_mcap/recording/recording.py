@@ -14,7 +14,8 @@ from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import EPISODE_START, FINAL_STATE, INFO
 from tupli_mcap.recording.about.described import DescribedRecording
-from tupli_mcap.recording.columns.read import FIVE, ColumnReader, Columns, StoredSteps, field_names
+from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.episode import Episode, Episodes
 from tupli_mcap.recording.frames import Frames, gathered

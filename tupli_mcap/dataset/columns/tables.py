@@ -11,7 +11,7 @@ from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.recording.columns.read import FIVE
+from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.spaces.labels import element_names
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.columns.read import FIVE, field_names
+from tupli_mcap.recording.columns.fields import FIVE, field_names
 
 __all__ = [
     "FIELDS",

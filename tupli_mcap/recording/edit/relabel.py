@@ -18,7 +18,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
-from tupli_mcap.recording.columns.read import field_names
+from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import NewValues
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts

@@ -15,7 +15,7 @@ from sqlalchemy import Connection, select
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.columns.read import field_names
+from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.schema import BaseFilter, FilterIN
 from tupli_mcap.server.blobs import Blobs

@@ -1,0 +1,70 @@
+"""The names of the columns of steps, and Gymnasium's names for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any
+
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, did_you_mean
+
+FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
+FIELDS = (*FIVE, "next_states", "times", "infos", "frames")
+_OTHER_NAMES = MappingProxyType(
+    {
+        "observations": "states",
+        "next_observations": "next_states",
+        "terminations": "terminals",
+        "truncations": "timeouts",
+    }
+)
+
+
+def field_names(
+    fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
+) -> list[str]:
+    """The fields under this package's names, each once; Gymnasium's names are understood.
+
+    Raises:
+        error: a name is unknown, or is no text.
+    """
+    try:
+        given = [fields] if isinstance(fields, str) else list(fields)
+        names = [_OTHER_NAMES.get(name, name) for name in given]
+    except TypeError as err:
+        raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
+    for name in names:
+        if name not in known:
+            raise error(
+                f"expected fields from {', '.join(known)}, found {name!r:.80}{did_you_mean(name, known)}"
+            )
+    return list(dict.fromkeys(names))
+
+
+class GymnasiumNames(SaysWhatIsMeant):
+    """Columns of steps under Gymnasium's names."""
+
+    states: Any
+    next_states: Any
+    terminals: Any
+    timeouts: Any
+
+    @property
+    def observations(self) -> Any:
+        """`states`."""
+        return self.states
+
+    @property
+    def next_observations(self) -> Any:
+        """`next_states`."""
+        return self.next_states
+
+    @property
+    def terminations(self) -> Any:
+        """`terminals`."""
+        return self.terminals
+
+    @property
+    def truncations(self) -> Any:
+        """`timeouts`."""
+        return self.timeouts
