@@ -145,8 +145,15 @@ def test_what_an_environment_says_of_its_actions_counts_more(tmp_path: Path) -> 
     assert record(Joystick(), tmp_path / "r.mcap").labels.values == {"action": ("NOOP", "FIRE")}
 
 
-def test_names_may_be_chosen(tmp_path: Path) -> None:
-    given = {"state['joints']": ["shoulder", "elbow"], "state['held']": ["a", "b", "c"], "action": ["x", "y"]}
+@pytest.mark.parametrize(
+    ("state", "action"), [("state", "action"), ("states", "actions"), ("observations", "action")]
+)
+def test_names_may_be_chosen(state: str, action: str, tmp_path: Path) -> None:
+    given = {
+        f"{state}['joints']": ["shoulder", "elbow"],
+        f"{state}['held']": ["a", "b", "c"],
+        action: ["x", "y"],
+    }
     labels = record(Arm(), tmp_path / "r.mcap", labels=given).labels
     assert labels.dimensions == {"state['joints']": ("shoulder", "elbow")}
     assert labels.values == {"state['held']": ("a", "b", "c"), "action": ("x", "y")}

@@ -18,6 +18,13 @@ LABELS_NAME = "labels.json"
 LABELS_MEDIA_TYPE = "application/json"
 MAX_LABELS = 1 << 20  # bytes of `labels.json`
 _LONGEST = 200  # characters of one label
+_OF_COLUMN = {
+    "states": "state",
+    "observation": "state",
+    "observations": "state",
+    "actions": "action",
+    "rewards": "reward",
+}
 
 
 class Labels(NamedTuple):
@@ -78,17 +85,20 @@ class Labels(NamedTuple):
 
 
 def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], known: Labels) -> Labels:
-    """`known`, replaced by `given` where it has names: leaf path -> names of its dimensions, or of its values.
+    """`known`, replaced by `given` where it has names: leaf path -> names of its dimensions, or of its values. The path
+    may begin with the name of a column: `states['pos']` is the leaf `state['pos']`.
 
     Raises:
         SpaceError: no leaf has the path, or the leaf has another number of dimensions or values.
     """
     by_path = {leaf.path: leaf for leaf in leaves}
     dimensions, values = dict(known.dimensions), dict(known.values)
-    for path, names in given.items():
+    for key, names in given.items():
+        root, bracket, rest = key.partition("[")
+        path = f"{_OF_COLUMN.get(root, root)}{bracket}{rest}"
         leaf = by_path.get(path)
         if leaf is None:
-            raise SpaceError(f"labels: expected one of {sorted(by_path)}, found {path!r:.80}")
+            raise SpaceError(f"labels: expected one of {sorted(by_path)}, found {key!r:.80}")
         texts = tuple(names) if not isinstance(names, str) else (names,)
         if not _are_texts(texts):
             raise SpaceError(
