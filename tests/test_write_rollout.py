@@ -217,7 +217,9 @@ def test_refuses_a_dtype_that_numpy_does_not_have(tmp_path: Path) -> None:
 
 def test_texts_need_their_space(tmp_path: Path) -> None:
     words = np.array([["pick", "it"], ["up", "now"]])
-    with pytest.raises(StepError, match="states: expected numbers, found <U4; pass observation_space"):
+    with pytest.raises(
+        StepError, match="states: expected numbers, found <U4; convert it, or pass observation_space"
+    ):
         write_rollout(tmp_path / "r.mcap", words, np.zeros((2, 2)), np.zeros((2, 2)))
     space = spaces.Text(10)
     write_rollout(tmp_path / "r.mcap", words, np.zeros((2, 2)), np.zeros((2, 2)), observation_space=space)

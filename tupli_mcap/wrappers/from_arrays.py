@@ -418,4 +418,6 @@ def _space(tree: Any, lead: int, name: str) -> gym.Space[Any]:
         return gym.spaces.Box(limits.min, limits.max, shape, dtype.type)
     if dtype.kind == "f":
         return gym.spaces.Box(-np.inf, np.inf, shape, dtype.type)
-    raise StepError(f"{name}: expected numbers, found {dtype}; pass observation_space and action_space")
+    raise StepError(
+        f"{name}: expected numbers, found {dtype}; convert it, or pass observation_space and action_space"
+    )
