@@ -297,13 +297,15 @@ class TestOrder:
                 assert paged == (whole[::-1] if backwards else whole)
 
     @pytest.mark.sampled(2)
-    @pytest.mark.parametrize("few", [0, 5, 1000])
+    @pytest.mark.parametrize(("few", "scanned"), [(0, 1000), (5, 8), (5, 1000), (1000, 1000)])
     def test_each_way_to_a_page_leads_to_the_same_episodes(
-        self, mixed: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch, few: int
+        self, mixed: Catalog | ServerCatalog, monkeypatch: pytest.MonkeyPatch, few: int, scanned: int
     ) -> None:
-        """By an index that names few; through the next episodes; by several indexes; by nothing of the kind."""
+        """By an index that names few, or few in some recordings; through the next episodes; by several indexes; by
+        nothing of the kind."""
         for name, value in {
             "_FEW": few,
+            "_SCANNED": scanned,
             "_NEAR": 9,
             "_MOST": 50,
             "_RECORDINGS": 1,
@@ -324,6 +326,7 @@ class TestOrder:
             (time >= second) & (time < second + 2 * 10**9) & (F("recording") != "a.mcap"),
             (time == second) | (time > second + 3 * 10**9),
             (F("run.name") == "run 1% a.mcap") & (F("benchmark_id") == "b"),
+            (F("recording") == "a.mcap") & (F("steps") > 0),
             F("run.name").isin(["run 1% b.mcap", "run"]) & (score == 3),
             F("run.name") == "run _% a.mcap",
         ):

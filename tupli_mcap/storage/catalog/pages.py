@@ -1,6 +1,7 @@
 """A page of episodes: the first in some order that a filter is true of, without a look at all others.
 
-1. Where an index names few episodes that may match, these are put in order and looked at one after another.
+1. Where an index names few episodes that may match, these are put in order and looked at one after another. If a page
+   is sorted, there may also be few in the recordings that the query is about.
 2. Where it names many, or there is none, the next episodes in order are looked at, if an index has that order: of many,
    some are among them.
 3. If they are not, all that may match by all indexes are put in order, and looked at one after another.
@@ -39,11 +40,12 @@ from tupli_mcap.storage.texts import escape_text
 __all__ = ["Asked", "candidates"]
 
 _FEW: Final = 5_000
+_SCANNED: Final = 30_000
 _MOST: Final = 200_000
 _NEAR: Final = 10_000
 _RECORDINGS: Final = 100  # at once
 _GROUP: Final = 500  # episodes that are worth a statement
-_FETCHED: Final = 500  # ids at once
+_FETCHED: Final = 500  # rows at once
 
 
 @dataclass(frozen=True)
@@ -98,30 +100,47 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
     others follow, which start anew."""
     given = [] if asked.filter is None else sources(asked.filter, asked.indexed)
     near = wanted if asked.filter is None and asked.sort is None else max(wanted, _NEAR)
-    fewest = _fewest(connection, given if asked.sort is None else [*given, _of_recordings(asked)])
+    fewest = _fewest(connection, asked, given)
     if fewest is not None:
         (source, count), left = fewest, Left(_FEW + 1)
         yield _ids(connection, asked, source, left) if count else (), left
         return
     left = Left(near)
     if asked.sort is None:
-        yield _next(connection, asked, wanted, left), left
+        yield _next(connection, asked, left), left
     elif has_index(asked.sort, asked.indexed):
-        yield _ids(connection, asked, None, left), left
+        yield _by_index(connection, asked, left), left
     if given:
         left = Left(_MOST)
         yield _ids(connection, asked, in_all(given).subquery(), left), left
 
 
-def _fewest(connection: Connection, given: Iterable[Source]) -> tuple[Subquery, int] | None:
-    """The source that has the fewest ids, and how many, if they are few."""
+def _fewest(connection: Connection, asked: Asked, given: Sequence[Source]) -> tuple[Subquery, int] | None:
+    """The ids of the source that has the fewest, or the fewest in the recordings that may have such episodes, and how
+    many, if they are few."""
     fewest, least = None, _FEW + 1
+    if asked.sort is not None:
+        given = [*given, _of_recordings(asked)]
     for source in given:
         some = source.first(_FEW + 1)
-        count = connection.execute(select(func.count()).select_from(some)).scalar_one()
+        count = _count(connection, some)
         if count < least:
             fewest, least = (some, count), count
+    if fewest is not None or asked.sort is None:
+        return fewest
+    for source in given[:-1]:
+        every = source.first(_SCANNED)
+        joined = every.join(RECORDING, RECORDING.c.id == every.c[0] // (1 << EPISODE_BITS))
+        some = select(every.c[0]).select_from(joined).where(asked.recordings()).limit(_FEW + 1).subquery()
+        count = _count(connection, some)
+        if count < least and _count(connection, every) < _SCANNED:
+            fewest, least = (some, count), count
     return fewest
+
+
+def _count(connection: Connection, ids: Subquery) -> int:
+    count: int = connection.execute(select(func.count()).select_from(ids)).scalar_one()
+    return count
 
 
 def _of_recordings(asked: Asked) -> Source:
@@ -129,30 +148,37 @@ def _of_recordings(asked: Asked) -> Source:
     return Source(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
 
 
-def _ids(connection: Connection, asked: Asked, source: Subquery | None, left: Left) -> Iterator[int]:
-    """The ids of a source in order, or, without one, of all episodes."""
-    parts = asked.order(
-        connection, few=source is not None, row_id=EPISODE.c.id if source is None else source.c[0]
-    )
-    for part in parts:
-        recording = part.row_id // (1 << EPISODE_BITS)
-        query: Select[Any] = select(part.row_id).select_from(
-            part.table.join(RECORDING, RECORDING.c.id == recording)
-        )
-        if source is not None:
-            joined = source.join(RECORDING, RECORDING.c.id == source.c[0] // (1 << EPISODE_BITS))
-            if asked.sort is not None:
-                joined = joined.join(part.table, part.row_id == source.c[0])
-            query = select(part.row_id).select_from(joined).where(asked.recordings())
-        query = query.where(part.having).order_by(*part.order).limit(left.most)
-        for row_id in _streamed(connection, query):
+def _ids(connection: Connection, asked: Asked, source: Subquery, left: Left) -> Iterator[int]:
+    """The ids of a source in order."""
+    for part in asked.order(connection, few=True, row_id=source.c[0]):
+        joined = source.join(RECORDING, RECORDING.c.id == source.c[0] // (1 << EPISODE_BITS))
+        if asked.sort is not None:
+            joined = joined.join(part.table, part.row_id == source.c[0])
+        query = select(part.row_id).select_from(joined).where(asked.recordings(), part.having)
+        for (row_id,) in _streamed(connection, query.order_by(*part.order).limit(left.most)):
             yield row_id
             left.most -= 1
         if left.most <= 0:
             return
 
 
-def _next(connection: Connection, asked: Asked, wanted: int, left: Left) -> Iterator[int]:
+def _by_index(connection: Connection, asked: Asked, left: Left) -> Iterator[int]:
+    """The ids of the first episodes, in the order of an index, that SQL tells may match."""
+    for part in asked.order(connection, few=False):
+        both = part.table.join(RECORDING, RECORDING.c.id == part.row_id // (1 << EPISODE_BITS))
+        if part.table is not EPISODE:
+            both = both.join(EPISODE, EPISODE.c.id == part.row_id)
+        query = select(part.row_id, and_(asked.meets(), asked.recordings())).select_from(both)
+        query = query.where(part.having).order_by(*part.order).limit(left.most)
+        for row_id, meets in _streamed(connection, query):
+            if meets:
+                yield row_id
+            left.most -= 1
+        if left.most <= 0:
+            return
+
+
+def _next(connection: Connection, asked: Asked, left: Left) -> Iterator[int]:
     """The ids of the next episodes, in the order of their recordings, that SQL tells may match; fetched a page at a
     time, as many episodes are looked at for each. Without a filter, only those that are found count as looked at."""
     found: Iterable[int]
@@ -169,7 +195,7 @@ def _next(connection: Connection, asked: Asked, wanted: int, left: Left) -> Iter
                 query = query.limit(left.most)
             elif size > left.most:
                 query = query.where(_first(own, left.most, asked.backwards))
-            found = _streamed(connection, query, min(wanted, _FETCHED))
+            found = (row_id for (row_id,) in _streamed(connection, query))
         else:
             found = _in_order(connection.execute(query).scalars(), group, asked.backwards)
         if asked.filter is not None:
@@ -195,12 +221,11 @@ def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards:
     return sorted(found, key=lambda row_id: (places[row_id >> EPISODE_BITS], sign * row_id))
 
 
-def _streamed(connection: Connection, query: Select[Any], size: int = _FETCHED) -> Iterator[int]:
-    """What a query of ids finds, fetched as it is needed, so many at once."""
-    found = connection.execute(query, execution_options={"yield_per": size}).scalars()
-    with contextlib.closing(found):
-        for some in found.partitions():
-            yield from some
+def _streamed(connection: Connection, query: Select[*tuple[Any, ...]]) -> Iterator[Any]:
+    """The rows that a query finds, fetched as they are needed: a few first, then more at once."""
+    options = {"stream_results": True, "max_row_buffer": _FETCHED}
+    with contextlib.closing(connection.execute(query, execution_options=options)) as rows:
+        yield from rows
 
 
 def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:

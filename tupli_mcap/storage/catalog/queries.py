@@ -81,7 +81,8 @@ __all__ = [
 
 _ROWS_AT_ONCE: Final = 20_000
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
-_GROWTH: Final = 8  # how many times as many episodes are looked at next, where too few have matched
+_GROWTH: Final = 8  # how many times as many episodes are looked at next, where none has matched
+_MARGIN: Final = 1.5  # how many times as many are looked at as are likely to have the missing ones
 _MOST_AT_ONCE: Final = 4_000
 _ROWS_OF_ANSWER: Final = 500
 _STREAMED: Final = {"yield_per": _ROWS_OF_ANSWER}
@@ -280,18 +281,27 @@ def _query(asked: Asked, found: Narrowed, *columns: Any, rows: FromClause | None
 
 
 def _looked_at(
-    connection: Connection, asked: Asked, ids: Iterable[int], size: int
+    connection: Connection, asked: Asked, ids: Iterable[int], wanted: int
 ) -> Iterator[EpisodeHeader]:
-    """The matching episodes among those with some ids, in the same order. `size`: how many to ask for at first."""
+    """The matching episodes among those with some ids, in the same order. Looks at as many as are wanted first, then
+    at as many as are likely to have the missing ones."""
     of_them = select(*_COLUMNS, *_OF_RECORDING).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
     of_them = of_them.where(asked.meets(), asked.recordings())
     ids = iter(ids)
+    size, looked_at, found = wanted, 0, 0
     while some := list(itertools.islice(ids, size)):
         rows = connection.execute(of_them.where(among(EPISODE.c.id, some)))
         known = {row.id: row for row in rows}
         ordered = [known[number] for number in some if number in known]
-        yield from _headers(connection, asked, asked.each, ordered)
-        size = min(_GROWTH * size, _MOST_AT_ONCE)
+        for each in _headers(connection, asked, asked.each, ordered):
+            found += 1
+            yield each
+        looked_at += len(some)
+        if 0 < found < wanted:
+            size = math.ceil(_MARGIN * (wanted - found) * looked_at / found)
+        else:
+            size *= _GROWTH
+        size = min(size, _MOST_AT_ONCE)
 
 
 def _all_of_them(
@@ -371,16 +381,16 @@ def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[t
 def _index_anew(
     connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int], key: int
 ) -> None:
-    """Puts the values of rows, which are in the order of their ids, at one more key into `VALUE`."""
+    """Puts the values of rows at one more key into `VALUE`."""
     values = [value for row in rows for value in indexed_values(row, indexed) if value[1] == key]
     _insert_values(connection, values)
-    if not any(flags & flag_bits([True, False], key) for *_, flags in values):
-        return
-    new = VALUE.alias("new")
-    flags = select(new.c.flags).where(new.c.episode_id == VALUE.c.episode_id, new.c.key == key)
-    others = VALUE.c.episode_id.between(rows[0].id, rows[-1].id), VALUE.c.key != key
-    told = func.coalesce(flags.correlate(VALUE).scalar_subquery(), VALUE.c.flags)
-    connection.execute(update(VALUE).where(*others).values(flags=told))
+    both, told = flag_bits([True, False], key), dict[int, list[int]]()
+    for row_id, *_, flags in values:
+        if flags & both:
+            told.setdefault(flags & both, []).append(row_id)
+    for bits, ids in told.items():
+        others = among(VALUE.c.episode_id, ids), VALUE.c.key != key
+        connection.execute(update(VALUE).where(*others).values(flags=VALUE.c.flags.bitwise_or(bits)))
 
 
 def _insert_values(connection: Connection, values: Sequence[tuple[Any, ...]]) -> None:
