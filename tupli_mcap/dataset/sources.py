@@ -8,7 +8,7 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pydantic import ValidationError
 
@@ -92,7 +92,7 @@ class StorageSource:
             ids = [header.id for header in self.benchmarks(benchmark_filter)]
             of_benchmarks = FilterIN(key="benchmark_id", value=ids)
             wanted = of_benchmarks if episode_filter is None else of_benchmarks & episode_filter
-        return cast("list[EpisodeHeader]", self.storage.list_episodes(wanted))
+        return self.storage.list_episodes(wanted)
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         return self.storage.open_recording(recording, episodes)

@@ -47,8 +47,9 @@ from tupli_mcap.server.stored.items import Items, artifact_key
 from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.base import with_tuples
 from tupli_mcap.storage.from_values import write_episodes
-from tupli_mcap.storage.listing import is_storage, scan, with_tuples
+from tupli_mcap.storage.listing import is_storage, scan
 from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.storage.texts import escape_text, unescape_text
 

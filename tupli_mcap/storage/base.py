@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import itertools
 import secrets
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, overload
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Episode as RecordedEpisode, Recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -35,10 +36,12 @@ __all__ = [
     "anew",
     "by_recording",
     "check_page",
+    "each_opened",
     "episode_id",
     "new_name",
     "oldest_first",
     "published_in",
+    "with_tuples",
 ]
 
 TupliStorageError = StorageError
@@ -134,7 +137,36 @@ class TupliStorage(ABC):
             SpaceError: Values of one kind differ in structure from step to step, or have no space.
         """
 
-    @abstractmethod
+    @overload
+    def list_episodes(
+        self,
+        filter: BaseFilter | None = None,
+        include_tuples: Literal[False] = False,
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeHeader]: ...
+
+    @overload
+    def list_episodes(
+        self,
+        filter: BaseFilter | None,
+        include_tuples: Literal[True],
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeItem]: ...
+
+    @overload
+    def list_episodes(
+        self,
+        filter: BaseFilter | None = None,
+        *,
+        include_tuples: Literal[True],
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeItem]: ...
+
     def list_episodes(
         self,
         filter: BaseFilter | None = None,
@@ -145,6 +177,14 @@ class TupliStorage(ABC):
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
         """The episodes that match a filter, in the order of their recordings; EpisodeItems with tuples if
         asked."""
+        check_page(limit, offset)
+        if not include_tuples:
+            return self._list_headers(filter, limit, offset)
+        return anew(lambda: list(with_tuples(self._list_headers(filter, limit, offset), self.open_recording)))
+
+    @abstractmethod
+    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
+        """The episodes that match a filter, in the order of their recordings."""
 
     @abstractmethod
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
@@ -229,6 +269,36 @@ def by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[EpisodeHead
     for header in headers:
         found.setdefault(header.recording, []).append(header)
     return found
+
+
+def each_opened(
+    headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
+) -> Iterator[tuple[EpisodeHeader, RecordedEpisode]]:
+    """The episodes of headers that are sorted by recording; each recording is open while its episodes are given.
+
+    Raises:
+        NotFoundError: an episode was deleted meanwhile.
+    """
+    for name, same in itertools.groupby(headers, key=lambda header: header.recording):
+        group = list(same)
+        with open_recording(name, [header.episode for header in group]) as recording:
+            positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
+            for header in group:
+                if header.episode not in positions:
+                    raise NotFoundError(f"episode {header.id} was deleted meanwhile")
+                yield header, recording.episodes[positions[header.episode]]
+
+
+def with_tuples(
+    headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
+) -> Iterator[EpisodeItem]:
+    """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
+
+    A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
+    """
+    for header, episode in each_opened(headers, open_recording):
+        # Header and steps are valid already.
+        yield EpisodeItem.model_construct(**dict(header), tuples=episode.tuples)
 
 
 def oldest_first(items: Iterable[_Item]) -> list[_Item]:

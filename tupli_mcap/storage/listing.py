@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -13,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import NotFoundError, RecordingError, TupliError, os_reason
+from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import is_url, matching, shown
-from tupli_mcap.schema import EpisodeHeader, EpisodeItem
+from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
@@ -32,7 +31,6 @@ __all__ = [
     "ListedRecording",
     "RecordingStamp",
     "compactable",
-    "each_opened",
     "find_recordings",
     "is_storage",
     "list_recordings",
@@ -40,7 +38,6 @@ __all__ = [
     "recordings_at",
     "scan",
     "stamp_of",
-    "with_tuples",
 ]
 
 
@@ -299,33 +296,3 @@ def _listed(
             )
     except (TupliError, OSError) as err:
         return ListedRecording(name, error=str(err))
-
-
-def each_opened(
-    headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
-) -> Iterator[tuple[EpisodeHeader, Episode]]:
-    """The episodes of headers that are sorted by recording; each recording is open while its episodes are given.
-
-    Raises:
-        NotFoundError: an episode was deleted meanwhile.
-    """
-    for name, same in itertools.groupby(headers, key=lambda header: header.recording):
-        group = list(same)
-        with open_recording(name, [header.episode for header in group]) as recording:
-            positions = {int(number): i for i, number in enumerate(recording.index["episode"])}
-            for header in group:
-                if header.episode not in positions:
-                    raise NotFoundError(f"episode {header.id} was deleted meanwhile")
-                yield header, recording.episodes[positions[header.episode]]
-
-
-def with_tuples(
-    headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
-) -> Iterator[EpisodeItem]:
-    """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
-
-    A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
-    """
-    for header, episode in each_opened(headers, open_recording):
-        # Header and steps are valid already.
-        yield EpisodeItem.model_construct(**dict(header), tuples=episode.tuples)

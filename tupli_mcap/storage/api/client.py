@@ -23,7 +23,6 @@ from tupli_mcap.schema import (
     BenchmarkQuery,
     Episode,
     EpisodeHeader,
-    EpisodeItem,
     FilterEQ,
     bound,
 )
@@ -34,11 +33,10 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, anew, check_page, published_in
+from tupli_mcap.storage.base import TupliStorage, published_in
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
-from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import is_hash
 
 __all__ = ["TupliAPIClient"]
@@ -210,19 +208,9 @@ class TupliAPIClient(People, Recordings, TupliStorage):
             name = self.push(path)
         return self._episodes(FilterEQ(key="recording", value=name))
 
-    def list_episodes(
-        self,
-        filter: BaseFilter | None = None,
-        include_tuples: bool = False,
-        *,
-        limit: int | None = None,
-        offset: int = 0,
-    ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        check_page(limit, offset)
+    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
         self.flush()
-        if not include_tuples:
-            return self._episodes(filter, limit, offset)
-        return anew(lambda: list(with_tuples(self._episodes(filter, limit, offset), self.open_recording)))
+        return self._episodes(filter, limit, offset)
 
     def _episodes(
         self, filter: BaseFilter | None, limit: int | None = None, offset: int = 0

@@ -21,7 +21,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, anew
+from tupli_mcap.storage.base import LOCAL_USER, anew, each_opened
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     DOCUMENT_NAME,
@@ -35,7 +35,6 @@ from tupli_mcap.storage.benchmark_json import (
     unpack,
 )
 from tupli_mcap.storage.bundles.carried import carried_environment
-from tupli_mcap.storage.listing import each_opened
 from tupli_mcap.storage.sidecar import Notes
 
 if TYPE_CHECKING:

@@ -24,18 +24,16 @@ from tupli_mcap.schema import (
     BenchmarkQuery,
     Episode,
     EpisodeHeader,
-    EpisodeItem,
     FilterEQ,
 )
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
-from tupli_mcap.storage.base import TupliStorage, anew, check_page
+from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files.recordings import RecordingFiles
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.from_values import record_each, write_episodes
-from tupli_mcap.storage.listing import with_tuples
 from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
@@ -207,22 +205,8 @@ class FileStorage(TupliStorage):
             self.ingest(path)
             return self._recordings.of_recording(path)
 
-    def list_episodes(
-        self,
-        filter: BaseFilter | None = None,
-        include_tuples: bool = False,
-        *,
-        limit: int | None = None,
-        offset: int = 0,
-    ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        check_page(limit, offset)
-        if not include_tuples:
-            return self._catalog.headers(filter, limit=limit, offset=offset)
-        return anew(
-            lambda: list(
-                with_tuples(self._catalog.headers(filter, limit=limit, offset=offset), self.open_recording)
-            )
-        )
+    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
+        return self._catalog.headers(filter, limit=limit, offset=offset)
 
     def count_episodes(self, filter: BaseFilter | None = None) -> int:
         return self._catalog.count(filter)
