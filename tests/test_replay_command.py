@@ -120,7 +120,7 @@ def test_recordings_of_other_spaces_are_other_rerun_recordings(folder: Path, tmp
     assert len(found.recordings) == 2 and len(found.blueprints) == 2
 
 
-@pytest.mark.parametrize(("words", "opens"), [(["--split"], "rerun - < "), ([], "rerun ")])
+@pytest.mark.parametrize(("words", "opens"), [(["--apart"], "rerun - < "), ([], "rerun ")])
 def test_what_opens_the_file_opens_all_that_is_in_it(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str], opens: str
 ) -> None:
@@ -139,7 +139,7 @@ BAD = [
     (["{folder}/none.mcap"], r"none\.mcap does not exist; give the path of a recording", 1),
     (["{folder}/damaged.mcap"], r"damaged\.mcap", 1),
     (["{one}", "{pendulum}", "--compare"], r"expected recordings of the same spaces to compare", 1),
-    (["{one}", "--compare", "--split"], r"give one of them", 2),
+    (["{one}", "--compare", "--apart"], r"give one of them", 2),
     (["{one}", "--web"], r"give one of them", 2),
     (
         ["{one}", "--compare", "-e", "all", "{runs}"],

@@ -232,7 +232,7 @@ def test_camera_frames_are_sent_as_they_are(tmp_path: Path) -> None:
         frame.data for frame in encoded
     ]
     assert found.rows("/camera/render", "EncodedImage:media_type") == [[f"image/{encoded[0].form}"]] * 8
-    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="split"))
+    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="apart"))
     assert [apart.rows("/camera/render", "step", i) for i in range(2)] == [[0, 3, 6, 8]] * 2
 
 
@@ -409,7 +409,7 @@ def test_a_final_state_that_is_not_known_leaves_its_row_empty(tmp_path: Path) ->
     assert found.rows("/state", "step") == rows
     assert found.scalars("/state")[:, 0].tolist() == rows
     assert found.held("/action", 12) == ["0", "1", "", "0", "1", "0", "", "0", "1", "", "0", ""]
-    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="split"))
+    apart = Rrd(viewer.save(path, tmp_path / "apart.rrd", form="apart"))
     assert [apart.rows("/state", "step", i) for i in range(4)] == [[0, 1], [0, 1, 2, 3], [0, 1], [0]]
 
 

@@ -160,7 +160,7 @@ def test_one_episode_starts_at_step_0(cartpole: Path, tmp_path: Path) -> None:
 
 
 def test_split_gives_a_recording_an_episode(cartpole: Path, tmp_path: Path) -> None:
-    found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", [3, 1], form="split"))
+    found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", [3, 1], form="apart"))
     assert len(found.recordings) == 2 and len(found.blueprints) == 1
     assert len({entry.application_id for entry in found.recordings}) == 1
     with Recording(cartpole) as recording:

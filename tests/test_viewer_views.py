@@ -63,7 +63,7 @@ def test_many_episodes(viewer: HeadlessViewer, tmp_path: Path) -> None:
 
 
 def test_one_of_several_episodes_apart(viewer: HeadlessViewer, cart_pole: Path) -> None:
-    state = shown(viewer, cart_pole, "--split")
+    state = shown(viewer, cart_pole, "--apart")
     assert views(state) == {"state": PLOT, "action": LANES, **REWARDS, **ABOUT}
     (start, end), (first, last) = ranges(state)["step"], ranges(state)["episode_time"]
     assert (start, first) == (0, 0) and end <= 300 and last == end * 20_000_000
@@ -72,7 +72,7 @@ def test_one_of_several_episodes_apart(viewer: HeadlessViewer, cart_pole: Path) 
 def test_all_episodes_apart_are_opened_from_the_standard_input(
     viewer: HeadlessViewer, cart_pole: Path, tmp_path: Path
 ) -> None:
-    shown(viewer, cart_pole, "--split")
+    shown(viewer, cart_pole, "--apart")
     with HeadlessViewer(tmp_path, piped=cart_pole.with_suffix(".rrd")) as window:
         for _ in patiently(120.0):
             if len(window.settled().recordings) == 3:

@@ -14,9 +14,9 @@ from tupli_mcap.cli.terminal import flush, say
 __all__ = ["replay"]
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
-_Split = Annotated[
+_Apart = Annotated[
     bool,
-    typer.Option("--split/--joined", help="Show each episode on its own, or all on one timeline."),
+    typer.Option("--apart/--joined", help="Show each episode on its own, or all on one timeline."),
 ]
 _Save = Annotated[
     Path | None,
@@ -44,7 +44,7 @@ def replay(
     episode: Episodes = None,
     filter_text: FilterText = None,
     compare: _Compare = False,
-    split: _Split = False,
+    apart: _Apart = False,
     save: _Save = None,
     web: _Web = False,
     connect: _Connect = None,
@@ -61,14 +61,14 @@ def replay(
     """
     goals = sum([web, save is not None, connect is not None])
     if layout is not None:
-        if episode or filter_text or compare or split or goals:
+        if episode or filter_text or compare or apart or goals:
             raise typer.BadParameter(
                 "--layout goes only with --force: a layout is made for a whole recording"
             )
         _write_layout(sources, layout, force=force)
         return
-    if compare and split:
-        raise typer.BadParameter("--compare overlays episodes, --split shows them apart; give one of them")
+    if compare and apart:
+        raise typer.BadParameter("--compare overlays episodes, --apart shows them apart; give one of them")
     if goals > 1:
         raise typer.BadParameter("--save, --web and --connect exclude each other; give one of them")
     if force and save is None:
@@ -76,7 +76,7 @@ def replay(
     from tupli_mcap import viewer
     from tupli_mcap.viewer.sdk import import_quickly
 
-    form: viewer.Form = "compare" if compare else "split" if split else "joined"
+    form: viewer.Form = "compare" if compare else "apart" if apart else "joined"
     import_quickly()
     notes: list[str] = []
     shown: dict[str, Any] = {"filter": filter_of(filter_text), "form": form, "note": notes.append}

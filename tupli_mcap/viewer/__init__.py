@@ -45,7 +45,7 @@ def save(
 ) -> Path:
     """Write episodes and their blueprint into a `.rrd` file, which `rerun FILE` opens.
 
-    A file holds several Rerun recordings if `form` is "split", or if the sources have different spaces. `rerun FILE`
+    A file holds several Rerun recordings if `form` is "apart", or if the sources have different spaces. `rerun FILE`
     opens only one of them, `rerun - < FILE` all. Recordings of different spaces are different applications in the
     viewer, so that each has its own blueprint.
 
@@ -54,7 +54,7 @@ def save(
         episodes: "best", "worst", "first", "last", "all", "3,7-9", or numbers. By default, all; if there are more than
             ten, the last, the best and the worst (of each recording; of more than three recordings, of all together).
         filter: only episodes that match it.
-        form: "joined" on one timeline, "split" into a Rerun recording each, or "compare" in the same plots.
+        form: "joined" on one timeline, "apart" into a Rerun recording each, or "compare" in the same plots.
         overwrite: replace a file that exists.
         tell: called with the command that opens the file.
         note: called with a sentence on which episodes are shown, if the default has left some out.

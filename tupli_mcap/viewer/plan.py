@@ -26,8 +26,8 @@ from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
 
-Form = Literal["joined", "split", "compare"]
-_MOST_SPLIT = 200
+Form = Literal["joined", "apart", "compare"]
+_MOST_APART = 200
 _MOST_COMPARED = 16
 _FEW = 10  # up to so many episodes are all shown, and described one by one
 _EACH = 3  # up to so many recordings, episodes are chosen from each
@@ -162,11 +162,11 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
         RecordingError: there are too many episodes for this form.
     """
     total = sum(len(item.positions) for item in chosen)
-    if form == "split":
-        if total > _MOST_SPLIT:
+    if form == "apart":
+        if total > _MOST_APART:
             raise RecordingError(
-                f"expected at most {_MOST_SPLIT} episodes for --split, found {total}; "
-                "choose some with --episodes, or leave out --split"
+                f"expected at most {_MOST_APART} episodes for --apart, found {total}; "
+                "choose some with --episodes, or leave out --apart"
             )
         yield from _split(chosen)
     elif form == "compare":
