@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import sys
 import threading
@@ -73,6 +74,20 @@ def test_a_whole_recording_comes_and_goes_as_the_file_that_it_is(
         before = proxy.down
         assert copy_episodes(admin, again, benchmark_id=uri)[uri].episodes == 12
         assert proxy.down - before < one.stat().st_size
+
+
+def test_the_command_deletes_on_a_server(admin: TupliAPIClient, tmp_path: Path) -> None:
+    pushed(admin, tmp_path / "lab")
+    worst = admin.list_episodes(F("episode") < 2)
+    told = json.loads(run("delete", admin.url, "--filter", "episode < 2", "--dry-run", "--json"))["result"]
+    assert told == {"dry_run": True, "episodes": [header.id for header in worst]}
+    assert admin.count_episodes() == 12
+    assert run("delete", admin.url, "--filter", "episode < 2") == "deleted 2 episodes\n"
+    assert min(header.episode for header in admin.list_episodes()) == 2
+    for words in (["--episodes", "3"], [str(tmp_path / "lab"), "--filter", "episode < 4"]):
+        refused = CliRunner().invoke(app, ["delete", admin.url, *words])
+        assert refused.exit_code == 2 and "choose its episodes with --filter" in refused.output
+    assert admin.count_episodes() == 10
 
 
 def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient, tmp_path: Path) -> None:

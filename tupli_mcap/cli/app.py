@@ -362,7 +362,11 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "filter runs/ 'run.name ~ \"ppo\"' -o ppo.mcap",
         "filter https://example.org/run.mcap 'return > 100' -o good.mcap",
     ),
-    "delete": ("delete run.mcap --episodes 3,7", "delete lab/ --filter 'return < 10' --dry-run"),
+    "delete": (
+        "delete run.mcap --episodes 3,7",
+        "delete lab/ --filter 'return < 10' --dry-run",
+        "delete http://127.0.0.1:8080 --filter 'run.name = \"ppo-3\"'",
+    ),
     "restore": ("restore run.mcap", "restore run.mcap --episodes 3"),
     "trim": (
         "trim run.mcap --steps 10:-5 -o trimmed.mcap",

@@ -3,6 +3,7 @@ declare-key."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,7 @@ from tupli_mcap.cli.options import (
     Sort,
     StoragePath,
     any_storage,
+    dataset_of,
     filter_of,
     full_id,
     local_path,
@@ -40,6 +42,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import say, terminal_width
+from tupli_mcap.remote import is_server
 
 __all__ = [
     "compact",
@@ -149,7 +152,9 @@ _Paths = Annotated[
 
 
 def delete(
-    paths: _Paths,
+    places: Annotated[
+        list[str], typer.Argument(metavar="PATH|URL", help="Files, directories, storages, or a server.")
+    ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
     force: Annotated[
@@ -158,12 +163,35 @@ def delete(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Delete episodes; restore brings them back.
+    """Delete episodes; restore brings them back, but for those on a server.
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json
     still shows them.
     """
+    if episodes is None and filter_text is None:
+        raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
+    if any(map(is_server, places)):
+        if len(places) > 1 or episodes is not None:
+            raise typer.BadParameter(
+                "name one server alone, and choose its episodes with --filter 'return < 10'"
+            )
+        chosen = dataset_of(places).filter(filter_text or "")
+        ids = [header.id for header in chosen.headers]
+        count = chosen.delete(force=force, dry_run=dry_run)
+    else:
+        ids, count = _delete_in_files(map(local_path, places), episodes, filter_text, force, dry_run)
+    print_result(
+        {"dry_run": dry_run, "episodes": ids},
+        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
+        as_json=as_json,
+    )
+
+
+def _delete_in_files(
+    paths: Iterable[Path], episodes: str | None, filter_text: str | None, force: bool, dry_run: bool
+) -> tuple[list[str], int]:
+    """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
     from tupli_mcap.dataset.which import candidates, named_positions
@@ -171,8 +199,6 @@ def delete(
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
 
-    if episodes is None and filter_text is None:
-        raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
     wanted = filter_of(filter_text)
     files = [str(file) for given in paths for file in find_recordings(given)]
     doomed: dict[tuple[str, str], list[int]] = {}
@@ -182,14 +208,8 @@ def delete(
             positions = among if episodes is None else named_positions(recording, among, episodes, wanted)
             if len(positions):
                 doomed[file, recording.uuid] = recording.index["episode"][positions].tolist()
-    source = FilesSource(files) if files else None
-    count = 0 if source is None else curate.delete(source, doomed, force=force, dry_run=dry_run)
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
-    print_result(
-        {"dry_run": dry_run, "episodes": ids},
-        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
-        as_json=as_json,
-    )
+    return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run) if files else 0
 
 
 def restore(

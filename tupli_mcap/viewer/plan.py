@@ -168,7 +168,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
                 f"expected at most {_MOST_APART} episodes for --apart, found {total}; "
                 "choose some with --episodes, or leave out --apart"
             )
-        yield from _split(chosen)
+        yield from _apart(chosen)
     elif form == "compare":
         if total > _MOST_COMPARED:
             raise RecordingError(
@@ -183,7 +183,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
             yield _joined(group)._replace(listed=len(alike) > 1)
 
 
-def _split(chosen: Sequence[Chosen]) -> Iterator[Plan]:
+def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
     several = sum(len(item.positions) for item in chosen) > 1
     for item in chosen:
         scene = scene_of(item.recording, item.positions)
