@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -43,6 +43,9 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import say, terminal_width
 from tupli_mcap.remote import is_server
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import BaseFilter
 
 __all__ = [
     "compact",
@@ -171,16 +174,17 @@ def delete(
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
+    wanted = filter_of(filter_text)
     if any(map(is_server, places)):
-        if len(places) > 1 or episodes is not None:
+        if len(places) > 1 or episodes is not None or wanted is None:
             raise typer.BadParameter(
                 "name one server alone, and choose its episodes with --filter 'return < 10'"
             )
-        chosen = dataset_of(places).filter(filter_text or "")
+        chosen = dataset_of(places).filter(wanted)
         ids = [header.id for header in chosen.headers]
         count = chosen.delete(force=force, dry_run=dry_run)
     else:
-        ids, count = _delete_in_files(map(local_path, places), episodes, filter_text, force, dry_run)
+        ids, count = _delete_in_files(map(local_path, places), episodes, wanted, force, dry_run)
     print_result(
         {"dry_run": dry_run, "episodes": ids},
         f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
@@ -189,7 +193,7 @@ def delete(
 
 
 def _delete_in_files(
-    paths: Iterable[Path], episodes: str | None, filter_text: str | None, force: bool, dry_run: bool
+    paths: Iterable[Path], episodes: str | None, wanted: BaseFilter | None, force: bool, dry_run: bool
 ) -> tuple[list[str], int]:
     """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
     from tupli_mcap.dataset import curate
@@ -199,7 +203,6 @@ def _delete_in_files(
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
 
-    wanted = filter_of(filter_text)
     files = [str(file) for given in paths for file in find_recordings(given)]
     doomed: dict[tuple[str, str], list[int]] = {}
     for file in files:
