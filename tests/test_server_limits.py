@@ -108,6 +108,20 @@ def test_a_stranger_sends_no_long_body(tmp_path: Path) -> None:
         assert known.status_code == 400
 
 
+def test_json_has_a_limit_of_values(tmp_path: Path) -> None:
+    """Short lists within lists take a hundred times the memory of their text."""
+    with server_with(tmp_path / "served", max_values=1000) as admin:
+        for path in ("/v1/benchmarks", "/benchmarks/create", "/episodes/record", "/v1/episodes/list"):
+            for kind in ("application/json", "Application/Problem+JSON", None):
+                deep = b'{"metadata": [' + b"[]," * 1000 + b"[]]}"
+                headers = token_of(admin) | ({} if kind is None else {"Content-Type": kind})
+                refused = httpx.post(admin.url + path, content=deep, headers=headers)
+                assert refused.status_code == 413, (path, refused.text)
+                assert "expected JSON of at most 1000 values" in refused.json()["detail"]
+        many = b"[" * 5000
+        assert admin.store_artifact(many, ArtifactMetadata(name="brackets")).id
+
+
 @pytest.mark.parametrize(
     ("filter", "message"),
     [

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Final
 
+from fastapi import HTTPException
 from fastapi.security.utils import get_authorization_scheme_param
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
@@ -27,6 +28,7 @@ _CONTENT: Final = frozenset(
     ("/v1/benchmarks", "/v1/artifacts", "/benchmarks/create", "/artifacts/upload", "/episodes/record")
 )
 _METHODS: Final = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
+_BEFORE_VALUES: Final = (b"[", b"{", b",")
 _QUIET: Final = frozenset(("/health", "/ready", "/metrics"))
 
 
@@ -42,7 +44,7 @@ class Gate:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        passing = _Passing(scope, receive, send)
+        passing = _Passing(scope, receive, send, self._settings.max_values)
         clear_contextvars()
         bind_contextvars(id=passing.id)  # which is in every line of the log from here on
         with self._metrics.running.track_inprogress():
@@ -105,16 +107,25 @@ class Gate:
 class _Passing:
     """A request on its way through the gate."""
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    def __init__(self, scope: Scope, receive: Receive, send: Send, max_values: int) -> None:
         self.id = secrets.token_hex(8)
         self.begun = time.monotonic()
         self.status = self.received = self.sent = 0
-        self._receive, self._send = receive, send
+        self._receive, self._send, self._max_values = receive, send, max_values
+        self._values = 0  # that its JSON may have so far, counted before it is parsed
+        kind = dict(scope["headers"]).get(b"content-type", b"json")
+        self._is_json = b"json" in kind.lower()
         scope.setdefault("state", {})
 
     async def receive(self) -> Message:
+        """Receives a part of the body; HTTPException if its JSON has too many values."""
         message = await self._receive()
-        self.received += len(message.get("body", b""))
+        body = message.get("body", b"")
+        self.received += len(body)
+        if self._is_json:
+            self._values += sum(map(body.count, _BEFORE_VALUES))
+            if self._values > self._max_values:
+                raise HTTPException(413, f"expected JSON of at most {self._max_values} values, found more")
         return message
 
     async def send(self, message: Message) -> None:
