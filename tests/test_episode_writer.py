@@ -231,7 +231,8 @@ def test_a_killed_process_loses_none_of_many_steps(tmp_path: Path) -> None:
         if told is None and not done:
             continue
         assert len(told.steps) >= (parts[done - 1][-1] + 1 if done else 1)
-        assert told.final is None
+        # its death may leave the next state behind
+        assert told.final is None or np.array_equal(told.final, states[len(told.steps)])
         np.testing.assert_array_equal([step[0] for step in told.steps], states[: len(told.steps)])
         np.testing.assert_array_equal([step[2] for step in told.steps], rewards[: len(told.steps)])
 
