@@ -327,6 +327,15 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
         dataset.read("rewrads")
 
 
+def test_columns_are_found_by_name_as_in_a_dict(dataset: Dataset) -> None:
+    columns = dataset.read(["states", "rewards"])
+    assert columns["states"] is columns["observations"] is columns.states
+    assert [*columns.asdict()] == ["episode_lengths", "states", "rewards"]
+    for name in ("actions", "state"):
+        with pytest.raises(KeyError, match=f"expected one of .*states, rewards, found '{name}'"):
+            columns[name]
+
+
 def test_windows_and_transitions_stay_within_episodes(dataset: Dataset) -> None:
     found = dataset.filter("steps > 12").sample(6, seed=2)
     windows, columns = found.windows(8), found.read()

@@ -631,6 +631,19 @@ class TestCommands:
         ):
             assert CliRunner().invoke(app, words).exit_code == 2
 
+    def test_tag_in_a_directory(self, tmp_path: Path) -> None:
+        for name, count in (("a", 1), ("deep/b", 3), ("c", 0)):
+            record(tmp_path / "runs" / f"{name}.mcap", count)
+        runs = str(tmp_path / "runs")
+        told = command("tag", runs, "--filter", "episode >= 1", "late=true")
+        assert told == f"{runs}/deep/b.mcap: 2 episodes annotated: late=true\n"
+        data = tupli_mcap.open(runs)
+        assert [e.metadata.get("late") for e in data] == [None, None, True, True]
+        for words, code in ((["--filter", "episode > 9", "late=true"], 1), (["--undo"], 2)):
+            assert CliRunner().invoke(app, ["tag", runs, *words]).exit_code == code
+        command("tag", f"{runs}/deep/b.mcap", "--undo")
+        assert not any(e.metadata for e in tupli_mcap.open(runs))
+
     def test_record_says_what_run_it_is(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)
         command(

@@ -337,7 +337,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     ),
     "tag": (
         "tag run.mcap --episodes 3,7 success=true note='gripper slipped'",
-        "tag run.mcap --filter 'return > 100' quality=good",
+        "tag runs/ --filter 'return > 100' quality=good",
         "tag run.mcap --undo",
     ),
     "edit": (

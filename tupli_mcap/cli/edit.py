@@ -35,6 +35,7 @@ from tupli_mcap.cli.output import (
     print_wrapped,
 )
 from tupli_mcap.cli.terminal import say
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote import is_url, shown
 
 if TYPE_CHECKING:
@@ -114,8 +115,11 @@ def split(
 
 
 def tag(
-    files: Annotated[
-        list[str], typer.Argument(metavar="FILE|KEY=VALUE", help="Recordings, then the values to note.")
+    places: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="PATH|KEY=VALUE", help="Recordings, directories, storages; then the values to note."
+        ),
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -129,13 +133,14 @@ def tag(
     is JSON is read as JSON, any other as text; KEY= removes a key. The file keeps who noted
     it and when. Its steps are not touched. A signature is dropped.
     """
-    from tupli_mcap.dataset.which import choose_episodes
+    from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.jsonvalue import spelled
-    from tupli_mcap.recording import Recording, annotate_episodes, undo_annotation
+    from tupli_mcap.recording import annotate_episodes, undo_annotation
+    from tupli_mcap.storage.listing import find_recordings
 
-    given = [text for text in files if "=" not in text or is_url(text)]
+    given = [text for text in places if "=" not in text or is_url(text)]
     paths = [local_path(text) for text in given]
-    values = dict(pair_of(text) for text in files if text not in given)
+    values = dict(pair_of(text) for text in places if text not in given)
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
             "expected recordings, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
@@ -144,17 +149,21 @@ def tag(
         raise typer.BadParameter(
             "say which episodes: --episodes 3,7, --filter 'return < 10' or --episodes all"
         )
-    wanted = filter_of(filter_text)
+    if undo and any(path.is_dir() for path in paths):  # their last notes may have nothing in common
+        raise typer.BadParameter("name the recordings whose last note --undo takes back, not their directory")
+    files = [str(file) for path in paths for file in find_recordings(path)]
     done: list[dict[str, Any]] = []
-    for path in paths:
-        if undo:
-            last = undo_annotation(path, dry_run=dry_run)
-            done.append({"path": path, "episodes": last.episodes, "values": last.values})
-            continue
-        with Recording(path) as recording:
-            chosen = [episode.number for episode in choose_episodes(recording, episodes or "all", wanted)]
-        annotate_episodes(path, values, chosen, dry_run=dry_run)
-        done.append({"path": path, "episodes": chosen, "values": values})
+    if undo:
+        for file in files:
+            last = undo_annotation(file, dry_run=dry_run)
+            done.append({"path": file, "episodes": last.episodes, "values": last.values})
+    else:
+        chosen = numbers_in(files, episodes, filter_of(filter_text))
+        if not chosen:
+            raise RecordingError(f"no episode of {' '.join(map(str, paths))} matches {filter_text}")
+        for (file, _), numbers in chosen.items():
+            annotate_episodes(file, values, numbers, dry_run=dry_run)
+            done.append({"path": file, "episodes": numbers, "values": values})
     if as_json:
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return

@@ -198,19 +198,12 @@ def _delete_in_files(
     """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.dataset.which import candidates, named_positions
-    from tupli_mcap.recording import Recording
+    from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
 
     files = [str(file) for given in paths for file in find_recordings(given)]
-    doomed: dict[tuple[str, str], list[int]] = {}
-    for file in files:
-        with Recording(file) as recording:
-            among = candidates(recording, wanted)
-            positions = among if episodes is None else named_positions(recording, among, episodes, wanted)
-            if len(positions):
-                doomed[file, recording.uuid] = recording.index["episode"][positions].tolist()
+    doomed = numbers_in(files, episodes, wanted)
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
     return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run) if files else 0
 

@@ -125,6 +125,26 @@ def named_positions(
     return list(chosen)
 
 
+def numbers_in(
+    files: Iterable[str], text: str | None, filter: BaseFilter | None
+) -> dict[tuple[str, str], list[int]]:
+    """The numbers of the episodes that a text names in each of some recordings, by its path and UUID; without a text,
+    of those that match the filter. Recordings without one are left out.
+
+    Raises:
+        FilterError: the text is something else, or the filter has an unknown key.
+        RecordingError: a recording has no such episode.
+    """
+    found = {}
+    for file in files:
+        with Recording(file) as recording:
+            among = candidates(recording, filter)
+            positions = among if text is None else named_positions(recording, among, text, filter)
+            if len(positions):
+                found[file, recording.uuid] = recording.index["episode"][positions].tolist()
+    return found
+
+
 def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
     """The places that one item of a text names, among episodes with these numbers and returns; none if there is none.
 

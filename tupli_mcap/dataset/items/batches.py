@@ -12,7 +12,8 @@ from tupli_mcap.dataset.items.order import Numbers
 from tupli_mcap.dataset.items.steps import SamplingError, checked_count
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.items.items import Items, Parts
+    from tupli_mcap.dataset.items.items import Items
+    from tupli_mcap.recording.columns.fields import Parts
 
 __all__ = ["Batches"]
 

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.items import Parts, StepItems
+from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps
 from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
+from tupli_mcap.recording.columns.fields import Parts
 
 __all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
 

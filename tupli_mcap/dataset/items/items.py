@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
@@ -15,36 +14,17 @@ from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_numbers
-from tupli_mcap.errors import SaysWhatIsMeant, did_you_mean
+from tupli_mcap.recording.columns.fields import Parts
 from tupli_mcap.schema import BaseFilter, F
 
 __all__ = [
     "Items",
-    "Parts",
     "Samples",
     "StepItems",
 ]
 
 T = TypeVar("T", bound="Parts")
 _MANY = 1 << 20  # items that are processed together
-
-
-@dataclass(frozen=True)
-class Parts(SaysWhatIsMeant):
-    """Columns of one item or of a batch, and facts about them, by name; None if not requested. `item["states"]` is
-    `item.states`, as in the dicts of a `DataLoader`."""
-
-    def __getitem__(self, name: str) -> Any:
-        found = self.asdict()
-        if name not in found:
-            raise KeyError(
-                f"expected one of {', '.join(found)}, found {name!r:.80}{did_you_mean(name, found)}"
-            )
-        return found[name]
-
-    def asdict(self) -> dict[str, Any]:
-        """The requested columns and facts, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 class Samples(Sequence[dict[str, Any]]):

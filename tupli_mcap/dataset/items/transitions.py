@@ -10,8 +10,9 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.beside import BESIDE
-from tupli_mcap.dataset.items.items import Parts, StepItems
+from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.recording.columns.fields import Parts
 
 __all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
 

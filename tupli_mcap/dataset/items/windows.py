@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.items import Items, Parts
+from tupli_mcap.dataset.items.items import Items
 from tupli_mcap.dataset.items.steps import (
     SamplingError,
     Steps,
@@ -17,6 +17,7 @@ from tupli_mcap.dataset.items.steps import (
     checked_fields,
     map_arrays,
 )
+from tupli_mcap.recording.columns.fields import Parts
 
 __all__ = ["Pad", "Window", "Windows", "shaped_rows"]
 

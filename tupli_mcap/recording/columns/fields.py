@@ -41,6 +41,24 @@ def field_names(
     return list(dict.fromkeys(names))
 
 
+class Parts(SaysWhatIsMeant):
+    """Columns and facts about them as attributes, None if not requested. `parts["states"]` is `parts.states`, as in a
+    dict."""
+
+    def __getitem__(self, name: str) -> Any:
+        found = self.asdict()
+        known = _OTHER_NAMES.get(name, name)
+        if known not in found:
+            raise KeyError(
+                f"expected one of {', '.join(found)}, found {name!r:.80}{did_you_mean(name, found)}"
+            )
+        return found[known]
+
+    def asdict(self) -> dict[str, Any]:
+        """The requested columns and facts, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
 class GymnasiumNames(SaysWhatIsMeant):
     """Columns of steps under Gymnasium's names."""
 

@@ -14,7 +14,7 @@ from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames
+from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames, Parts
 from tupli_mcap.recording.columns.gather import (
     EPISODE,
     Files,
@@ -31,8 +31,8 @@ _MOST_KEYS = 20  # keys of infos that are shown
 
 
 @dataclass(repr=False)
-class Columns(GymnasiumNames):
-    """Columns of the requested fields, None for the others.
+class Columns(GymnasiumNames, Parts):
+    """Columns of the requested fields, None for the others; `columns["states"]` is `columns.states`.
 
     A leaf of constant size is an array of shape (steps, *leaf shape), one of variable size a list; both are nested as
     the space is.
