@@ -26,8 +26,9 @@ def step(state, torque):
 @jax.jit
 def rollout(key):
     """States [T + 1, N, 3], actions [T, N, 1] and rewards [T, N] of random torques."""
-    first = jax.vmap(reset)(jax.random.split(key, ENVS))
-    torques = jax.random.uniform(key, (STEPS, ENVS, 1), minval=-2, maxval=2)
+    of_states, of_torques = jax.random.split(key)
+    first = jax.vmap(reset)(jax.random.split(of_states, ENVS))
+    torques = jax.random.uniform(of_torques, (STEPS, ENVS, 1), minval=-2, maxval=2)
 
     def both(state, torque):
         after, reward = jax.vmap(step)(state, torque)

@@ -162,6 +162,7 @@ def test_names_may_be_chosen(state: str, action: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "match"),
     [
+        ({"action": ["a", "b"], "actions": ["a", "b"]}, "expected names for action once"),
         ({"joints": ["a", "b"]}, r"labels: expected one of \[.*state\['joints'\].*found 'joints'"),
         ({"state['joints']": ["a"]}, r"labels: expected 2 names for state\['joints'\] .* found 1"),
         ({"state['held']": ["a", "b"]}, r"expected 1 or 3 names for state\['held'\]"),

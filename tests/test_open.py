@@ -331,6 +331,9 @@ def test_columns_are_found_by_name_as_in_a_dict(dataset: Dataset) -> None:
     columns = dataset.read(["states", "rewards"])
     assert columns["states"] is columns["observations"] is columns.states
     assert [*columns.asdict()] == ["episode_lengths", "states", "rewards"]
+    assert "observations" in columns and "actions" not in columns
+    with pytest.raises(TypeError, match="not iterable"):
+        list(columns)
     for name in ("actions", "state"):
         with pytest.raises(KeyError, match=f"expected one of .*states, rewards, found '{name}'"):
             columns[name]

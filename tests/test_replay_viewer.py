@@ -159,7 +159,7 @@ def test_one_episode_starts_at_step_0(cartpole: Path, tmp_path: Path) -> None:
         assert found.scalars("/end/terminal").tolist() == [[episode.return_]]
 
 
-def test_split_gives_a_recording_an_episode(cartpole: Path, tmp_path: Path) -> None:
+def test_apart_each_episode_is_a_recording(cartpole: Path, tmp_path: Path) -> None:
     found = Rrd(viewer.save(cartpole, tmp_path / "out.rrd", [3, 1], form="apart"))
     assert len(found.recordings) == 2 and len(found.blueprints) == 1
     assert len({entry.application_id for entry in found.recordings}) == 1

@@ -641,6 +641,9 @@ class TestCommands:
         assert [e.metadata.get("late") for e in data] == [None, None, True, True]
         for words, code in ((["--filter", "episode > 9", "late=true"], 1), (["--undo"], 2)):
             assert CliRunner().invoke(app, ["tag", runs, *words]).exit_code == code
+        sweep = record(tmp_path / "lr=0.1" / "run.mcap", 1)
+        command("tag", str(sweep.parent), "--episodes", "all", "good=true")
+        assert Recording(sweep).episodes[0].metadata == {"good": True}
         command("tag", f"{runs}/deep/b.mcap", "--undo")
         assert not any(e.metadata for e in tupli_mcap.open(runs))
 

@@ -123,7 +123,7 @@ def tag(
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Take back the last note.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last note of each recording.")] = False,
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
@@ -138,12 +138,12 @@ def tag(
     from tupli_mcap.recording import annotate_episodes, undo_annotation
     from tupli_mcap.storage.listing import find_recordings
 
-    given = [text for text in places if "=" not in text or is_url(text)]
+    given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
     paths = [local_path(text) for text in given]
     values = dict(pair_of(text) for text in places if text not in given)
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
-            "expected recordings, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 success=true"
+            "expected recordings or directories, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 good=true"
         )
     if not undo and episodes is None and filter_text is None:
         raise typer.BadParameter(
@@ -160,7 +160,8 @@ def tag(
     else:
         chosen = numbers_in(files, episodes, filter_of(filter_text))
         if not chosen:
-            raise RecordingError(f"no episode of {' '.join(map(str, paths))} matches {filter_text}")
+            why = "" if filter_text is None else f" that matches {filter_text}"
+            raise RecordingError(f"there is no episode{why} in {', '.join(map(str, paths))}")
         for (file, _), numbers in chosen.items():
             annotate_episodes(file, values, numbers, dry_run=dry_run)
             done.append({"path": file, "episodes": numbers, "values": values})

@@ -166,7 +166,7 @@ def delete(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Delete episodes; restore brings them back, but for those on a server.
+    """Delete episodes; restore brings them back, except on a server.
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json

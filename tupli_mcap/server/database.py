@@ -188,7 +188,7 @@ def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
         limits = f"-c lock_timeout={BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
-        # To compile a statement (JIT) takes longer than to run it, and to start processes that share it, too.
+        # Compiling a statement (JIT), or starting processes that share it, takes longer than running it.
         kwargs["options"] = (
             f"{kwargs.get('options', '')} {limits} -c jit=off -c max_parallel_workers_per_gather=0"
         )

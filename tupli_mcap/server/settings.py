@@ -19,10 +19,10 @@ class Settings:
     open_signup: whether everybody may create a user. min_password: least characters of a new password. guests: whether
     what is published in `global` is shown without a sign-in. access_seconds, refresh_seconds, ticket_seconds: how long
     tokens and tickets are valid. max_upload, max_body, max_message: most bytes of a recording, of a benchmark or an
-    artifact, and of any other request. max_values: most values in a body of JSON, which take up to a hundred times the
-    memory of their text. max_page: most items of a page. max_uploads: most unfinished uploads of a user.
-    max_requests: most requests of a user that a process answers at a time. quota: most bytes that each user may store;
-    None without a limit. query_seconds: how long a query may take.
+    artifact, and of any other request. max_marks: most commas and opening brackets in a body of JSON: a short value
+    takes up to a hundred times the memory of its text. max_page: most items of a page. max_uploads: most unfinished
+    uploads of a user. max_requests: most requests of a user that a process answers at a time. quota: most bytes that
+    each user may store; None without a limit. query_seconds: how long a query may take.
     head_seconds, stall_seconds: how long a client may keep the server waiting, see `patience`. pending_seconds: after
     this time, a pending file counts as left by a killed process. upkeep_seconds: time between two clean-ups.
     open_metrics: whether metrics are shown without a sign-in.
@@ -42,7 +42,7 @@ class Settings:
     max_upload: int = 1 << 40
     max_body: int = 256 << 20
     max_message: int = 4 << 20
-    max_values: int = 4_000_000
+    max_marks: int = 4_000_000
     max_page: int = 1000
     max_uploads: int = 100
     max_requests: int = 4

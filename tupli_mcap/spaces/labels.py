@@ -92,13 +92,16 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
         SpaceError: no leaf has the path, or the leaf has another number of dimensions or values.
     """
     by_path = {leaf.path: leaf for leaf in leaves}
-    dimensions, values = dict(known.dimensions), dict(known.values)
+    dimensions, values, named = dict(known.dimensions), dict(known.values), set[str]()
     for key, names in given.items():
-        root, bracket, rest = key.partition("[")
+        root, bracket, rest = str(key).partition("[")
         path = f"{_OF_COLUMN.get(root, root)}{bracket}{rest}"
         leaf = by_path.get(path)
         if leaf is None:
             raise SpaceError(f"labels: expected one of {sorted(by_path)}, found {key!r:.80}")
+        if path in named:
+            raise SpaceError(f"labels: expected names for {path} once, found them twice")
+        named.add(path)
         texts = tuple(names) if not isinstance(names, str) else (names,)
         if not _are_texts(texts):
             raise SpaceError(

@@ -167,6 +167,16 @@ class TupliStorage(ABC):
         offset: int = 0,
     ) -> list[EpisodeItem]: ...
 
+    @overload
+    def list_episodes(
+        self,
+        filter: BaseFilter | None = None,
+        include_tuples: bool = False,
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+    ) -> list[EpisodeHeader] | list[EpisodeItem]: ...
+
     def list_episodes(
         self,
         filter: BaseFilter | None = None,

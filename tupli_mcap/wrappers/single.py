@@ -63,7 +63,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             documentation. No other environment is made; `verify --rerun` finds out whether a spec rebuilds it.
         attachments: name -> (media type, bytes), written before the first step instead of what `capture_env` says.
         labels: names for viewers and plots, by leaf: {"state": ["x", "angle"], "action": ["left", "right"]}, one for
-            each dimension, or for each value of a Discrete. By default those in the environment's documentation.
+            each dimension, or for each value of a Discrete. By default those in the environment's documentation. Names
+            of columns, such as "observations", mean the same leaves.
         flush_seconds: write chunks at least this often (seconds), full or not.
         journal_dir: where the journal goes, if not beside the recording (a local disk for a network path).
         chunk_size: bytes of a chunk before compression.

@@ -54,6 +54,11 @@ class Parts(SaysWhatIsMeant):
             )
         return found[known]
 
+    __iter__ = None  # it has no order
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and _OTHER_NAMES.get(name, name) in self.asdict()
+
     def asdict(self) -> dict[str, Any]:
         """The requested columns and facts, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}

@@ -28,7 +28,8 @@ _CONTENT: Final = frozenset(
     ("/v1/benchmarks", "/v1/artifacts", "/benchmarks/create", "/artifacts/upload", "/episodes/record")
 )
 _METHODS: Final = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
-_BEFORE_VALUES: Final = (b"[", b"{", b",")
+_BYTES: Final = frozenset(("/v1/artifacts",))  # takes no JSON
+_MARKS: Final = (b"[", b"{", b",")
 _QUIET: Final = frozenset(("/health", "/ready", "/metrics"))
 
 
@@ -44,7 +45,7 @@ class Gate:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        passing = _Passing(scope, receive, send, self._settings.max_values)
+        passing = _Passing(scope, receive, send, self._settings.max_marks)
         clear_contextvars()
         bind_contextvars(id=passing.id)  # which is in every line of the log from here on
         with self._metrics.running.track_inprogress():
@@ -107,25 +108,29 @@ class Gate:
 class _Passing:
     """A request on its way through the gate."""
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send, max_values: int) -> None:
+    def __init__(self, scope: Scope, receive: Receive, send: Send, max_marks: int) -> None:
         self.id = secrets.token_hex(8)
         self.begun = time.monotonic()
         self.status = self.received = self.sent = 0
-        self._receive, self._send, self._max_values = receive, send, max_values
-        self._values = 0  # that its JSON may have so far, counted before it is parsed
-        kind = dict(scope["headers"]).get(b"content-type", b"json")
-        self._is_json = b"json" in kind.lower()
+        self._receive, self._send, self._max_marks = receive, send, max_marks
+        self._marks = 0
+        kinds = [value.lower() for name, value in scope["headers"] if name == b"content-type"]
+        said = not any(kinds) or any(b"json" in kind for kind in kinds)
+        self._is_json = said and scope["method"] != "PATCH" and scope["path"] not in _BYTES
         scope.setdefault("state", {})
 
     async def receive(self) -> Message:
-        """Receives a part of the body; HTTPException if its JSON has too many values."""
+        """Receives a part of the body; HTTPException if too many values may be in its JSON: one follows each mark."""
         message = await self._receive()
         body = message.get("body", b"")
         self.received += len(body)
         if self._is_json:
-            self._values += sum(map(body.count, _BEFORE_VALUES))
-            if self._values > self._max_values:
-                raise HTTPException(413, f"expected JSON of at most {self._max_values} values, found more")
+            self._marks += sum(map(body.count, _MARKS))
+            if self._marks > self._max_marks:
+                raise HTTPException(
+                    413,
+                    f"expected JSON with at most {self._max_marks} commas and opening brackets, found more",
+                )
         return message
 
     async def send(self, message: Message) -> None:

@@ -161,10 +161,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         if not isinstance(artifact, bytes | bytearray | memoryview):
             raise StorageError(f"expected the bytes of an artifact, found {type(artifact).__name__}")
         told = jsonvalue.dumps_plain(metadata.model_dump())
-        headers = {
-            "Artifact-Metadata": base64.b64encode(told.encode()).decode(),
-            "Content-Type": "application/octet-stream",
-        }
+        headers = {"Artifact-Metadata": base64.b64encode(told.encode()).decode()}
         response = self._session.ask(
             "POST", "/v1/artifacts", content=bytes(artifact), headers=headers, repeat=True
         )

@@ -116,8 +116,8 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
 
 
 def _fewest(connection: Connection, asked: Asked, given: Sequence[Source]) -> tuple[Subquery, int] | None:
-    """The ids of the source that has the fewest, or the fewest in the recordings that may have such episodes, and how
-    many, if they are few."""
+    """The ids of the source that has the fewest, and how many, if they are few. If a page is sorted and all sources
+    have many, only their ids in the recordings that may have such episodes are counted."""
     fewest, least = None, _FEW + 1
     if asked.sort is not None:
         given = [*given, _of_recordings(asked)]
