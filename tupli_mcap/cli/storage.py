@@ -166,11 +166,11 @@ def delete(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Delete episodes; restore brings them back, except on a server.
+    """Delete episodes; restore brings them back.
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json
-    still shows them.
+    still shows them. Episodes on a server are gone.
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
