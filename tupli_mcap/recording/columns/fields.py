@@ -1,4 +1,4 @@
-"""The names of the columns of steps, and Gymnasium's names for them."""
+"""The names of the columns of steps, Gymnasium's names for them, and columns that are found by name."""
 
 from __future__ import annotations
 

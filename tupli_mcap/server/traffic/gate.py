@@ -113,14 +113,14 @@ class _Passing:
         self.begun = time.monotonic()
         self.status = self.received = self.sent = 0
         self._receive, self._send, self._max_marks = receive, send, max_marks
-        self._marks = 0
+        self._marks = 0  # so far
         kinds = [value.lower() for name, value in scope["headers"] if name == b"content-type"]
-        said = not any(kinds) or any(b"json" in kind for kind in kinds)
-        self._is_json = said and scope["method"] != "PATCH" and scope["path"] not in _BYTES
+        may_be = not any(kinds) or any(b"json" in kind for kind in kinds)
+        self._is_json = may_be and scope["method"] != "PATCH" and scope["path"] not in _BYTES
         scope.setdefault("state", {})
 
     async def receive(self) -> Message:
-        """Receives a part of the body; HTTPException if too many values may be in its JSON: one follows each mark."""
+        """Receives a part of the body; HTTPException if its JSON may have too many values: a mark comes before each."""
         message = await self._receive()
         body = message.get("body", b"")
         self.received += len(body)
