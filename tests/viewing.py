@@ -9,15 +9,17 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import rerun_cli
 from PIL import Image
 from rerun.experimental import View, ViewerClient, ViewerState
+
+T = TypeVar("T")
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"  # the program itself: its Python shim would orphan it
 SIZE = (900, 640)
@@ -85,7 +87,7 @@ class HeadlessViewer:
 
     def show(self, *paths: Path) -> ViewerState:
         """Closes all files, opens these in order, and waits until they are drawn; the last one is in front."""
-        if self.client.get_state().recordings:
+        if self._state().recordings:
             self.client.close("all")
         self._seen = self._last_log()
         self.client.open([str(path) for path in paths])
@@ -98,7 +100,7 @@ class HeadlessViewer:
     def settled(self) -> ViewerState:
         """The state once nothing loads any more and every view has been drawn at least once."""
         for _ in patiently(_PATIENCE):
-            state = self.client.get_state()
+            state = self._state()
             if state.recordings and not state.loading:
                 break
         else:
@@ -106,13 +108,16 @@ class HeadlessViewer:
         if any(recording.timelines for recording in state.recordings):
             self._pause()
         self.screenshot()  # reports are those of the last time a view was drawn
-        return self.client.get_state()
+        return self._state()
+
+    def _state(self) -> ViewerState:
+        return answer(self.client.get_state)
 
     def _pause(self) -> None:
         """Stops the time, else every picture waits for the next ones."""
         for _ in patiently(_PATIENCE):
             try:
-                return self.client.set_time(play_state="paused")
+                return answer(lambda: self.client.set_time(play_state="paused"))
             except ConnectionError as err:  # the recording in front is not the one that has some
                 if "no timelines" not in str(err):
                     raise
@@ -120,17 +125,17 @@ class HeadlessViewer:
 
     def seek(self, timeline: str, step: int) -> None:
         """Stop at a step of a sequence timeline."""
-        self.client.set_time(timeline, sequence=step, play_state="paused")
+        answer(lambda: self.client.set_time(timeline, sequence=step, play_state="paused"))
 
     def filled(self, *names: str) -> dict[str, bool]:
         """The name of every view in sight (or of these), and whether it shows any data; not those behind a tab."""
-        state = self.client.get_state()
+        state = self._state()
         inks = {view.name: self.ink(view) for view in state.views if not names or view.name in names}
         return {name: ink > _SOME for name, ink in inks.items() if ink is not None}
 
     def problems(self) -> list[str]:
         """The errors of views and the viewer since the last `show`."""
-        state = self.client.get_state()
+        state = self._state()
         views = [
             f"{view.name}: {report.severity}: {report.summary} {report.details or ''}"
             for view in state.views
@@ -149,7 +154,7 @@ class HeadlessViewer:
 
     def screenshot(self, view: View | None = None) -> np.ndarray:
         """A picture of the window, or of one of its views: height x width x 3 bytes."""
-        png = self.client.take_screenshot(None if view is None else view.view_id)
+        png = answer(lambda: self.client.take_screenshot(None if view is None else view.view_id))
         return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
 
     def ink(self, view: View) -> int | None:
@@ -210,6 +215,14 @@ def _of_the_machine(message: str) -> bool:
             "failed to render screenshot",
         )
     )
+
+
+def answer(ask: Callable[[], T]) -> T:
+    """What the viewer answers; asked again where it is too busy to do so in the 15 seconds that its client waits."""
+    for _ in patiently(_PATIENCE):
+        with contextlib.suppress(TimeoutError):
+            return ask()
+    return ask()
 
 
 def patiently(seconds: float, pause: float = 0.05) -> Iterator[None]:
