@@ -285,14 +285,18 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         ann = another(admin, "ann")
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
-        with pytest.raises(
-            StorageError, match="ann may store 20000 bytes, uses 15000, and cannot store 9000 more"
-        ):
+        stored = ann._session.ask("GET", "/v1/me")["used"]
+        assert 15_000 < stored < 15_500  # with its header
+        match = f"ann may store 20000 bytes, uses {stored}, and cannot store 9000 more"
+        with pytest.raises(StorageError, match=match):
             ann.store_artifact(b"y" * 9000, ArtifactMetadata(name="y"))
-        assert begin(ann, b"z" * 5000).status_code == 201
-        full = begin(ann, b"z" * 5001)
+        with pytest.raises(StorageError, match="ann may store 20000 bytes"):
+            ann.store_artifact(b"y", ArtifactMetadata(name="y", description="d" * 5000))
+        rest = 20_000 - stored
+        assert begin(ann, b"z" * rest).status_code == 201
+        full = begin(ann, b"z" * (rest + 1))
         assert (full.status_code, full.json()["error"]) == (507, "StorageError")
-        assert begin(ann, b"z" * 5000).status_code == 201  # the same one
+        assert begin(ann, b"z" * rest).status_code == 201  # the same one
         told = ann._session.ask("GET", "/v1/me")
         assert (told["used"], told["quota"]) == (20_000, 20_000)
 

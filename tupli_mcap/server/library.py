@@ -361,8 +361,6 @@ class Library:
                 with self.database.writing() as connection:
                     # else another user's deletion of the same bytes has removed them meanwhile
                     if self.blobs.size(key) is not None:
-                        # once more: what the user has sent at the same time may have taken the room
-                        quotas.demand_room(connection, self.settings, caller, len(data))
                         settle(connection, key)
                         return self.items.store_artifact(connection, caller, data, metadata)
         except BaseException:

@@ -105,7 +105,7 @@ ITEM: Final = Table(
     Column("header", TEXT, nullable=False),  # JSON: its header, without owner and groups
     Column("content", TEXT),  # a benchmark's environment as text
     Column("needs", TEXT, nullable=False),  # JSON: ids of the artifacts that a benchmark needs
-    Column("size", NUMBER, nullable=False, server_default="0"),  # bytes of its content
+    Column("size", NUMBER, nullable=False, server_default="0"),  # bytes of its content and header
     UniqueConstraint("kind", "id", "created_by"),
     Index("ix_item_id", "id"),
 )

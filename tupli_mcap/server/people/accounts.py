@@ -7,11 +7,11 @@ import re
 import time
 import unicodedata
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
-from sqlalchemy import Connection, delete, insert, select, update
+from sqlalchemy import Connection, Select, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.server.database import audit, demand_few
@@ -50,6 +50,7 @@ _GROUP: Final = re.compile(r"[^/\\\x00-\x1f\x7f]{1,100}")
 _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's own name
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
+_MEMBERSHIPS: Final = (MEMBERSHIP.c.user, MEMBERSHIP.c.team, MEMBERSHIP.c.role)
 _BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and symbols that draw nothing
 _MOST_PASSWORD: Final = 1024
 _MOST_DESCRIPTION: Final = 1000
@@ -134,9 +135,10 @@ def demand_over(connection: Connection, caller: Caller, name: str) -> None:
             caller.demand(right)
 
 
-def list_users(connection: Connection) -> list[str]:
-    """The names of all users, oldest first."""
-    return list(connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars())
+def list_users(connection: Connection) -> dict[str, dict[str, list[str]]]:
+    """All users, oldest first, each with the roles by group, as from `memberships_of`."""
+    names = connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars()
+    return _with_memberships(connection, list(names), select(*_MEMBERSHIPS))
 
 
 def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:
@@ -157,10 +159,16 @@ def guest(connection: Connection) -> Caller:
 
 def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
     """The roles of a user by group, with the roles that every user has."""
-    found = {GLOBAL: list(_EVERYBODY_S_ROLES), name: list(_OWN_ROLES)}
-    chosen = select(MEMBERSHIP.c.team, MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == name)
-    for group, role in connection.execute(chosen.order_by(MEMBERSHIP.c.team, MEMBERSHIP.c.role)):
-        roles = found.setdefault(group, [])
+    of_user = select(*_MEMBERSHIPS).where(MEMBERSHIP.c.user == name)
+    return _with_memberships(connection, [name], of_user)[name]
+
+
+def _with_memberships(
+    connection: Connection, names: Sequence[str], chosen: Select[Any]
+) -> dict[str, dict[str, list[str]]]:
+    found = {name: {GLOBAL: list(_EVERYBODY_S_ROLES), name: list(_OWN_ROLES)} for name in names}
+    for user, group, role in connection.execute(chosen.order_by(*_MEMBERSHIPS)):
+        roles = found[user].setdefault(group, [])
         if role not in roles:
             roles.append(role)
     return found

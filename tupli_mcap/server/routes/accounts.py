@@ -142,10 +142,8 @@ def list_users(library: Served, caller: Reader) -> list[User]:
     """All users."""
     caller.demand(Right.USER_READ)
     with library.database.reading() as connection:
-        return [
-            User(username=name, memberships=accounts.memberships_of(connection, name))
-            for name in accounts.list_users(connection)
-        ]
+        users = accounts.list_users(connection)
+    return [User(username=name, memberships=held) for name, held in users.items()]
 
 
 @router.delete("/users/{username}")

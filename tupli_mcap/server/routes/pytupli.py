@@ -86,20 +86,17 @@ def _hidden(caller: Caller, text: str) -> Iterator[None]:
 # --- users ---
 
 
-def _user(library: Library, name: str) -> dict[str, Any]:
-    with library.database.reading() as connection:
-        held = accounts.memberships_of(connection, name)
-    return {
-        "username": name,
-        "memberships": [{"group": group, "roles": roles} for group, roles in held.items()],
-    }
+def _user(name: str, held: dict[str, list[str]]) -> dict[str, Any]:
+    memberships = [{"group": group, "roles": roles} for group, roles in held.items()]
+    return {"username": name, "memberships": memberships}
 
 
 @router.post("/access/users/create")
 def create_user(library: Served, caller: AnyCaller, address: Address, told: Credentials) -> dict[str, Any]:
     """Makes a user."""
     library.create_user(caller, told.username, told.password, address)
-    return _user(library, told.username)
+    with library.database.reading() as connection:
+        return _user(told.username, accounts.memberships_of(connection, told.username))
 
 
 @router.get("/access/users/list")
@@ -107,8 +104,8 @@ def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
     """All users."""
     caller.demand(Right.USER_READ)
     with library.database.reading() as connection:
-        names = accounts.list_users(connection)
-    return [_user(library, name) for name in names]
+        users = accounts.list_users(connection)
+    return [_user(name, held) for name, held in users.items()]
 
 
 @router.delete("/access/users/delete")

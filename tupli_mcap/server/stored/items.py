@@ -69,8 +69,9 @@ class Items:
                 environment=name_in(document),
             )
             size = len(query.serialized)
-            quotas.demand_room(connection, self._settings, caller, size)
-            own = self._add(connection, "benchmark", header, content=query.serialized, needs=needs, size=size)
+            own = self._add(
+                connection, caller, "benchmark", header, content=query.serialized, needs=needs, size=size
+            )
             audit(connection, caller.name, "store_benchmark", uri)
         return _benchmark(own)
 
@@ -103,7 +104,7 @@ class Items:
         own = self._own(connection, caller, "artifact", uri)
         if own is None:
             item = ArtifactMetadataItem.create_new(**dict(metadata), id=uri, hash=uri, created_by=caller.name)
-            own = self._add(connection, "artifact", item, size=len(data))
+            own = self._add(connection, caller, "artifact", item, size=len(data))
             audit(connection, caller.name, "store_artifact", uri)
         return _artifact(own)
 
@@ -191,6 +192,7 @@ class Items:
     def _add(
         self,
         connection: Connection,
+        caller: Caller,
         kind: Kind,
         item: BenchmarkHeader | ArtifactMetadataItem,
         *,
@@ -198,13 +200,15 @@ class Items:
         needs: Sequence[str] = (),
         size: int,
     ) -> Row[Any]:
-        header = plain(item)
+        header = json.dumps(plain(item))
+        size += len(header)
+        quotas.demand_room(connection, self._settings, caller, size)
         row = {
             "kind": kind,
             "id": item.id,
             "created_by": item.created_by,
             "published_in": audience(connection, item.published_in),
-            "header": json.dumps(header),
+            "header": header,
             "content": content,
             "needs": json.dumps(list(needs)),
             "size": size,
