@@ -6,7 +6,7 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections.abc import Collection, Generator, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -39,15 +39,12 @@ MOST_MERGED = 256
 _MEDIA = "application/octet-stream"
 
 
-def recording_of(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> StreamingResponse:
-    """An answer with one recording of these episodes, written while it is sent.
+def recording_of(shelf: Shelf, numbers_of: Mapping[str, Sequence[int]]) -> StreamingResponse:
+    """An answer with one recording of some episodes, by recording and number, written while it is sent.
 
     Raises:
         SpaceError, RecordingError: the episodes cannot be merged into one recording.
     """
-    numbers_of: dict[str, list[int]] = {}
-    for header in headers:
-        numbers_of.setdefault(header.recording, []).append(header.episode)
     if len(numbers_of) > MOST_MERGED:
         raise UnmergeableError(
             f"expected episodes of at most {MOST_MERGED} recordings, found {len(numbers_of)}; choose fewer"

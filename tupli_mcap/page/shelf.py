@@ -106,7 +106,7 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
         NotFoundError: an episode does not exist, or the reader may not see it.
     """
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
-    found = each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection)))
+    found = list(each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection))))
     known = {header.id for header in found}
     missing = [uri for uri in uris if uri not in known]
     if missing:

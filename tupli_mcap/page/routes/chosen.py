@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -86,19 +86,28 @@ def sparks(shelf: Shown, uris: Ids) -> Response:
 def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Response:
     """One recording of the chosen episodes; if none are chosen, of all that match the filter."""
 
-    def ask(connection: Connection) -> list[EpisodeHeader]:
+    def find(connection: Connection) -> Iterable[EpisodeHeader]:
         if uris:
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         of = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
         return each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection), of=of))
 
-    headers = shelf.ask(ask)
-    if not headers:
+    def ask(connection: Connection) -> tuple[EpisodeHeader | None, dict[str, list[int]]]:
+        first: EpisodeHeader | None = None
+        numbers_of: dict[str, list[int]] = {}
+        for header in find(connection):  # of what may be a million, only the numbers are kept
+            first = first or header
+            numbers_of.setdefault(header.recording, []).append(header.episode)
+        return first, numbers_of
+
+    first, numbers_of = shelf.ask(ask)
+    if first is None:
         raise NotFoundError("no episode matches; choose others, or another filter")
-    name = str(headers[0].run.get("name", "")) or Path(headers[0].recording).stem
-    what = f"episode-{headers[0].episode}" if len(headers) == 1 else f"{len(headers)}-episodes"
-    answer = recording_of(shelf, headers)
+    name = str(first.run.get("name", "")) or Path(first.recording).stem
+    count = sum(map(len, numbers_of.values()))
+    what = f"episode-{first.episode}" if count == 1 else f"{count}-episodes"
+    answer = recording_of(shelf, numbers_of)
     answer.headers["Content-Disposition"] = (
         f'attachment; filename="{quote(files.as_file_name(name))}-{what}.mcap"'
     )

@@ -151,12 +151,13 @@ def find_episodes(
     return _all_of_them(connection, asked, limit, offset)
 
 
-def each_once(headers: Iterable[EpisodeHeader]) -> list[EpisodeHeader]:
+def each_once(headers: Iterable[EpisodeHeader]) -> Iterator[EpisodeHeader]:
     """Each episode once: if several files of a directory have it, that of the first one."""
-    found: dict[str, EpisodeHeader] = {}
+    seen: set[str] = set()
     for each in headers:
-        found.setdefault(each.id, each)
-    return list(found.values())
+        if each.id not in seen:
+            seen.add(each.id)
+            yield each
 
 
 def count_episodes(
