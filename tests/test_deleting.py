@@ -179,3 +179,29 @@ def test_at_a_url_nothing_is_deleted(runs: Path) -> None:
         for delete in (dataset.filter("seed == 0").delete, dataset[0].delete):
             with pytest.raises(RecordingError, match="cannot be changed here; download it"):
                 delete()
+
+
+def test_a_link_is_the_file_that_it_names(runs: Path, tmp_path: Path) -> None:
+    file, link = runs / "a.mcap", tmp_path / "curated" / "link.mcap"
+    link.parent.mkdir()
+    link.symlink_to(file)
+    assert seeds(link.parent) == [0, 1, 2, 3]
+    run("delete", str(link), "--episodes", "1")
+    assert seeds(link) == seeds(link.parent) == seeds(file) == [0, 2, 3]
+    run("delete", str(file), "--episodes", "0")
+    assert seeds(link) == seeds(link.parent) == [2, 3]
+    run("restore", str(link), "--episodes", "0")
+    before = file.stat().st_size
+    run("compact", str(link))
+    assert link.is_symlink() and file.stat().st_size < before
+    assert seeds(file) == seeds(link.parent) == [0, 2, 3]
+    run("delete", str(link), "--episodes", "all", "--force")
+    assert not (file.exists() or link.is_symlink())
+
+
+def test_a_hidden_file_that_is_named(tmp_path: Path) -> None:
+    file = record(tmp_path / ".hidden.mcap")
+    assert tupli_mcap.open(file).filter("seed = 1").delete() == 1
+    assert seeds(file) == [0, 2, 3]
+    assert "restored 1 episode" in run("restore", str(file))
+    assert seeds(file) == [0, 1, 2, 3]

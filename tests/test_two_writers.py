@@ -21,8 +21,17 @@ import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
 
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, journal_path, rewrite_recording
-from tupli_mcap.mcap.lock import FileLock, is_locked
+import tupli_mcap
+from tupli_mcap import (
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    journal_path,
+    recover_recording,
+    rewrite_recording,
+)
+from tupli_mcap.mcap.lock import FileLock, LockedError, is_locked
+from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 
 Names = Callable[[Path], Path]
 
@@ -162,7 +171,7 @@ class TestASecondWriter:
         def replace() -> None:
             time.sleep(0.2)
             with Recording(path) as recording:
-                rewrite_recording(recording, path, episodes=[0])
+                rewrite_in_place(recording, path, [0])
             os.close(held)
 
         thread = threading.Thread(target=replace)
@@ -184,6 +193,46 @@ class TestASecondWriter:
                 assert np.array_equal(old.read().states, wanted)
                 assert Recording(path).num_steps == 3
         assert list(tmp_path.iterdir()) == [path]
+
+
+def rewrite(source: Path, target: Path) -> None:
+    with Recording(source) as recording:
+        rewrite_recording(recording, target)
+
+
+REPLACE: dict[str, Callable[[Path, Path], Any]] = {
+    "merge": lambda source, target: tupli_mcap.merge_recordings([source], target, overwrite=True),
+    "save": lambda source, target: tupli_mcap.open(source).save(target, overwrite=True),
+    "map": lambda source, target: tupli_mcap.open(source).map(lambda e: e.rewards, target, overwrite=True),
+    "trim": lambda source, target: tupli_mcap.open(source).trim(slice(0, 1), target, overwrite=True),
+    "rewrite": rewrite,
+    "recover": lambda source, target: recover_recording(source, target, overwrite=True),
+}
+
+
+@pytest.mark.parametrize("how", REPLACE)
+def test_a_recording_in_progress_is_not_replaced(tmp_path: Path, how: str) -> None:
+    source, live, link = (tmp_path / f"{name}.mcap" for name in ("source", "live", "link"))
+    with cart_pole(source) as env:
+        roll(env, 30)
+    link.symlink_to(live)
+    with cart_pole(live) as env:
+        roll(env, 20)
+        for target in (live, link):
+            with pytest.raises(LockedError, match="being recorded by another writer"):
+                REPLACE[how](source, target)
+        roll(env, 20)
+    assert Recording(live).num_steps == 40
+
+
+def test_what_replaces_a_link_replaces_the_file_it_names(tmp_path: Path) -> None:
+    source, file, link = (tmp_path / f"{name}.mcap" for name in ("source", "file", "link"))
+    for path, steps in ((source, 30), (file, 20)):
+        with cart_pole(path) as env:
+            roll(env, steps)
+    link.symlink_to(file.name)
+    tupli_mcap.open(source).save(link, overwrite=True)
+    assert link.is_symlink() and Recording(file).num_steps == 30
 
 
 class TestARecordingWithoutASteps:

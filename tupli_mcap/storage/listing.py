@@ -146,8 +146,10 @@ def scan(root: Path) -> Iterator[FoundRecording]:
 
 def stamp_of(root: Path, relative: str) -> RecordingStamp:
     """The stamp of one recording below a directory; raises FileNotFoundError if it is gone."""
-    deleting = Deletion.read(root).stamp(relative)
-    path = root / relative
+    return _stamp_at(root / relative, Deletion.read(root).stamp(relative))
+
+
+def _stamp_at(path: Path, deleting: Sequence[int]) -> RecordingStamp:
     status = path.stat()
     try:
         return _mix(status, sidecar_path(path).stat(), deleting)
@@ -158,6 +160,8 @@ def stamp_of(root: Path, relative: str) -> RecordingStamp:
 def _stamp(
     entry: os.DirEntry[str], found: dict[str, os.DirEntry[str]], deleting: Sequence[int]
 ) -> RecordingStamp:
+    if entry.is_symlink():
+        return _stamp_at(Path(entry.path), deleting)
     beside = found.get(f"{entry.name}.json")
     # Not `beside.stat()`: scandir's facts about a file may be older than its name.
     return _mix(os.stat(entry.path), None if beside is None else os.stat(beside.path), deleting)  # noqa: PTH116

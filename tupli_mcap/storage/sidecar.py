@@ -20,6 +20,7 @@ Another recording may replace one (`mode="w"`), with episodes of the same number
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -185,5 +186,7 @@ def storage_of(recording: Path) -> Path:
 
 
 def sidecar_path(recording: Path) -> Path:
-    """The path of a recording's sidecar."""
+    """The path of a recording's sidecar: beside the file itself, where the path is a symbolic link to it."""
+    if recording.is_symlink():
+        recording = Path(os.path.realpath(recording))
     return recording.with_name(recording.name + ".json")

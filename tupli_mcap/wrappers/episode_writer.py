@@ -19,7 +19,7 @@ from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.edit.attach import held
-from tupli_mcap.recording.edit.rewrite import rewrite_recording
+from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
@@ -403,6 +403,6 @@ def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> No
         with held(path), Recording(path) as recording:
             kept = [number for number in recording.index["episode"].tolist() if number not in numbers]
             if kept:
-                rewrite_recording(recording, path, episodes=kept, compression=compression)
+                rewrite_in_place(recording, path, kept, compression=compression)
             else:
                 path.unlink()

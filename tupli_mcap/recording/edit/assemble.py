@@ -19,6 +19,7 @@ from tupli_mcap.journal.derive import even_rows
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.chunks import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows, library
+from tupli_mcap.mcap.lock import writers_kept_out
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
@@ -241,17 +242,23 @@ def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtyp
 
 
 @contextlib.contextmanager
-def replacing(goal: Path, permissions: int = 0o666) -> Iterator[tuple[int, Path]]:
+def replacing(goal: Path, permissions: int = 0o666, *, held: bool = False) -> Iterator[tuple[int, Path]]:
     """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
 
-    Missing directories are made.
+    Missing directories are made, and a symbolic link is followed.
+
+    Args:
+        held: whether the caller holds the lock of the recording that is replaced.
 
     Raises:
+        LockedError: somebody is recording to `goal`.
         RecordingError: the system refuses, here or in the block; `goal` is unchanged.
     """
+    place = Path(os.path.realpath(goal)) if goal.is_symlink() else goal
     try:
-        goal.parent.mkdir(parents=True, exist_ok=True)
-        with files.replacing(goal) as new:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        kept_out = writers_kept_out(goal) if goal.is_file() and not held else contextlib.nullcontext()
+        with kept_out, files.replacing(place) as new:
             fd = files.create(new, permissions)
             try:
                 yield fd, new

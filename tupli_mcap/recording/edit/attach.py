@@ -60,7 +60,7 @@ def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without:
             raise RecordingError(
                 f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
             )
-        with replacing(path, 0o600) as (fd, _):
+        with replacing(path, 0o600, held=True) as (fd, _):
             container = Container(fd, str(path), "zstd")
             restore_container(container, contents, source)
             _write(container, source, contents, attachments, {*attachments, *without})

@@ -58,6 +58,16 @@ def rewrite_recording(
         write(source, container, metadata, episodes, attachments or {}, frames, signed=same)
 
 
+def rewrite_in_place(
+    source: Recording, path: Path, episodes: Sequence[int], *, compression: str = "zstd"
+) -> None:
+    """Writes the file of `source`, whose lock the caller holds, anew with fewer episodes. Raises as
+    `rewrite_recording` does."""
+    with replacing(path, held=True) as (fd, _):
+        container = Container(fd, str(path), compression)
+        write(source, container, kept_metadata(source), episodes, {}, signed=False)
+
+
 def kept_metadata(source: Recording) -> dict[str, str]:
     """The metadata of a rewritten recording, which keeps its UUID."""
     metadata = {key: value for key, value in source.metadata.items() if key not in ("journal", "replaced")}

@@ -12,13 +12,14 @@ from pathlib import Path
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
-from tupli_mcap.recording import Recording, journal_path, rewrite_recording
+from tupli_mcap.recording import Recording, journal_path
+from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
 from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in
 from tupli_mcap.storage.files.sync import SyncedCatalog
-from tupli_mcap.storage.listing import FoundRecording, scan
+from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles"]
@@ -110,7 +111,8 @@ class RecordingFiles:
             FormatError: It is damaged.
         """
         try:
-            relative = path.resolve().relative_to(self._root.resolve()).as_posix()
+            place = path.parent.resolve() / path.name  # a link to a file elsewhere is below the root itself
+            relative = place.relative_to(self._root.resolve()).as_posix()
         except ValueError as err:
             raise StorageError(
                 f"expected a recording below {str(self._root)!r}, found {str(path)!r}"
@@ -190,10 +192,10 @@ class RecordingFiles:
     def deleted(self, only: Collection[str] | None = None) -> list[str]:
         """The ids of the episodes that are deleted and still in their recordings, or `only` in those at these paths."""
         found = []
-        for item in self._recordings(only):
-            notes = Notes.read(self._root / item.relative, self._root)
+        for path in self._paths(only):
+            notes = Notes.read(path, self._root)
             if notes.deleted:
-                with Recording(self._root / item.relative) as recording:
+                with Recording(path) as recording:
                     numbers = notes.about(recording.metadata).deleted & set(
                         recording.index["episode"].tolist()
                     )
@@ -205,8 +207,7 @@ class RecordingFiles:
         restored = 0
         with self._lock:
             self._finish_deletion()
-            for item in self._recordings(only):
-                path = self._root / item.relative
+            for path in self._paths(only):
                 notes = Notes.read(path, self._root)
                 if notes.deleted:
                     sidecar = notes.about(metadata_at(path))
@@ -217,8 +218,10 @@ class RecordingFiles:
                         restored += len(back)
         return restored
 
-    def _recordings(self, only: Collection[str] | None) -> list[FoundRecording]:
-        return sorted(item for item in scan(self._root) if only is None or item.relative in only)
+    def _paths(self, only: Collection[str] | None) -> list[Path]:
+        """The paths of all recordings, or of the given ones, which may be hidden."""
+        names = [item.relative for item in scan(self._root)] if only is None else only
+        return [path for path in (self._root / name for name in sorted(names)) if _is_file(path)]
 
     def _finish_deletion(self) -> None:
         """Finish a deletion that was interrupted; only recordings in its list are changed."""
@@ -262,7 +265,8 @@ class RecordingFiles:
             with writers_kept_out(path), os_errors("cannot delete the recording", path):
                 if self._left(path):  # somebody has written to it meanwhile
                     return
-                for gone in (path, journal_path(path), sidecar_path(path)):
+                file = path.resolve()
+                for gone in (file, journal_path(file), sidecar_path(file), path):
                     gone.unlink(missing_ok=True)
         except RecordingError:
             return
@@ -288,8 +292,7 @@ class RecordingFiles:
         freed = files.remove_left(files.left_below(self._root))
         with self._lock:
             self._finish_deletion()
-        for item in self._recordings(only):
-            path = self._root / item.relative
+        for path in self._paths(only):
             with self._lock:
                 if not path.exists() or not Notes.read(path, self._root).deleted:
                     continue
@@ -310,7 +313,7 @@ class RecordingFiles:
             sidecar = notes.about(recording.metadata)
             if sidecar.deleted:
                 kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
-                rewrite_recording(recording, path, episodes=kept)
+                rewrite_in_place(recording, path, kept)
                 journal_path(path).unlink(missing_ok=True)
                 groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
                 sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
