@@ -656,11 +656,48 @@ def test_images_and_large_arrays_come_to_arrow(tmp_path: Path) -> None:
     table = dataset.to_arrow()
     cams = dataset.read(["states"]).states["cam"]
     assert np.array_equal(np.array(table.column("state['cam']").to_pylist(), np.uint8), cams)
+    assert str(table.schema.field("state['cam']").type.value_type.value_type.value_type) == "uint8"
     frame = dataset.to_pandas()
     assert len([name for name in frame if "state" in name]) == 4
     assert np.array_equal(np.stack(list(frame["state['depth']"])), dataset.read().states["depth"])
     assert frame["state['depth']"][0].shape == (16, 32, 1)
     assert set(dataset.stats()) == {"states['depth']", "states['x']", "actions", "rewards"}
+
+
+def test_columns_without_a_common_type_come_to_arrow_as_json(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    with tupli_mcap.EpisodeWriter(
+        tmp_path / "r.mcap", gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+    ) as writer:
+        for seed, fact in ((2**63, 1), (3, "x")):
+            writer.begin(seed=seed, metadata={"fact": fact, "large": 2**64})
+            writer.step(0, 0, 1.0, True, info={"fact": fact, "map": np.zeros((seed % 3 + 1, 2))})
+    dataset = tupli_mcap.open(tmp_path)
+    episodes = dataset.to_arrow("episodes").to_pydict()
+    assert episodes["seed"] == ["9223372036854775808", "3"]
+    assert (
+        episodes["metadata.fact"] == ["1", '"x"']
+        and episodes["metadata.large"] == ["18446744073709551616"] * 2
+    )
+    steps = dataset.to_arrow().to_pydict()
+    assert steps["info.fact"] == ["1", '"x"']
+    assert [len(value) for value in steps["info.map"]] == [2**63 % 3 + 1, 1]
+
+
+def test_an_empty_leaf_has_statistics(tmp_path: Path) -> None:
+    space = gym.spaces.Box(0, 1, (2, 0), np.float32)
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        writer.step(np.zeros((2, 0), np.float32), 1, 1.0, True)
+    assert tupli_mcap.open(tmp_path).stats()["states"].mean.shape == (2, 0)
+
+
+def test_a_fraction_of_numpy_and_values_that_have_no_order(dataset: Dataset) -> None:
+    assert [each.n_steps for each in dataset.split(np.float64(0.5))] == [
+        each.n_steps for each in dataset.split(0.5)
+    ]
+    with pytest.raises(TupliError, match="cannot sort by"):
+        dataset.sort(lambda episode: np.array([1, 2]))
 
 
 def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:

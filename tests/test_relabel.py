@@ -232,6 +232,20 @@ def test_replaces_nothing_by_itself(tmp_path: Path) -> None:
         tupli_mcap.open(source).map(lambda episode: episode.rewards, source, overwrite=True)
 
 
+def test_values_that_would_change_are_refused(tmp_path: Path) -> None:
+    space = spaces.Box(0, 255, (1,), np.uint8)
+    source = record(tmp_path / "r.mcap", 1, Sampler(space, spaces.Discrete(2)))
+    dataset, wrong = tupli_mcap.open(source), tmp_path / "wrong.mcap"
+    n = len(dataset[0].all_states)
+    masked = np.ma.masked_array(np.ones((n, 1), np.uint8), mask=np.ones((n, 1)))  # type: ignore[no-untyped-call]
+    for made in (np.full((n, 1), -1, np.int8), np.full((n, 1), -0.0), np.full((n, 1), 256), masked):
+        with pytest.raises(RecordingError, match=r"that uint8 holds exactly, found .* cast them"):
+            dataset.map(lambda episode, made=made: made, wrong, fields=["states"])
+    assert not wrong.exists()
+    same_values = dataset.map(lambda episode: episode.all_states.astype(float), wrong, fields=["states"])
+    assert np.array_equal(tupli_mcap.open(same_values)[0].all_states, dataset[0].all_states)
+
+
 def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
     paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
     merge_recordings(paths, tmp_path / "all.mcap")

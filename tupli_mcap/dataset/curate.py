@@ -121,7 +121,10 @@ def trim(
     _check_new(dataset, target, overwrite=overwrite)
     kept: dict[str, dict[int, slice]] = {name: {} for name in dataset._chosen}
     for header, episode in zip(dataset.headers, dataset, strict=True):
-        kept[header.recording][header.episode] = steps if isinstance(steps, slice) else steps(episode)
+        part = steps(episode) if callable(steps) else steps
+        if not isinstance(part, slice):
+            raise DatasetError(f"expected a slice of the steps of episode {header.id}, found {part!r:.80}")
+        kept[header.recording][header.episode] = part
     return _save_trimmed(dataset, kept, target)
 
 
@@ -161,7 +164,6 @@ def trim_dataset(
 
 def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
     """Writes the episodes of a dataset; `kept`: by recording and number, the steps that stay."""
-    target.parent.mkdir(parents=True, exist_ok=True)
     if len(dataset._chosen) == 1:
         ((name, numbers),) = dataset._chosen.items()
         trim_recording(dataset._open(name), target, kept[name], episodes=sorted(numbers), overwrite=True)
@@ -208,7 +210,6 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, qu
     known = query or ("" if dataset._filter is None else str(dataset._filter))
     facts = {"query": known} if known else {}
     chosen = dataset._chosen
-    target.parent.mkdir(parents=True, exist_ok=True)
     if len(chosen) == 1:
         ((name, numbers),) = chosen.items()
         source = dataset._open(name)

@@ -247,8 +247,8 @@ class Dataset(RandomAccess):
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
             )
-        places = [i for i, value in enumerate(values) if value is not None and value == value]
         try:
+            places = [i for i, value in enumerate(values) if value is not None and value == value]
             ordered = sorted(places, key=lambda i: values[i], reverse=descending)
         except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
@@ -286,7 +286,7 @@ class Dataset(RandomAccess):
         for i, header in enumerate(self.headers):
             name = header.id if values is None else repr(values[i])
             digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
-            parts[int.from_bytes(digest[:8], "big") >= fraction * 2**64].append(header)
+            parts[int.from_bytes(digest[:8], "big") >= float(fraction) * 2**64].append(header)
         return self._of(parts[0]), self._of(parts[1])
 
     @property
@@ -409,7 +409,7 @@ class Dataset(RandomAccess):
         return tables.dataframe(self, level)
 
     def to_arrow(self, level: Level = "steps") -> pa.Table:
-        """The same as an Arrow table.
+        """The same as an Arrow table. Where Arrow has no type for all values of a column, they are texts of JSON.
 
         Raises:
             MissingExtraError: pandas or pyarrow is not installed.

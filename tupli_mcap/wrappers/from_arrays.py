@@ -184,6 +184,7 @@ def _episodes(given: _Given) -> Iterator[_Part]:
         states, rewards, n = one.states, _array(one.rewards), len(one.rewards)
         if n == 0:
             raise StepError(f"episode {i}: expected at least one step, found none")
+        _check_infos(one.infos)
         for name in ("actions", "next_states", "infos"):
             _check_shape(f"episode {i}: {name}", getattr(one, name), (n,), n)
         _check_shape(f"episode {i}: states", states, (n,), n, n + 1)
@@ -230,6 +231,7 @@ def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
         StepError: arrays do not fit together; at once, before anything is written.
     """
     shape = given.rewards.shape[:lead]
+    _check_infos(given.infos)
     for name in ("actions", "next_states", "infos"):
         _check_shape(name, getattr(given, name), shape, shape[0])
     _check_shape("states", given.states, shape, shape[0], shape[0] + 1)
@@ -351,6 +353,11 @@ def _flags(name: str, given: Any, shape: tuple[int, ...]) -> Array:
         )
     flags: Array = given.astype(np.bool_)
     return flags
+
+
+def _check_infos(infos: Any) -> None:
+    if not (infos is None or isinstance(infos, Mapping)):
+        raise StepError(f"infos: expected arrays by name, found {shorten(infos)}")
 
 
 def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> None:

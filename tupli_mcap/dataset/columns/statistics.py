@@ -96,7 +96,7 @@ def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:
     numbers[~np.isfinite(numbers)] = np.nan
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # an element that is never finite has NaN
-        quantiles = np.nanquantile(numbers, QUANTILES, axis=0)
+        quantiles = np.nanquantile(numbers, QUANTILES, axis=0) if leaf.size else np.empty((len(QUANTILES), 0))
     finite = known.finite > 0
     return FieldStatistics(
         count=shaped(known.finite),

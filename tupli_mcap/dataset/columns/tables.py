@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
@@ -45,12 +46,31 @@ def arrow(dataset: Dataset, level: Level) -> pa.Table:
         import pyarrow
     except ImportError as err:
         raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
+    typed = {}
     for name in frame.columns:
-        if frame[name].dtype == object:  # arrays of several dimensions have to be lists
-            frame[name] = [
-                value.tolist() if isinstance(value, np.ndarray) else value for value in frame[name]
-            ]
-    return pyarrow.Table.from_pandas(frame, preserve_index=False)
+        if frame[name].dtype == object:
+            typed[name] = _arrow_column(list(frame[name]), pyarrow)
+            frame[name] = None
+    table = pyarrow.Table.from_pandas(frame, preserve_index=False)
+    for name, column in typed.items():
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    return table
+
+
+def _arrow_column(values: Sequence[Any], pyarrow: Any) -> Any:
+    """Values as Arrow has them: arrays as lists of their dtype, and what has no common type as texts of JSON."""
+    kind, arrays = None, [value for value in values if isinstance(value, np.ndarray)]
+    kinds = {(value.dtype, value.ndim) for value in arrays}
+    if len(arrays) == len(values) and len(kinds) == 1:
+        ((dtype, ndim),) = kinds
+        kind = pyarrow.from_numpy_dtype(dtype)
+        for _ in range(ndim):
+            kind = pyarrow.list_(kind)
+    listed = [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
+    try:
+        return pyarrow.array(listed, kind, from_pandas=True)
+    except (pyarrow.ArrowException, OverflowError):  # numbers beside texts, or too large ones
+        return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
 
 def _episode_columns(dataset: Dataset) -> dict[str, Any]:
@@ -97,7 +117,7 @@ def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     columns: dict[str, Any] = {}
     for key in keys:
         values = [item.get(key) for item in items]
-        some_whole = None in values and {type(value) for value in values} == {int, type(None)}
+        some_whole = {type(value) for value in values} == {int, type(None)}
         columns[f"{root}.{key}"] = _whole_numbers(values) if some_whole else values
     return columns
 

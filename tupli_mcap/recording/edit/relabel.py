@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap import files
 from tupli_mcap.arrays import Array, DType
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -26,6 +26,7 @@ from tupli_mcap.recording.edit.rewrite import return_of
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import final_encoder
+from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
 _FIELDS = ("rewards", "actions", "states")
@@ -114,7 +115,7 @@ class _NewColumns:
     def put(self, episode: Episode, row: Any, field: str, made: Any) -> None:
         """Adds the values of a field. If there is one more state than steps, it is the final state."""
         first, channel, steps = int(row["first_row"]), self._file.steps[int(row["env"])], len(episode)
-        has_final = field == "states" and row["final_row"] >= 0
+        has_final = field == "states" and int(row["final_row"]) >= 0
         lasts = []
         for leaf in self._leaves[field]:
             told = f"{field} of episode {episode.number}"
@@ -177,18 +178,18 @@ def _checked(made: Any, leaf: Leaf, layout: StepLayout, count: int, where: str) 
             if len(values) != count:
                 raise RecordingError(f"expected {count} {where}, found {len(values)}{_hint(where)}")
             return values
-        given = np.asarray(leaf.get(made))
+        given = leaf.get(made)
     except (KeyError, IndexError, TypeError, ValueError) as err:
         raise RecordingError(f"expected {where} as {leaf.path} has them: {err}") from err
     shape, dtype = (count, *leaf.shape), layout.dtypes[leaf.name]
-    if given.shape != shape or given.dtype.kind not in "biuf":
-        found = f"{given.shape} of {given.dtype}"
-        raise RecordingError(f"expected {where} of shape {shape}, found {found}{_hint(where)}")
-    with np.errstate(over="ignore", invalid="ignore"):
-        stored = given.astype(dtype)
-    if not np.array_equal(stored.astype(given.dtype), given, equal_nan=given.dtype.kind == "f"):
-        raise RecordingError(f"expected {where} that {dtype} holds exactly, found {given.dtype}; cast them")
-    return stored
+    try:
+        return exact_array(given, dtype, shape, where)
+    except StepError as err:
+        found = f"{type(given).__name__} of {getattr(given, 'dtype', '?')}, {getattr(given, 'shape', '?')}"
+        raise RecordingError(
+            f"expected {where} of shape {shape} that {dtype} holds exactly, found {found}"
+            + ("; cast them" if np.shape(given) == shape else _hint(where))
+        ) from err
 
 
 def _hint(where: str) -> str:

@@ -87,7 +87,10 @@ def trims_of(source: Recording, steps: Mapping[int, slice]) -> dict[int, Trim]:
 
 def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
     """The trim of an episode; None if all steps stay."""
-    start, stop, stride = kept.indices(len(episode))
+    try:
+        start, stop, stride = kept.indices(len(episode))
+    except (TypeError, ValueError) as err:
+        raise RecordingError(f"expected a slice of steps, found {kept}: {err}") from err
     if stride != 1:
         raise RecordingError(f"expected consecutive steps, found a stride of {stride}")
     if stop <= start:
