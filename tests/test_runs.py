@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +30,7 @@ from tupli_mcap import (
     write_rollout,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.errors import FilterError
+from tupli_mcap.errors import FilterError, SpaceError
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.recording import (
     annotate_episodes,
@@ -767,3 +769,30 @@ def test_keys_are_texts(tmp_path: Path) -> None:
     ):
         with pytest.raises(RecordingError, match="expected"):
             change()
+
+
+def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    for given in ({"name": "one", "metadata": {"lr": 1}}, {"name": "one", "metadata": {"lr": 1}}, {}):
+        record(path, 2, mode="a", **given)
+    assert [run.name for run in Recording(path).runs] == ["one"]  # the same goes on
+    edit_run(path, metadata={"lr": 1.5})
+    record(path, 1, mode="a", name="one", metadata={"lr": 1})  # as it was given
+    pid = os.fork()
+    if pid == 0:
+        env = RecordEpisodes(gym.make("CartPole-v1"), path, mode="a", name="killed", metadata={"lr": 3})
+        env.reset(seed=1)
+        env.step(1)
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+    record(path, 2, mode="a", name="two", metadata={"lr": 2})
+    with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a", metadata={"lr": float("nan")}):
+        pass  # without a step
+    dataset = tupli_mcap.open(path)
+    assert [episode.run.metadata["lr"] for episode in dataset] == [1.5] * 7 + [3] + [2] * 2
+    assert len(dataset.filter("run.name = 'two'")) == 2
+    assert verify_recording(path).ok
+    with pytest.raises(RecordingError, match="has 4 runs; only a recording of one run"):
+        edit_run(path, name="x")
+    with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):
+        RecordVectorEpisodes(gym.make_vec("CartPole-v1", 1), path, mode="a").reset()

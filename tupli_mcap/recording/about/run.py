@@ -145,6 +145,20 @@ class RecordedRuns(NamedTuple):
         found = list(itertools.islice(each, episodes))
         return found + [len(self.runs) - 1] * (episodes - len(found))
 
+    def followed_by(self, run: Run, episodes: int) -> Self:
+        """These runs of so many episodes, and the one that begins now.
+
+        It goes on with the last one if it is of the same environment, and the user gives it the same name, metadata,
+        tags and split, or none of them.
+        """
+        last = self.runs[-1]
+        known = [_given(each) for each in (Run(), last, *self.before)]
+        if _given(run) in known and run.environment in ("", last.environment):
+            return self
+        places = itertools.groupby(self.places(episodes))
+        spans = [(len(list(same)), place) for place, same in places]
+        return self._replace(runs=[*self.runs, run], spans=spans)
+
     def to_json(self) -> bytes:
         """The content of `run.json`: all parts that are not empty, without `ended`, which follows from the episodes.
 
@@ -185,6 +199,11 @@ class RecordedRuns(NamedTuple):
             [(span[0], span[1]) for span in spans],
             [Run.of_document(run, where) for run in before],
         )
+
+
+def _given(run: Run) -> str:
+    """What a user has given, as one text."""
+    return jsonvalue.dumps_plain([run.name, run.metadata, run.tags, run.split])
 
 
 def _document(run: Run) -> dict[str, Any]:

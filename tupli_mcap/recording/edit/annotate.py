@@ -138,7 +138,7 @@ def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, 
     """The run of a recording, and its versions before edits."""
     if len(recording.runs) > 1:
         raise RecordingError(
-            f"{path} is made of {len(recording.runs)} runs; edit the recordings that it was made of, and merge them"
+            f"{path} has {len(recording.runs)} runs; only a recording of one run can be edited"
         )
     (said,) = recording.recorded_runs.runs
     return said, recording.recorded_runs.before

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal, sync_file
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary
+from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary, read_attachment
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
 from tupli_mcap.recording.index import IndexBuilder
@@ -58,13 +59,17 @@ def resume(writer: RecordingWriter) -> None:
         _check_nothing_behind(writer, contents, source)
         _check_aligned(writer, contents)
         _restore(writer, contents, source)
+        runs = _more_runs(writer, contents, source)
     finally:
         source.close()
     writer.container.position = contents.data_end
+    indexes = writer.container.attachment_indexes
+    writer.container.attachment_indexes = [each for each in indexes if each.name not in runs]
     known = set(contents.attachments)
     # The two halves of an environment: one that was lost is not made up for by half of another environment.
     known |= set(_ENVIRONMENT) if known.intersection(_ENVIRONMENT) else set()
-    new = {name: a for name, a in (writer.options.attachments or {}).items() if name not in known}
+    given = writer.options.attachments or {}
+    new = {name: a for name, a in given.items() if name not in known} | runs
     if contents.complete and not new:
         return
     writer.cut()
@@ -151,6 +156,17 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
                 f"{writer.path} lost its end: expected {expected} pictures in {pictures}, found {found}; "
                 f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
             )
+
+
+def _more_runs(writer: RecordingWriter, contents: Contents, source: Source) -> dict[str, tuple[str, bytes]]:
+    """`run.json` with the run that begins now; empty if it goes on with the last one, or the file has no run."""
+    given, recorded = (writer.options.attachments or {}).get(RUN_NAME), contents.attachments.get(RUN_NAME)
+    if given is None or recorded is None:
+        return {}
+    (run,) = RecordedRuns.from_json(given[1], RUN_NAME).runs
+    earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{writer.path}: {RUN_NAME}")
+    runs = earlier.followed_by(run, writer.index.count)
+    return {} if runs is earlier else {RUN_NAME: (RUN_MEDIA_TYPE, runs.to_json())}
 
 
 def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:

@@ -346,8 +346,9 @@ class RecordingWriter:
         if self.layout is None or self.recorded_envs is None:
             return
         if (self.recorded_envs, self.recorded_vector) != (num_envs, vector):
+            recorded = _kind(self.recorded_envs, vector=self.recorded_vector)
             raise SpaceError(
-                f"{self.path} records {self.recorded_envs} sub-environment(s), found {num_envs}; record to another file"
+                f"{self.path} records {recorded}, found {_kind(num_envs, vector=vector)}; record to another file"
             )
         old, new = self.layout.to_metadata(), spaces.to_metadata()
         for key in ("observation_space", "action_space", "reward_space"):
@@ -510,6 +511,10 @@ def finish_in_place(path: Path, options: RecordOptions) -> None:
     except BaseException:
         writer.leave_unfinished()
         raise
+
+
+def _kind(envs: int, *, vector: bool) -> str:
+    return f"a vector environment of {envs}" if vector else "a single environment"
 
 
 def _abandon_all() -> None:
