@@ -739,3 +739,14 @@ def test_names_of_other_libraries_are_understood_well_enough_to_name_ours(
             read(fields=[name])
     with pytest.raises(TupliError, match=rf"found '{name}' \(did you mean '{step}'\?\)"):
         dataset.delta_windows({name: [0]})
+
+
+def test_fields_of_items_have_gymnasium_s_names_too(dataset: Dataset) -> None:
+    states = dataset.windows(3)[0].states
+    assert np.array_equal(dataset.windows(3)[0].observations, states)
+    transition = dataset.transitions()[0]
+    assert np.array_equal(transition.next_observations, transition.next_states)
+    around = dataset.delta_windows({"observations": [0, 1, 2], "action": [0], "truncations": [0]})[0]
+    assert list(around.values) == ["observations", "action", "truncations"]
+    assert np.array_equal(around["observations"], states)
+    assert "states: float32 (3, 4)" in repr(dataset.windows(3)[0]) and len(repr(around)) < 500

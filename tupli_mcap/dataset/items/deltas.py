@@ -13,7 +13,7 @@ from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps
 from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
-from tupli_mcap.recording.columns.fields import Parts
+from tupli_mcap.recording.columns.fields import OTHER_NAMES, Parts
 
 __all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
 
@@ -23,12 +23,13 @@ KEYS = {
     "state": "states", "action": "actions", "reward": "rewards", "terminal": "terminals",
     "timeout": "timeouts", "next_state": "next_states", "time": "times",
 }  # fmt: skip
+_FIELDS = {**KEYS, **{field: field for field in KEYS.values()}, **OTHER_NAMES}
 _CLOSEST = 1e-4  # seconds by which a delta may miss a step
 _FARTHEST = 1 << 48  # steps: beyond every episode
 _LONGEST = 1e9  # seconds, 31 years: beyond every episode
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DeltaWindow(Parts):
     """Values around one step, or around B steps, by key ("state", "action", …). `window["state"]` is
     `window.values["state"]`.
@@ -56,8 +57,8 @@ class DeltaWindows(StepItems[DeltaWindow]):
     Values come from the step's own episode, and from between the cuts of a tuple filter.
 
     Args:
-        deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time"), the distances from
-            the step: `{"state": [-2, -1, 0], "action": range(16)}`.
+        deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time", or the name of the
+            column), the distances from the step: `{"state": [-2, -1, 0], "action": range(16)}`.
         unit: "steps"; "seconds", where each step takes `step_seconds`; or "clock", seconds by the recorded times: the
             step with the nearest time is taken.
         step_seconds: time that a step takes (s).
@@ -102,9 +103,9 @@ class DeltaWindows(StepItems[DeltaWindow]):
         masks: dict[str, Array] = {}
         for keys in together.values():
             rows, mask = self._rows(steps, self.deltas[keys[0]], firsts, lasts)
-            columns = self.source.read([KEYS[key] for key in keys], rows.reshape(-1))
+            columns = self.source.read(list(dict.fromkeys(_FIELDS[key] for key in keys)), rows.reshape(-1))
             for key in keys:
-                column = columns[KEYS[key]]
+                column = columns[_FIELDS[key]]
                 values[key] = column if single else shaped_rows(column, rows.shape)
                 masks[key] = mask[0] if single else mask
         episodes = self._episodes(steps)
@@ -147,7 +148,7 @@ class DeltaWindows(StepItems[DeltaWindow]):
 def _checked_keys(deltas: Mapping[str, Iterable[float]]) -> Mapping[str, Iterable[float]]:
     if not isinstance(deltas, Mapping) or not deltas:
         raise SamplingError(f"expected deltas such as {{'state': [-1, 0]}}, found {deltas!r:.80}")
-    unknown = [key for key in deltas if key not in KEYS]
+    unknown = [key for key in deltas if key not in _FIELDS]
     if unknown:
         found = f"{', '.join(map(repr, unknown))}{did_you_mean(unknown[0], KEYS)}"
         raise SamplingError(f"expected deltas of {', '.join(KEYS)}, found {found}")

@@ -12,15 +12,15 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.beside import BESIDE
 from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
-from tupli_mcap.recording.columns.fields import Parts
+from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
 __all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
 
 TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
 
 
-@dataclass(frozen=True)
-class Transition(Parts):
+@dataclass(frozen=True, repr=False)
+class Transition(GymnasiumNames, Parts):
     """One transition, or columns of B transitions; columns are nested as the space is, None if not requested.
 
     Attributes:

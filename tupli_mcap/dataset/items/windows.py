@@ -17,7 +17,7 @@ from tupli_mcap.dataset.items.steps import (
     checked_fields,
     map_arrays,
 )
-from tupli_mcap.recording.columns.fields import Parts
+from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
 __all__ = ["Pad", "Window", "Windows", "shaped_rows"]
 
@@ -26,8 +26,8 @@ PADS = ("none", "repeat", "zero")
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 
-@dataclass(frozen=True)
-class Window(Parts):
+@dataclass(frozen=True, repr=False)
+class Window(GymnasiumNames, Parts):
     """Columns of one window, shape (T, ...), or of B windows, shape (B, T, ...); None if not requested.
 
     They are nested as the space is; values that differ in size are in a list (of B lists).

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, did_you_mean
 
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 FIELDS = (*FIVE, "next_states", "times", "infos", "frames")
-_OTHER_NAMES = MappingProxyType(
+_MOST_KEYS = 20  # keys of infos that are shown
+OTHER_NAMES = MappingProxyType(
     {
         "observations": "states",
         "next_observations": "next_states",
@@ -30,7 +33,7 @@ def field_names(
     """
     try:
         given = [fields] if isinstance(fields, str) else list(fields)
-        names = [_OTHER_NAMES.get(name, name) for name in given]
+        names = [OTHER_NAMES.get(name, name) for name in given]
     except TypeError as err:
         raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
     for name in names:
@@ -41,23 +44,44 @@ def field_names(
     return list(dict.fromkeys(names))
 
 
+def described(column: Any) -> str:
+    """A column in short: dtype and shape, or the number of values; for dicts, their keys; a number itself."""
+    if isinstance(column, np.generic | int | float):
+        return str(column)
+    if isinstance(column, np.ndarray):
+        return f"{column.dtype} {column.shape}"
+    if isinstance(column, dict):
+        return "{" + ", ".join(f"{key!r}: {described(value)}" for key, value in column.items()) + "}"
+    if isinstance(column, tuple):
+        return f"({', '.join(map(described, column))})"
+    if all(isinstance(value, dict) for value in column):
+        keys = list(dict.fromkeys(key for value in column for key in value))
+        more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+        return f"{len(column)} dicts of {', '.join(map(str, keys[:_MOST_KEYS])) or 'nothing'}{more}"
+    return f"{len(column)} values"
+
+
 class Parts(SaysWhatIsMeant):
     """Columns and facts about them as attributes, None if not requested. `parts["states"]` is `parts.states`, as in a
     dict."""
 
     def __getitem__(self, name: str) -> Any:
         found = self.asdict()
-        known = _OTHER_NAMES.get(name, name)
+        known = OTHER_NAMES.get(name, name)
         if known not in found:
             raise KeyError(
                 f"expected one of {', '.join(found)}, found {name!r:.80}{did_you_mean(name, found)}"
             )
         return found[known]
 
+    def __repr__(self) -> str:
+        told = "; ".join(f"{name}: {described(value)}" for name, value in self.asdict().items())
+        return f"<{type(self).__name__} of {told}>"
+
     __iter__ = None  # it has no order
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and _OTHER_NAMES.get(name, name) in self.asdict()
+        return isinstance(name, str) and OTHER_NAMES.get(name, name) in self.asdict()
 
     def asdict(self) -> dict[str, Any]:
         """The requested columns and facts, by name."""

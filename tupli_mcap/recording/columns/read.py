@@ -14,7 +14,7 @@ from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames, Parts
+from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames, Parts, described
 from tupli_mcap.recording.columns.gather import (
     EPISODE,
     Files,
@@ -26,8 +26,6 @@ from tupli_mcap.recording.columns.gather import (
     step_rows,
 )
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
-
-_MOST_KEYS = 20  # keys of infos that are shown
 
 
 @dataclass(repr=False)
@@ -62,24 +60,9 @@ class Columns(GymnasiumNames, Parts):
 
     def __repr__(self) -> str:
         columns = [(field, getattr(self, field)) for field in FIELDS]
-        told = [f"{field}: {_described(column)}" for field, column in columns if column is not None]
+        told = [f"{field}: {described(column)}" for field, column in columns if column is not None]
         counts = f"{plural(len(self), 'step')} of {plural(len(self.episode_lengths), 'episode')}"
         return f"<Columns of {counts}: {'; '.join(told)}>"
-
-
-def _described(column: Any) -> str:
-    """A column in short: dtype and shape, or the number of values; for dicts, their keys."""
-    if isinstance(column, np.ndarray):
-        return f"{column.dtype} {column.shape}"
-    if isinstance(column, dict):
-        return "{" + ", ".join(f"{key!r}: {_described(value)}" for key, value in column.items()) + "}"
-    if isinstance(column, tuple):
-        return f"({', '.join(map(_described, column))})"
-    if all(isinstance(value, dict) for value in column):
-        keys = list(dict.fromkeys(key for value in column for key in value))
-        more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
-        return f"{len(column)} dicts of {', '.join(map(str, keys[:_MOST_KEYS])) or 'nothing'}{more}"
-    return f"{len(column)} values"
 
 
 class ColumnReader:
