@@ -130,6 +130,12 @@ def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_
     assert sum(header.n_tuples for header in admin.list_episodes()) == 30
 
 
+def test_a_path_that_is_not_there_is_not_pushed(admin: TupliAPIClient, tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["push", str(tmp_path / "nope"), "--url", admin.url])
+    assert result.exit_code == 1 and "does not exist; give a recording" in result.output
+    assert not (tmp_path / "nope").exists()
+
+
 def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     uri = fill(tmp_path / "lab")
     assert run("push", tmp_path / "lab", "--dry-run") == (

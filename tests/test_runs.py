@@ -525,6 +525,21 @@ class TestCommands:
             "ls", str(tmp_path), "--sort", "-settings", "--columns", "settings,tags,split"
         ).splitlines()
         assert [line.split()[0] for line in lines] == ["SETTINGS", "lr=1", "lr=0.1", "lr=0.01"]
+        lines = command(
+            "ls",
+            str(tmp_path),
+            "--sort",
+            "-run.metadata.lr",
+            "--columns",
+            "run,run.metadata.lr,run.metadata.x",
+        ).splitlines()
+        assert [line.split() for line in lines] == [
+            ["RUN", "run.metadata.lr"], ["run-0", "1.0"], ["run-1", "0.1"], ["run-2", "0.01"],
+        ]  # fmt: skip
+        found = json.loads(command("ls", str(tmp_path), "--columns", "run.metadata.lr,Run", "--json"))[
+            "result"
+        ]
+        assert found[0] == {"run.metadata.lr": 1, "run": "run-0"}
         shown = command("episodes", str(tmp_path / "0.mcap"), "--columns", "run,run.tags").splitlines()
         assert [line.split() for line in shown] == [["RUN", "RUN.TAGS"], ["run-0", "a,", "b"]]
         found = json.loads(
@@ -554,7 +569,7 @@ class TestCommands:
         dated = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "date"])
         assert "did you mean 'started'" in dated.output
         (tmp_path / "empty").mkdir()
-        assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recordings\n"
+        assert command("ls", str(tmp_path / "empty"), "--filter", "return > 3") == "no recording matches\n"
         wrong = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "retrn"])
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output

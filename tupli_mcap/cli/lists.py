@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -50,9 +51,9 @@ _Cells = Callable[["Sequence[ListedRecording]"], list[str]]
 
 
 class _Listed(NamedTuple):
-    """A column of `ls`: the field of `ListedRecording` that it is sorted by, and how its cells are made."""
+    """A column of `ls`: the value that it is sorted by, and how its cells are made."""
 
-    field: str
+    value: Callable[[ListedRecording], Any]
     column: Column
     cells: _Cells
 
@@ -74,28 +75,34 @@ def _success(item: ListedRecording) -> str:
 
 
 _COLUMNS = {
-    "recording": _Listed("path", Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))),
-    "run": _Listed("name", Column("RUN", shrink="end"), _each(lambda r: r.name)),
-    "environment": _Listed(
-        "environment", Column("ENVIRONMENT", shrink="end"), _each(lambda r: r.environment)
+    "recording": _Listed(
+        attrgetter("path"), Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))
     ),
-    "episodes": _Listed("episodes", Column("EPISODES", "right"), _each(lambda r: number(r.episodes))),
-    "steps": _Listed("steps", Column("STEPS", "right"), _each(lambda r: number(r.steps))),
-    "return": _Listed("return_mean", Column("RETURN", "right"), _means),
+    "run": _Listed(attrgetter("name"), Column("RUN", shrink="end"), _each(lambda r: r.name)),
+    "environment": _Listed(
+        attrgetter("environment"), Column("ENVIRONMENT", shrink="end"), _each(lambda r: r.environment)
+    ),
+    "episodes": _Listed(
+        attrgetter("episodes"), Column("EPISODES", "right"), _each(lambda r: number(r.episodes))
+    ),
+    "steps": _Listed(attrgetter("steps"), Column("STEPS", "right"), _each(lambda r: number(r.steps))),
+    "return": _Listed(attrgetter("return_mean"), Column("RETURN", "right"), _means),
     "success": _Listed(
-        "success",
+        attrgetter("success"),
         Column("SUCCESS", "right"),
         _each(_success),
     ),
-    "started": _Listed("started", Column("STARTED"), _each(lambda r: when(r.started))),
+    "started": _Listed(attrgetter("started"), Column("STARTED"), _each(lambda r: when(r.started))),
     "size": _Listed(
-        "size", Column("SIZE", "right"), _each(lambda r: "" if r.size is None else bytes_of(r.size))
+        attrgetter("size"),
+        Column("SIZE", "right"),
+        _each(lambda r: "" if r.size is None else bytes_of(r.size)),
     ),
-    "state": _Listed("state", Column("STATE"), _each(lambda r: r.state)),
-    "split": _Listed("split", Column("SPLIT"), _each(lambda r: r.split)),
-    "tags": _Listed("tags", Column("TAGS", shrink="end"), _each(lambda r: ", ".join(r.tags))),
+    "state": _Listed(attrgetter("state"), Column("STATE"), _each(lambda r: r.state)),
+    "split": _Listed(attrgetter("split"), Column("SPLIT"), _each(lambda r: r.split)),
+    "tags": _Listed(attrgetter("tags"), Column("TAGS", shrink="end"), _each(lambda r: ", ".join(r.tags))),
     "settings": _Listed(
-        "settings", Column("SETTINGS", shrink="end"), _each(lambda r: pairs_of(r.settings or {}))
+        attrgetter("settings"), Column("SETTINGS", shrink="end"), _each(lambda r: pairs_of(r.settings or {}))
     ),
 }
 
@@ -109,6 +116,7 @@ _MEANT = {
     "metadata": "settings",
 }
 """Other names for columns, for a hint."""
+_SETTING = "run.metadata."
 
 
 def ls(
@@ -128,9 +136,10 @@ def ls(
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
     state, split, tags, settings. The last three appear only with --columns; settings are the
-    metadata of the run. RETURN is the mean over episodes. STATE is `complete`; `recording`
-    while a process writes the file; `recovered` if its writer was killed or failed: all
-    finished steps are there as long as the journal is. A server does not tell SIZE and STATE.
+    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over
+    episodes. STATE is `complete`; `recording` while a process writes the file; `recovered` if
+    its writer was killed or failed: all finished steps are there as long as the journal is. A
+    server does not tell SIZE and STATE.
     Deleted episodes are not counted. With --filter, only the episodes that match are counted.
     """
     wanted = filter_of(filter_text)
@@ -138,12 +147,16 @@ def ls(
     if wanted is not None and not listed:
         _check_there(paths or ["."], wanted)
     if sort is not None:
-        listed = _sorted(listed, _column(sort.removeprefix("-")).field, descending=sort.startswith("-"))
+        listed = _sorted(listed, _column(sort.removeprefix("-")).value, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
     if as_json:
         print_json(_json_of_runs(listed, columns))
     elif good or not listed:
-        _print_runs(good, _chosen_columns(columns, good))
+        _print_runs(
+            good,
+            _chosen_columns(columns, good),
+            "no recordings" if wanted is None else "no recording matches",
+        )
     bad = [item for item in listed if item.error is not None]
     for item in bad:
         fail(item.error or "")
@@ -181,24 +194,49 @@ def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
         len(dataset_of(found).filter(wanted))
 
 
-def _sorted(items: Sequence[ListedRecording], field: str, *, descending: bool) -> list[ListedRecording]:
-    """Sorts recordings by a field; those without a value, and unreadable ones, come last."""
+def _sorted(
+    items: Sequence[ListedRecording], value: Callable[[ListedRecording], Any], *, descending: bool
+) -> list[ListedRecording]:
+    """Sorts recordings by a value, texts after numbers; those without one, and unreadable ones, come last."""
 
     def key(item: ListedRecording) -> Any:
-        value = getattr(item, field)
-        if item.error or value is None or (isinstance(value, float) and math.isnan(value)):
+        found = value(item)
+        if item.error or found is None or (isinstance(found, float) and math.isnan(found)):
             return None
-        return pairs_of(value) if isinstance(value, dict) else value
+        if isinstance(found, dict):
+            return 1, pairs_of(found)
+        if isinstance(found, int | float):
+            return 0, found
+        return 1, found if isinstance(found, str) else _text(found)
 
     known = [item for item in items if key(item) is not None]
     return [*sorted(known, key=key, reverse=descending), *(item for item in items if key(item) is None)]
 
 
 def _column(name: str) -> _Listed:
+    if name.startswith(_SETTING):
+        value = partial(_setting, name.removeprefix(_SETTING).split("."))
+        return _Listed(value, Column(name), _each(lambda r: _text(value(r))))
     if name.lower() not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
-        raise typer.BadParameter(f"there is no column {name!r}{similar}; columns are {', '.join(_COLUMNS)}")
+        raise typer.BadParameter(
+            f"there is no column {name!r}{similar}; columns are {', '.join(_COLUMNS)}, {_SETTING}KEY"
+        )
     return _COLUMNS[name.lower()]
+
+
+def _text(value: Any) -> str:
+    from tupli_mcap.jsonvalue import spelled
+
+    return "" if value is None else spelled(value)
+
+
+def _setting(path: Sequence[str], item: ListedRecording) -> Any:
+    """A value in the settings of a recording's run."""
+    found: Any = item.settings
+    for part in path:
+        found = found.get(part) if isinstance(found, dict) else None
+    return found
 
 
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
@@ -215,12 +253,12 @@ def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list
     from tupli_mcap.schema.times import iso_utc
 
     if columns is not None:
-        names = [name.strip().lower() for name in columns.split(",")]
-        fields = [_column(name).field for name in names]
-        return [dict(zip(names, (getattr(item, field) for field in fields), strict=True)) for item in items]
+        names = [name.strip() for name in columns.split(",")]
+        values = {name if name.startswith(_SETTING) else name.lower(): _column(name).value for name in names}
+        return [{name: value(item) for name, value in values.items()} for item in items]
     return [
         {
-            **{name: getattr(item, listed.field) for name, listed in _COLUMNS.items()},
+            **{name: listed.value(item) for name, listed in _COLUMNS.items()},
             "return_nan": item.return_nan,
             "created_at": iso_utc(item.created_ns) if item.created_ns else None,
             "benchmark_id": item.benchmark_id,
@@ -230,7 +268,7 @@ def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list
     ]
 
 
-def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> None:
+def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed], empty: str) -> None:
     from tupli_mcap.recording.description import nan_text
 
     columns, cells = [one.column for one in chosen], [one.cells(items) for one in chosen]
@@ -238,7 +276,7 @@ def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed]) -> 
     if any(notes) and _COLUMNS["return"] in chosen:
         columns.append(Column("NOTE ON RETURN", shrink="end"))
         cells.append(notes)
-    print_table(columns, list(zip(*cells, strict=True)), empty="no recordings")
+    print_table(columns, list(zip(*cells, strict=True)), empty=empty)
 
 
 def episodes(

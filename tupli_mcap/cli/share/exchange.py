@@ -24,6 +24,7 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import bytes_of, counted, print_result
 from tupli_mcap.cli.terminal import say
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote import copied, is_url, shown
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ def push(
     is_one = source is not None and (is_url(source) or Path(source).is_file())
     if (source is None or is_one) and (filter_text is not None or benchmark is not None):
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
+    if not (source is None or is_one or Path(source).is_dir()):
+        raise RecordingError(f"{source} does not exist; give a recording (.mcap) or a directory of them")
     verb = "would send" if dry_run else "sent"
     with server_at(url) as client:
         to = client.url
