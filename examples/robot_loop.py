@@ -5,6 +5,7 @@ python examples/robot_loop.py [DIRECTORY]
 
 from __future__ import annotations
 
+import string
 import sys
 from pathlib import Path
 
@@ -18,7 +19,7 @@ OBSERVATIONS = spaces.Dict(
         "front": spaces.Box(0, 255, (48, 64, 3), np.uint8),
         "wrist": spaces.Box(0, 255, (32, 32, 3), np.uint8),
         "joints": spaces.Box(-3.2, 3.2, (6,), np.float32),
-        "instruction": spaces.Text(80),
+        "instruction": spaces.Text(80, charset=string.ascii_lowercase + " "),
     }
 )
 ACTIONS = spaces.Box(-1, 1, (7,), np.float32)  # six joint velocities, and the gripper

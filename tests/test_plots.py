@@ -1114,3 +1114,10 @@ def test_info_of_a_damaged_chunk_and_of_none(cartpole: Path, tmp_path: Path) -> 
     assert "sketch" not in run("info", cartpole, "--json")[1]
     write_recording(tmp_path / "empty.mcap", [], observation_space=UNIT, action_space=spaces.Discrete(2))
     assert "FIRST TO LAST" not in run("info", tmp_path / "empty.mcap")[1]
+
+
+def test_recordings_without_a_matching_episode_are_left_out(tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 2)):
+        record(tmp_path / f"{name}.mcap", gym.make("CartPole-v1"), 60, seed=seed, name=name)
+    made = report([tmp_path / "a.mcap", tmp_path / "b.mcap"], episode_filter=F("run.name") == "b")
+    assert [group.name for group in made.groups] == ["b"] and len(made.measured) == 1

@@ -401,7 +401,7 @@ class Dataset(RandomAccess):
         """One row per step or per episode, one column per dimension, with its label if the recording has one.
 
         Infos and metadata have a column for each key: `info.x`, `metadata.score`. An image, or an array of more than
-        500 numbers, is one column, with an array in each cell.
+        500 numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
 
         Raises:
             MissingExtraError: pandas is not installed.

@@ -76,8 +76,11 @@ def report(
                 raise subject.error
             with subject.open() as recording:
                 measured.append(measure(recording, subject.choose(recording), READ_BYTES // len(subjects)))
-        if episode_filter is not None and not any(len(one.rows) for one in measured):
-            raise RecordingError(f"no episode matches {episode_filter}; use another filter")
+        if episode_filter is not None:
+            kept = [i for i, one in enumerate(measured) if len(one.rows)]
+            if not kept:
+                raise RecordingError(f"no episode matches {episode_filter}; use another filter")
+            subjects, measured = [subjects[i] for i in kept], [measured[i] for i in kept]
         _shorten_names(measured)
         traces = _traces(subjects, measured, str(episode))
         return Report(measured, traces, _make_comparable(measured), x)

@@ -100,7 +100,11 @@ def _episode_columns(dataset: Dataset) -> dict[str, Any]:
 
 def _times(texts: Sequence[str]) -> Any:
     """Times (ISO 8601 in UTC) for pandas, NaT for an empty text."""
-    return np.array([text.removesuffix("+00:00") or "NaT" for text in texts], "datetime64[ns]")
+    return _in_utc(np.array([text.removesuffix("+00:00") or "NaT" for text in texts], "datetime64[ns]"))
+
+
+def _in_utc(times: Any) -> Any:
+    return import_pandas().DatetimeIndex(times).tz_localize("UTC")
 
 
 def _whole_numbers(values: Sequence[int | None]) -> Any:
@@ -130,7 +134,7 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
     columns: dict[str, Any] = {
         "episode": of_episode,
         "step": steps_within(lengths),
-        "time": found.times.astype("datetime64[ns]"),
+        "time": _in_utc(found.times.astype("datetime64[ns]")),
     }
     recording = dataset.example
     if recording is not None:
