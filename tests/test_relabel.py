@@ -246,6 +246,15 @@ def test_values_that_would_change_are_refused(tmp_path: Path) -> None:
     assert np.array_equal(tupli_mcap.open(same_values)[0].all_states, dataset[0].all_states)
 
 
+def test_a_name_or_a_field_that_is_missing_is_named(tmp_path: Path) -> None:
+    dataset = tupli_mcap.open(record(tmp_path / "r.mcap", 1))
+    with pytest.raises(RecordingError, match=r"found a dict of actions; pass fields=\['actions'\]"):
+        dataset.map(lambda episode: {"actions": episode.actions}, tmp_path / "new.mcap")
+    for verb in (dataset.save, lambda path: dataset.map(lambda episode: episode.rewards, path)):
+        with pytest.raises(DatasetError, match=r"expected a name that ends in \.mcap, found .*good; add it"):
+            verb(tmp_path / "good")
+
+
 def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:
     paths = [record(tmp_path / f"{i}.mcap") for i in range(2)]
     merge_recordings(paths, tmp_path / "all.mcap")

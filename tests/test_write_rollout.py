@@ -14,7 +14,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 from mcap.reader import make_reader
 
 import tupli_mcap
-from tupli_mcap import EpisodeWriter, Recording, StepError, verify_recording, write_rollout
+from tupli_mcap import EpisodeWriter, Recording, RecordingError, StepError, verify_recording, write_rollout
 from tupli_mcap.arrays import arrays_at
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -263,3 +263,14 @@ def test_an_end_where_a_reset_should_be_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StepError, match="expected states or observations, which mean the same, found both"):
         write_rollout(tmp_path / "r.mcap", STATES, ACTIONS, REWARDS, observations=STATES)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_has_known_parts(tmp_path: Path) -> None:
+    arrays = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
+    with pytest.raises(RecordingError, match=r"found 'nmae' \(did you mean 'name'\?\)"):
+        write_rollout(tmp_path / "r.mcap", *arrays, run={"nmae": "x"})
+    with pytest.raises(StepError, match="infos: expected arrays by name, found"):
+        write_rollout(tmp_path / "r.mcap", *arrays, infos=[{"x": 1}, {"x": 2}])
+    with pytest.raises(RecordingError, match=r"\['metadata'\]\['code'\] is a .*module, .*; convert it"):
+        write_rollout(tmp_path / "r.mcap", *arrays, run={"metadata": {"code": np}})
+    assert not (tmp_path / "r.mcap").exists()

@@ -180,9 +180,7 @@ def _text(encoder: _Encoder, value: Any) -> str:
     except _UnstorableError as err:
         where = "value" + "".join(reversed(err.path))
         kind = f"{err.found.__module__}.{err.found.__qualname__}"
-        raise TypeError(
-            f"{where} is a {kind}, which has no exact JSON form; convert it or pass fallback="
-        ) from None
+        raise TypeError(f"{where} is a {kind}, which has no exact JSON form; convert it") from None
     return json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
 
 

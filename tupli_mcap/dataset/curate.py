@@ -184,9 +184,11 @@ def _excerpts(dataset: Dataset) -> list[Excerpt]:
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
-    """The path of a new file; raises DatasetError if it is a directory."""
+    """The path of a new file; raises DatasetError if it is a directory, or a name that no directory is searched for."""
     if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
         raise DatasetError(f"{os.fspath(place)} is a directory; give the path of a file (.mcap)")
+    if Path(place).suffix != ".mcap":
+        raise DatasetError(f"expected a name that ends in .mcap, found {os.fspath(place)}; add it")
     return Path(place)
 
 

@@ -11,13 +11,14 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap.arrays import Array, arrays_at, map_arrays
-from tupli_mcap.errors import StepError
+from tupli_mcap.errors import RecordingError, StepError, did_you_mean
 from tupli_mcap.recording.write.options import Mode
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
+_RUN: Final = ("name", "metadata", "tags", "split", "capture")
 _CHUNK: Final = 256 * 1024
 _TOGETHER: Final = 1 << 13  # steps that are written at once; a killed process loses their final states
 # Up to this many streams, chunks are as large as those of one: they all have room in the journal.
@@ -118,10 +119,19 @@ def write_rollout(
     with EpisodeWriter(
         path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
-        benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **(run or {}),
+        benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **_checked_run(run or {}),
     ) as writer:  # fmt: skip
         for part in rollout.parts:
             _write(writer, part)
+
+
+def _checked_run(run: Mapping[str, Any]) -> Mapping[str, Any]:
+    for key in run:
+        if key not in _RUN:
+            raise RecordingError(
+                f"run: expected {', '.join(_RUN)}, found {key!r:.80}{did_you_mean(key, _RUN)}"
+            )
+    return run
 
 
 class _Rollout(NamedTuple):

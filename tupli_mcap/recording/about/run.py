@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
 from urllib.parse import urlsplit
@@ -207,7 +207,7 @@ def _given(run: Run) -> str:
 
 
 def _document(run: Run) -> dict[str, Any]:
-    return {key: value for key, value in asdict(run).items() if value and key != "ended"}
+    return {key: value for key, value in vars(run).items() if value and key != "ended"}
 
 
 def _plain(value: Any) -> Any:

@@ -18,7 +18,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics
-from tupli_mcap.recording.columns.fields import field_names
+from tupli_mcap.recording.columns.fields import OTHER_NAMES, field_names
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import NewValues
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
@@ -78,6 +78,11 @@ def _new_values(
     for place, row in zip(places.tolist(), excerpt.rows, strict=True):
         episode = source.episodes[place]
         made = function(episode)
+        if isinstance(made, Mapping) and fields == ["rewards"] and set(made) <= {*_FIELDS, *OTHER_NAMES}:
+            raise RecordingError(
+                f"expected rewards of episode {episode.number}, found a dict of {', '.join(made)}; "
+                f"pass fields={list(made)}"
+            )
         by_field: Any = {fields[0]: made} if len(fields) == 1 else made
         if isinstance(by_field, Mapping):
             by_field = dict(zip(field_names(list(by_field), _FIELDS), by_field.values(), strict=True))
