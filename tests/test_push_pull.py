@@ -22,6 +22,7 @@ from persons import Person
 from serving import PASSWORD, serving
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord
@@ -103,6 +104,26 @@ def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient
                 assert sum(each.episodes for each in copy_episodes(source, target).values()) == new
     assert [header.episode for header in admin.list_episodes()] == [0, 1, 2]
     assert sorted(header.episode for header in pulled.list_episodes()) == [0, 1, 2]
+
+
+def test_annotations_of_what_is_there_are_sent_with_the_file(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "lab" / "run.mcap"
+    path.parent.mkdir()
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=0)
+        env.step(0)
+    with FileStorage(path.parent) as lab:
+        copy_episodes(lab, admin)
+        tupli_mcap.open(path)[0].annotate(good=True)
+        with pytest.warns(
+            UserWarning,
+            match="there already with other metadata, and left so: 1 episode; `tupli-mcap push FILE`",
+        ):
+            copy_episodes(lab, admin)
+    assert admin.list_episodes()[0].metadata == {}
+    result = CliRunner().invoke(app, ["push", str(path), "--url", admin.url])
+    assert result.exit_code == 0, result.output
+    assert admin.list_episodes()[0].metadata == {"good": True}
 
 
 def test_pulling_a_filter_and_an_episode(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap import trust
-from tupli_mcap.errors import FormatError, NotFoundError
+from tupli_mcap.errors import FormatError, NotFoundError, plural
+from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -68,7 +69,8 @@ def copy_episodes(
     to be copied whole for that.
 
     Returns:
-        By benchmark, how much was copied. A warning names benchmarks that the source lacks, or an artifact of them;
+        By benchmark, how much was copied. A warning tells how many episodes the target has with other metadata (from an
+        annotation, for example), and names benchmarks that the source lacks, or an artifact of them;
         their episodes are not copied.
 
     Raises:
@@ -106,8 +108,9 @@ def _copy(
             # somebody has published the episodes without their benchmark, which must not keep the others away
             warnings.warn(f"not copied: {len(headers)} episodes: {err}", stacklevel=4)
             continue
-        held = {header.id for header in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
+        held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         new = [header for header in headers if header.id not in held]
+        _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = [
             (name, list(of)) for name, of in itertools.groupby(new, key=lambda header: header.recording)
         ]
@@ -119,6 +122,16 @@ def _copy(
             _vouch(target, uri)
         copied[uri] = Copied(artifacts, len(new))
     return copied
+
+
+def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, EpisodeHeader]]) -> None:
+    """Warns of episodes that the target has with other metadata: it does not get those of the source."""
+    differ = sum(dumps_plain(here.metadata) != dumps_plain(there.metadata) for here, there in both)
+    if differ:
+        hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
+        warnings.warn(
+            f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}", stacklevel=5
+        )
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
