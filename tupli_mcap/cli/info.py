@@ -219,6 +219,11 @@ def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
 
 def _made_of_text(made_of: dict[str, Any]) -> str:
     facts = [f"{made_of.get(key)!s:.200}" for key in ("query", "function") if made_of.get(key)]
+    steps = made_of.get("steps")
+    if isinstance(steps, dict):  # of a trim
+        facts += [
+            f"to steps {kept!s:.40} of episode {number!s:.20}" for number, kept in list(steps.items())[:3]
+        ]
     names = [str(one.get("name", "")) if isinstance(one, dict) else "" for one in made_of["sources"]]
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     return f"{listed} by {made_of.get('how', '')!s:.40}{''.join(f' {fact}' for fact in facts)}"

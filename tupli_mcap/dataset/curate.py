@@ -25,7 +25,7 @@ from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeabl
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
-from tupli_mcap.schema import BaseFilter, parse_filter
+from tupli_mcap.schema import BaseFilter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
@@ -110,7 +110,7 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    query = str(parse_filter(filter) if isinstance(filter, str) else filter)
+    query = filter if isinstance(filter, str) else str(filter)
     return report._replace(size=save(kept, target, overwrite=overwrite, query=query).stat().st_size)
 
 

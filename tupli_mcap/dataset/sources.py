@@ -187,6 +187,10 @@ class FilesSource:
         from tupli_mcap.storage import FileStorage  # and with it a database, which reading does not need
 
         path = Path(recording).absolute()
+        if path.suffix != ".mcap":
+            raise RecordingError(
+                f"expected a recording whose name ends in .mcap, found {recording}; rename it"
+            )
         root = storage_of(path)
         if root not in self._folders:
             self._folders[root] = FileStorage(root)
