@@ -421,7 +421,7 @@ def test_what_is_called_out_of_turn_is_refused(tmp_path: Path) -> None:
         EpisodeWriter(tmp_path / "s.mcap", BOX, ACTIONS, num_envs=0)
     with pytest.raises(StepError, match="pass num_envs for several streams"):
         EpisodeWriter(tmp_path / "s.mcap", BOX, ACTIONS).begin(env=1)
-    with pytest.raises(SpaceError, match="records 2 sub-environment"):
+    with pytest.raises(SpaceError, match="records a vector environment of 2, found a single environment"):
         EpisodeWriter(tmp_path / "r.mcap", BOX, ACTIONS, mode="a")
 
 

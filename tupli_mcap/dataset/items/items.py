@@ -71,7 +71,7 @@ class Items(ABC, Generic[T]):
         told = " ".join(map(repr, (type(self).__name__, *parameters)))
         self.identity = hashlib.sha256(f"{steps.identity} {told}".encode()).hexdigest()
         if not len(steps):
-            raise SamplingError("expected at least one step, found none; use another filter")
+            raise SamplingError("expected at least one step, found an empty dataset; use another filter")
 
     @abstractmethod
     def __len__(self) -> int: ...
