@@ -807,6 +807,8 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     assert [episode.run.metadata["lr"] for episode in dataset] == [1.5] * 7 + [3] + [2] * 2
     assert len(dataset.filter("run.name = 'two'")) == 2
     assert verify_recording(path).ok
+    listed = json.loads(CliRunner().invoke(app, ["ls", str(path), "--json"]).output)["result"][0]
+    assert listed["run"].startswith("one, killed, two") and listed["settings"] == {}  # nothing that all share
     with pytest.raises(RecordingError, match="has 4 runs; only a recording of one run"):
         edit_run(path, name="x")
     with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +80,8 @@ class ListedRecording(NamedTuple):
             NaN, and is NaN if there is no other.
         size: of the file (bytes); None if unknown.
         state: see `tupli_mcap.recording.description.state_of`.
-        name, environment, started (ISO 8601 in UTC), split, tags, settings (its metadata): of its run.
+        name, environment, started (ISO 8601 in UTC), split, tags: of its run.
+        settings: the metadata of its run; of several, what they have in common.
         success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
             none do.
     """
@@ -241,7 +242,7 @@ def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
             success_known=len(said),
             split=str(run.get("split") or ""),
             tags=tuple(map(str, run.get("tags") or ())),
-            settings=run.get("metadata"),
+            settings=_shared(header.run.get("metadata") or {} for header in same),
         )
 
 
@@ -261,6 +262,14 @@ def compactable(root: Path) -> list[Compactable]:
                 if deleted:
                     compactables.append(Compactable(item.relative, len(deleted), item.stamp.size))
     return compactables
+
+
+def _shared(settings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """What settings have in common."""
+    first, *others = settings
+    return {
+        key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)
+    }
 
 
 def _listed(
@@ -296,7 +305,7 @@ def _listed(
                 success_known=len(said),
                 split=run.split,
                 tags=run.tags,
-                settings=run.metadata,
+                settings=_shared(each.metadata for each in recording.readable_runs),
             )
     except (TupliError, OSError) as err:
         return ListedRecording(name, error=str(err))
