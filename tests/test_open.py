@@ -749,4 +749,5 @@ def test_fields_of_items_have_gymnasium_s_names_too(dataset: Dataset) -> None:
     around = dataset.delta_windows({"observations": [0, 1, 2], "action": [0], "truncations": [0]})[0]
     assert list(around.values) == ["observations", "action", "truncations"]
     assert np.array_equal(around["observations"], states)
+    assert "rewards: 1.0; " in repr(transition) and "terminals: False" in repr(transition)
     assert "states: float32 (3, 4)" in repr(dataset.windows(3)[0]) and len(repr(around)) < 500

@@ -813,3 +813,10 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
         edit_run(path, name="x")
     with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):
         RecordVectorEpisodes(gym.make_vec("CartPole-v1", 1), path, mode="a").reset()
+
+
+def test_a_damaged_run_does_not_keep_anybody_from_appending(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 1)
+    add_attachments(path, {"run.json": ("application/json", b"no JSON")})
+    record(path, 1, mode="a", name="two")
+    assert len(Recording(path)) == 2

@@ -45,9 +45,9 @@ def field_names(
 
 
 def described(column: Any) -> str:
-    """A column in short: dtype and shape, or the number of values; for dicts, their keys; a number itself."""
-    if isinstance(column, np.generic | int | float):
-        return str(column)
+    """A column in short: dtype and shape, or the number of values; for dicts, their keys; a single value itself."""
+    if isinstance(column, np.generic | str) or not hasattr(column, "__len__"):
+        return f"{column!s:.40}"
     if isinstance(column, np.ndarray):
         return f"{column.dtype} {column.shape}"
     if isinstance(column, dict):

@@ -159,12 +159,16 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
 
 
 def _more_runs(writer: RecordingWriter, contents: Contents, source: Source) -> dict[str, tuple[str, bytes]]:
-    """`run.json` with the run that begins now; empty if it goes on with the last one, or the file has no run."""
+    """`run.json` with the run that begins now; empty if it goes on with the last one, or the file has none, or a
+    damaged one."""
     given, recorded = (writer.options.attachments or {}).get(RUN_NAME), contents.attachments.get(RUN_NAME)
     if given is None or recorded is None:
         return {}
-    (run,) = RecordedRuns.from_json(given[1], RUN_NAME).runs
-    earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{writer.path}: {RUN_NAME}")
+    try:
+        earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{writer.path}: {RUN_NAME}")
+    except FormatError:
+        return {}
+    run = RecordedRuns.from_json(given[1], RUN_NAME).runs[-1]
     runs = earlier.followed_by(run, writer.index.count)
     return {} if runs is earlier else {RUN_NAME: (RUN_MEDIA_TYPE, runs.to_json())}
 
