@@ -237,7 +237,7 @@ def test_values_that_would_change_are_refused(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap", 1, Sampler(space, spaces.Discrete(2)))
     dataset, wrong = tupli_mcap.open(source), tmp_path / "wrong.mcap"
     n = len(dataset[0].all_states)
-    masked = np.ma.masked_array(np.ones((n, 1), np.uint8), mask=np.ones((n, 1)))  # type: ignore[no-untyped-call]
+    masked = np.ma.MaskedArray(np.ones((n, 1), np.uint8), mask=np.ones((n, 1)))
     for made in (np.full((n, 1), -1, np.int8), np.full((n, 1), -0.0), np.full((n, 1), 256), masked):
         with pytest.raises(RecordingError, match=r"that uint8 holds exactly, found .* cast them"):
             dataset.map(lambda episode, made=made: made, wrong, fields=["states"])
