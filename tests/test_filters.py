@@ -607,6 +607,10 @@ class TestTimes:
             (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
             (F("published_in") == 3, "'published_in' is a text: expected such a value, found 3"),
             (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),
+            (F("run") == "ppo", "'run' holds several values .* name one, such as run.name"),
+            (F("lr") > 1, r"unknown key 'lr' \(your own: metadata.lr, run.metadata.lr\); the keys are"),
+            (F("name") == "ppo", r"unknown key 'name' \(did you mean 'run.name'\?\); the keys are"),
+            (F("tag") == "ppo", r"unknown key 'tag' \(did you mean 'run.tags'\?\); the keys are"),
         ],
         ids=repr,
     )

@@ -33,7 +33,14 @@ __all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "p
 TIME_KEY: Final = "created_at"
 TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
 _MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
-_LIKE: Final = {"length": "steps", "reward": "return", "rewards": "return", "date": "ended", "time": "ended"}
+_LIKE: Final = {
+    "length": "steps",
+    "reward": "return",
+    "rewards": "return",
+    "date": "ended",
+    "time": "ended",
+    "tag": "run.tags",
+}
 _INSIDE: Final = ("run.name", "run.tags", "run.split", "run.environment", "run.started", "metadata.success")
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
@@ -76,11 +83,11 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         name = _MEANT.get(name, name)
     if name not in (fields.model_fields if isinstance(fields, type) else fields):
         known = filter_keys(fields)
-        inside = [there for there in _INSIDE if there.endswith(f".{name}") and there.split(".")[0] in known]
-        similar = did_you_mean(
-            inside[0] if inside else _LIKE.get(name, name), [*known, *_MEANT.values(), *inside]
-        )
-        raise FilterError(f"unknown key {key!r}{similar}; the keys are {', '.join(known)}")
+        nested = [there for there in _INSIDE if there.split(".")[0] in known]
+        like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
+        similar = did_you_mean(like, [*known, *_MEANT.values(), *(there for there in nested if there == like)])
+        own = "" if similar or "run" not in known else f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
+        raise FilterError(f"unknown key {key!r}{similar}{own}; the keys are {', '.join(known)}")
     return (name, *inside)
 
 
@@ -140,8 +147,9 @@ def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -
 def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
     key = repr(filter.key)
     if not kinds:
+        example = "run.name" if name == "run" else "metadata.score"
         raise FilterError(
-            f"{key} holds several values and is equal to none; name one, such as metadata.score"
+            f"{key} holds several values and is equal to none; name one, such as {example}"
         )
     ordered = filter.type in ORDERING
     for value in filter.value if filter.type is FilterType.IN else (filter.value,):

@@ -101,8 +101,8 @@ def write_rollout(
             next_states.
 
     Raises:
-        StepError: arrays do not fit together, or values cannot be stored exactly; of lists, the episodes before that
-            one are in the file.
+        StepError: arrays do not fit together, or values cannot be stored exactly; the episodes before the first that
+            cannot be stored are in the file then, which `mode="w"` replaces.
         SpaceError: a space cannot be recorded.
         RecordingError: the file exists, is being written, or cannot be written.
     """
