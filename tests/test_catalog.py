@@ -559,7 +559,7 @@ class TestDeclaredKeys:
     @pytest.mark.parametrize(
         ("key", "message"),
         [
-            ("score", "unknown key 'score'; the keys are"),
+            ("score", "unknown key 'score' .your own: metadata.score"),
             ("metadata", "cannot be declared: name one in it, such as metadata.score"),
             ("metadata..x", "needs a name at character 9"),
         ],

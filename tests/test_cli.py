@@ -882,7 +882,10 @@ class TestStorages:
         [
             ("metadata.score >", "filter 'metadata.score >' needs a value .* at character 16, found the end"),
             ("and", "filter 'and' needs .* at character 0.*"),
-            ("score > 1", "unknown key 'score'; the keys are benchmark_id, .*"),
+            (
+                "score > 1",
+                r"unknown key 'score' .your own: metadata.score, run.metadata.score.; the keys are benchmark_id, .*",
+            ),
             ("env > [1]", "filter 'env > \\[1\\]' needs a value .*"),
             ("env > true", ".*true.*"),
         ],

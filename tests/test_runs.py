@@ -328,6 +328,10 @@ class TestAnnotations:
         path = record(tmp_path / "r.mcap")
         assert f"good={spelled(value)}\n" in command("tag", str(path), f"good={word}", "--episode", "0")
         assert Recording(path).episodes[0].metadata["good"] is value or value not in (True, False)
+        assert re.search(
+            r"^annotated +once by .+, 20.+: 1 episode$", command("info", str(path)), re.MULTILINE
+        )
+        assert "annotated" not in command("info", str(path), "--episodes", "1")
 
     def test_count_more_than_what_was_recorded(self, tmp_path: Path) -> None:
         class Callback(tupli_mcap.EpisodeMetadataCallback):

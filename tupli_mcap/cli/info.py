@@ -22,6 +22,7 @@ from tupli_mcap.cli.output import (
     print_wrapped,
     short_ids,
     time_of,
+    when,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError
@@ -198,6 +199,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([] if d.success is None else [("success", f"{d.success:.0%} of the episodes that say it")]),
         *([("seeds", f"{number(d.seeds)} different")] if d.seeds else []),
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
+        *([("annotated", _annotations_text(d.annotations))] if d.annotations else []),
         *([("infos", _some(d.info_keys))] if d.info_keys else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
@@ -206,6 +208,14 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
 def _times_text(start_ns: int, end_ns: int) -> str:
     start, end = time_of(start_ns), time_of(end_ns)
     return start if start == end else f"{start} to {end}"
+
+
+def _annotations_text(annotations: Sequence[dict[str, Any]]) -> str:
+    last = annotations[-1]
+    times = "once" if len(annotations) == 1 else f"{len(annotations):,} times, last"
+    return (
+        f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {counted(last['episodes'], 'episode')}"
+    )
 
 
 def _runs_text(runs: Sequence[dict[str, Any]]) -> str:

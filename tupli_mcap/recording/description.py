@@ -65,6 +65,7 @@ class RecordingDescription:
         run: the parts of its run, or of the first one, that are known.
         runs: `name` and number of `episodes` of each run.
         made_of: the recordings it was made of; None if it was recorded.
+        annotations: who said something (`by`) about how many `episodes`, and when (`at`, ISO 8601 in UTC).
         metadata_keys: keys of the episodes' metadata.
         info_keys: keys of the infos of its steps; of a long recording, of a sample.
         seeds: number of different seeds of its episodes.
@@ -88,6 +89,7 @@ class RecordingDescription:
     run: dict[str, Any]
     runs: list[dict[str, Any]]
     made_of: dict[str, Any] | None
+    annotations: list[dict[str, Any]]
     metadata_keys: list[str]
     info_keys: list[str]
     seeds: int
@@ -141,6 +143,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         run={key: value for key, value in vars(run).items() if value},
         runs=_runs(recording, positions),
         made_of=recording.made_of,
+        annotations=_annotations(recording, rows),
         metadata_keys=_metadata_keys(recording, positions),
         info_keys=_info_keys(recording, positions),
         seeds=len({seeds[i] for i in positions.tolist()} - {None}),
@@ -182,6 +185,12 @@ def _runs(recording: Recording, positions: Array) -> list[dict[str, Any]]:
     )
     counts = np.bincount(places, minlength=len(runs)).tolist()
     return [{"name": run.name, "episodes": count} for run, count in zip(runs, counts, strict=True)]
+
+
+def _annotations(recording: Recording, rows: Array) -> list[dict[str, Any]]:
+    numbers = set(rows["episode"].tolist())
+    counts = [(one, len(numbers.intersection(one.episodes))) for one in recording.annotations.said]
+    return [{"by": one.by, "at": one.at, "episodes": count} for one, count in counts if count]
 
 
 def _metadata_keys(recording: Recording, positions: Array) -> list[str]:

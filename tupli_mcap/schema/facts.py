@@ -85,9 +85,10 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         known = filter_keys(fields)
         nested = [there for there in _INSIDE if there.split(".")[0] in known]
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
-        similar = did_you_mean(like, [*known, *_MEANT.values(), *(there for there in nested if there == like)])
-        own = "" if similar or "run" not in known else f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
-        raise FilterError(f"unknown key {key!r}{similar}{own}; the keys are {', '.join(known)}")
+        hint = did_you_mean(like, [*known, *_MEANT.values(), *nested])
+        if not hint and "run" in known:
+            hint = f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
+        raise FilterError(f"unknown key {key!r}{hint}; the keys are {', '.join(known)}")
     return (name, *inside)
 
 
@@ -148,9 +149,7 @@ def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
     key = repr(filter.key)
     if not kinds:
         example = "run.name" if name == "run" else "metadata.score"
-        raise FilterError(
-            f"{key} holds several values and is equal to none; name one, such as {example}"
-        )
+        raise FilterError(f"{key} holds several values and is equal to none; name one, such as {example}")
     ordered = filter.type in ORDERING
     for value in filter.value if filter.type is FilterType.IN else (filter.value,):
         scalar = classify(value)
