@@ -171,6 +171,18 @@ def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     assert len(admin.list_episodes(F("published_in") == "global")) == 12
 
 
+def test_publish_only_the_episodes_that_match(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = fill(tmp_path / "lab")
+    run("push", tmp_path / "lab")
+    seen = F("published_in") == "global"
+    few = admin.count_episodes(F("episode") < 2)
+    assert 0 < few < 12
+    assert f" with {few} episodes in global" in run("publish", uri, "--filter", "episode < 2")
+    assert admin.count_episodes(seen) == few and len(admin.list_benchmarks(seen)) == 1
+    assert f"hid {few} episodes of {uri[:8]} from global" in run("unpublish", uri, "--filter", "episode < 5")
+    assert admin.count_episodes(seen) == 0 and len(admin.list_benchmarks(seen)) == 1
+
+
 @pytest.mark.parametrize("kind", ["pickle", "spec"])
 def test_nothing_from_a_server_runs(admin: TupliAPIClient, tmp_path: Path, kind: str) -> None:
     """Listing, reading and fetching run nothing, and rebuilding is refused, from the server and from the directory."""

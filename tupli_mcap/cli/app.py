@@ -393,7 +393,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "password": ("password", "password ann"),
     "push": ("push lab/", "push run.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'", "push"),
     "pull": ("pull 3f2a --storage lab", "pull --filter 'return > 100' --storage lab --dry-run"),
-    "publish": ("publish 3f2a", "publish 3f2a --group robots"),
+    "publish": ("publish 3f2a", "publish 3f2a --group robots --filter 'return > 100'"),
     "unpublish": ("unpublish 3f2a --group robots",),
     "list-users": ("list-users",),
     "delete-user": ("delete-user ann",),

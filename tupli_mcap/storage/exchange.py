@@ -251,10 +251,12 @@ def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiti
     return waiting
 
 
-def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
-    """Makes a benchmark, its artifacts, and the caller's episodes of it visible to a group; returns the number of
-    these episodes."""
-    own = _own_episodes(client, uri)
+def publish_benchmark(
+    client: TupliAPIClient, uri: str, group: str, chosen: BaseFilter | None = None, *, dry_run: bool = False
+) -> int:
+    """Makes a benchmark, its artifacts, and the caller's episodes of it (those that `chosen` is true for) visible to a
+    group; returns the number of these episodes."""
+    own = _own_episodes(client, uri, chosen)
     if dry_run:
         client.load_benchmark(uri)
         return client.count_episodes(own)
@@ -265,18 +267,22 @@ def publish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: 
     return client.publish_episodes(own, group)
 
 
-def unpublish_benchmark(client: TupliAPIClient, uri: str, group: str, *, dry_run: bool = False) -> int:
+def unpublish_benchmark(
+    client: TupliAPIClient, uri: str, group: str, chosen: BaseFilter | None = None, *, dry_run: bool = False
+) -> int:
     """Hides a benchmark and the caller's episodes of it from a group; returns the number of these episodes. Its
-    artifacts stay visible: other benchmarks may need them."""
-    own = _own_episodes(client, uri)
+    artifacts stay visible: other benchmarks may need them. With `chosen`, hides only episodes that it is true for."""
+    seen = _own_episodes(client, uri, chosen) & FilterEQ(key="published_in", value=group)
     if dry_run:
         client.load_benchmark(uri)
-        return client.count_episodes(own & FilterEQ(key="published_in", value=group))
-    episodes = client.unpublish_episodes(own, group)
-    client.unpublish_benchmark(uri, group)
+        return client.count_episodes(seen)
+    episodes = client.unpublish_episodes(seen, group)
+    if chosen is None:
+        client.unpublish_benchmark(uri, group)
     return episodes
 
 
-def _own_episodes(client: TupliAPIClient, uri: str) -> BaseFilter:
+def _own_episodes(client: TupliAPIClient, uri: str, chosen: BaseFilter | None) -> BaseFilter:
     me = client.whoami().username
-    return FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=me)
+    own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=me)
+    return own if chosen is None else own & chosen

@@ -173,19 +173,20 @@ def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> Ba
 def publish(
     benchmark: Benchmark,
     group: Group = "global",
+    filter_text: FilterText = None,
     dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
     """Let others see a benchmark on a server.
 
-    They also see its artifacts, and your episodes of it.
+    They also see its artifacts, and your episodes of it (with --filter, only those that match).
     """
     from tupli_mcap.storage.exchange import publish_benchmark
 
     with server_at(url) as client:
         uri = full_id(client, benchmark)
-        episodes = publish_benchmark(client, uri, group, dry_run=dry_run)
+        episodes = publish_benchmark(client, uri, group, filter_of(filter_text), dry_run=dry_run)
         verb = "would publish" if dry_run else "published"
         line = f"{verb} {uri[:8]} with {counted(episodes, 'episode')} in {group}"
         _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
@@ -194,6 +195,7 @@ def publish(
 def unpublish(
     benchmark: Benchmark,
     group: Group = "global",
+    filter_text: FilterText = None,
     dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
@@ -201,14 +203,15 @@ def unpublish(
     """Hide a benchmark on a server from others.
 
     It also hides your episodes of it. Its artifacts stay visible, as other benchmarks may
-    need them.
+    need them. With --filter, it hides only your episodes that match.
     """
     from tupli_mcap.storage.exchange import unpublish_benchmark
 
     with server_at(url) as client:
         uri = full_id(client, benchmark)
-        episodes = unpublish_benchmark(client, uri, group, dry_run=dry_run)
-        rest = f"{uri[:8]} and {counted(episodes, 'episode')} of yours"
+        episodes = unpublish_benchmark(client, uri, group, filter_of(filter_text), dry_run=dry_run)
+        hidden = counted(episodes, "episode")
+        rest = f"{uri[:8]} and {hidden} of yours" if filter_text is None else f"{hidden} of {uri[:8]}"
         line = f"would hide {rest} from {group}" if dry_run else f"hid {rest} from {group}"
         _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
