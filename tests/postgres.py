@@ -31,9 +31,10 @@ class NoPostgresError(Exception):
 
 class Cluster:
     """A running PostgreSQL, new or of the directory of an earlier one. Only the user who starts it may connect; the
-    superuser is `postgres`."""
+    superuser is `postgres`. `settings` are added to those of tests."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, **settings: str) -> None:
+        self._settings = {**_SETTINGS, **settings}
         found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb")) or list(
             filter(None, [shutil.which("initdb")])
         )
@@ -51,7 +52,7 @@ class Cluster:
 
     def start(self) -> None:
         """Starts it, also after a kill."""
-        settings = " ".join(f"-c {key}='{value}'" for key, value in _SETTINGS.items())
+        settings = " ".join(f"-c {key}='{value}'" for key, value in self._settings.items())
         log = str(self._directory / "log")
         self._run("pg_ctl", "--wait", "-l", log, "-o", f"{settings} -k {self._directory}", "start")
 

@@ -45,6 +45,7 @@ from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
+SETTINGS = {"shared_buffers": "1GB"}  # as in docs/howto/deploy/compose.yaml
 P95_MS = {"postgresql": 100.0, "sqlite": 150.0}
 EACH = 10_000  # episodes of a recording
 DAY_NS = 24 * 3600 * 10**9
@@ -120,7 +121,7 @@ def database(engine: str, directory: Path, episodes: int) -> Iterator[str]:
         else:
             place = directory / "cluster"
             place.mkdir(exist_ok=True)
-            cluster = postgres.Cluster(place)
+            cluster = postgres.Cluster(place, **SETTINGS)
             cluster.start()
             stack.callback(cluster.stop, "fast")
             url = f"postgresql+psycopg://postgres@/bench?host={place}"

@@ -45,7 +45,7 @@ _MOST: Final = 200_000
 _NEAR: Final = 10_000
 _RECORDINGS: Final = 100  # at once
 _GROUP: Final = 500  # episodes that are worth a statement
-_FETCHED: Final = 500  # rows at once
+_FETCHED_FIRST, _FETCHED = 50, 500  # rows at once
 
 
 @dataclass(frozen=True)
@@ -223,9 +223,11 @@ def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards:
 
 def _streamed(connection: Connection, query: Select[*tuple[Any, ...]]) -> Iterator[Any]:
     """The rows that a query finds, fetched as they are needed: a few first, then more at once."""
-    options = {"stream_results": True, "max_row_buffer": _FETCHED}
-    with contextlib.closing(connection.execute(query, execution_options=options)) as rows:
-        yield from rows
+    size = _FETCHED_FIRST
+    with contextlib.closing(connection.execute(query, execution_options={"stream_results": True})) as rows:
+        while some := rows.fetchmany(size):
+            yield from some
+            size = min(2 * size, _FETCHED)
 
 
 def _part(asked: Asked, recording: tuple[int, str]) -> ColumnElement[bool]:
