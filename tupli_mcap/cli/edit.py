@@ -134,7 +134,6 @@ def tag(
     it and when. Its steps are not touched. A signature is dropped.
     """
     from tupli_mcap.dataset.which import numbers_in
-    from tupli_mcap.jsonvalue import spelled
     from tupli_mcap.recording import annotate_episodes, undo_annotation
     from tupli_mcap.storage.listing import find_recordings
 
@@ -169,14 +168,19 @@ def tag(
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
     for one in done:
-        noted = ", ".join(
-            f"{key}={'' if value is None else spelled(value)}" for key, value in one["values"].items()
-        )
-        count = counted(len(one["episodes"]), "episode")
-        if undo:
-            say(f"{one['path']}: {'would take' if dry_run else 'took'} {noted} back from {count}")
-        else:
-            say(f"{one['path']}: {count} {'would be ' if dry_run else ''}annotated: {noted}")
+        _tell_note(one, undo=undo, dry_run=dry_run)
+
+
+def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
+    from tupli_mcap.jsonvalue import spelled
+
+    values = {key: "" if value is None else spelled(value) for key, value in note["values"].items()}
+    noted = ", ".join(f"{key}={value}" for key, value in values.items())
+    count = counted(len(note["episodes"]), "episode")
+    if undo:
+        say(f"{note['path']}: {'would take' if dry_run else 'took'} {noted} back from {count}")
+    else:
+        say(f"{note['path']}: {count} {'would be ' if dry_run else ''}annotated: {noted}")
 
 
 def edit(
