@@ -79,6 +79,7 @@ NESTED = spaces.Dict(
 )
 
 
+@pytest.mark.parametrize("known", ["all", "none", "some"])
 @pytest.mark.parametrize(
     ("space", "reward"),
     [
@@ -88,7 +89,9 @@ NESTED = spaces.Dict(
         (spaces.Discrete(9), spaces.Box(-9, 9, (2,), np.float64)),
     ],
 )
-def test_many_episodes_at_once_are_as_one_after_another(tmp_path: Path, space: Any, reward: Any) -> None:
+def test_many_episodes_at_once_are_as_one_after_another(
+    tmp_path: Path, space: Any, reward: Any, known: str
+) -> None:
     """Byte for byte the same messages, over many changes of halves of the journal, with rewards that overflow."""
     rng, n = np.random.default_rng(0), 900
     space.seed(1)
@@ -103,6 +106,7 @@ def test_many_episodes_at_once_are_as_one_after_another(tmp_path: Path, space: A
     terminals[400:700] = timeouts[400:700] = False  # longer than a half
     terminals[-1] = True
     stops = np.flatnonzero(terminals | timeouts) + 1
+    unknown = {"all": range(0), "none": range(len(stops)), "some": range(3, 40)}[known]
     given = (space, spaces.Box(-9, 9, (2,), np.float64))
     options: dict[str, Any] = {"reward_space": reward, "num_envs": 2, "chunk_size": 5000, "capture": "none"}
     with EpisodeWriter(tmp_path / "single.mcap", *given, **options) as writer:
@@ -112,13 +116,14 @@ def test_many_episodes_at_once_are_as_one_after_another(tmp_path: Path, space: A
             part = slice(begin, stop)
             steps = (arrays_at(column, part) for column in (states, actions, rewards, terminals, timeouts))
             writer.steps(*steps, env=1)
-            writer.end(arrays_at(finals, i), env=1)
+            writer.end(None if i in unknown else arrays_at(finals, i), env=1)
             begin = stop
     with EpisodeWriter(tmp_path / "many.mcap", *given, **options) as writer:
         for first, last in ((0, 3), (3, 40), (40, len(stops))):
             part = slice(stops[first - 1] if first else 0, stops[last - 1])
             steps = (arrays_at(column, part) for column in (states, actions, rewards, terminals, timeouts))
-            writer.episodes(*steps, arrays_at(finals, slice(first, last)), env=1)
+            after = None if first in unknown else arrays_at(finals, slice(first, last))
+            writer.episodes(*steps, after, env=1)
             assert len(Recording(tmp_path / "many.mcap").episodes) == last
     assert messages(tmp_path / "single.mcap") == messages(tmp_path / "many.mcap")
     assert verify_recording(tmp_path / "many.mcap").problems == []

@@ -88,12 +88,12 @@ class StartedEpisode(NamedTuple):
 class EpisodeBatch(NamedTuple):
     """Derived records in the order of time: `starts` (STARTS), `ends` (ENDS), and the final state of each end.
 
-    `states` is uint8 (ends, bytes): what follows `episode` and `env` in `/final_state`.
+    `states` is uint8 (ends, bytes): what follows `episode` and `env` in `/final_state`. None: no final state is known.
     """
 
     starts: Array
     ends: Array
-    states: Array
+    states: Array | None
 
 
 class EpisodeDeriver:

@@ -251,7 +251,7 @@ class EpisodeWriter(Recorder):
         rewards: Any,
         terminals: Any,
         timeouts: Any,
-        final_states: Any,
+        final_states: Any = None,
         *,
         env: int = 0,
     ) -> None:
@@ -261,7 +261,7 @@ class EpisodeWriter(Recorder):
 
         Args:
             terminals, timeouts: an episode ends where one of them is set, the last one at the last step.
-            final_states: the state after each episode, along the first axis of arrays.
+            final_states: the state after each episode, along the first axis of arrays; None: not known.
             env: in which stream.
 
         Raises:

@@ -30,7 +30,7 @@ _CHOOSE: Final = (
 
 
 class _Part(NamedTuple):
-    """Steps of one episode, or if `whole` of several, each ended by a flag and with its final state."""
+    """Steps of one episode, or if `whole` of several, each ended by a flag, whose final states are all known or none."""
 
     env: int
     states: Any
@@ -280,10 +280,11 @@ def _parts(
 ) -> Iterator[_Part]:
     """The episodes of one sub-environment; consecutive whole ones are one part."""
     begins, ends = spans
-    alone = ~finals.done[ends, *column] | ~finals.known(ends, column)
+    alone, known = ~finals.done[ends, *column], finals.known(ends, column)
     if given.infos or given.metadata:
         alone[:] = True
-    cuts = np.flatnonzero(np.diff(begins // _TOGETHER).astype(np.bool_) | alone[1:] | alone[:-1]) + 1
+    turns = (np.diff(begins // _TOGETHER) != 0) | (known[1:] != known[:-1])
+    cuts = np.flatnonzero(turns | alone[1:] | alone[:-1]) + 1
     for first, stop in itertools.pairwise([0, *cuts.tolist(), len(ends)]):
         whole = stop - first > 1
         rows: Any = slice(begins[first], ends[stop - 1] + 1)

@@ -159,7 +159,7 @@ class Stream:
         """
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
         numbers = np.arange(writer.next_episode, writer.next_episode + count)
-        final_bytes = _final_bytes(writer.laid(), finals, count)
+        final_bytes = None if finals is None else _final_bytes(writer.laid(), finals, count)
         now, first_row = time.time_ns(), store.count
         states, actions, rewards, terminals, timeouts = columns
         store.put_many(states, actions, rewards, terminals, timeouts, np.repeat(numbers, lengths))

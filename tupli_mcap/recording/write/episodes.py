@@ -41,7 +41,7 @@ _BOTH: _Fields = (("episode", "<u4", 0), ("env", "<u4", 4))
 _START: _Fields = (*_BOTH, ("first_row", "<u8", 8))
 _END: _Fields = (*_START, ("length", "<u8", 16), ("return", "<f8", 24), ("end", "u1", 32))
 _START_BODY = EpisodeStart(0, 0, 0, False, False, "", "", "{}").encode()
-_END_BODY = EpisodeEnd(0, 0, 0, 0, 0.0, 0, True, "{}").encode()
+_END_BODY = {known: EpisodeEnd(0, 0, 0, 0, 0.0, 0, known, "{}").encode() for known in (False, True)}
 
 
 class ResetFacts(NamedTuple):
@@ -169,18 +169,21 @@ class EpisodeLog(EventLog):
         if not len(batch.starts) and not len(batch.ends):
             return
         begun, final, ended = self._tables(batch)
+        final_rows = final["#sequence"] if len(final) else np.full(len(ended), -1)
         self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
-        self._tell_index(begun, ended, final["#sequence"])
+        self._tell_index(begun, ended, final_rows)
         self._add({self._start: begun, self._final: final, self._end: ended})
 
     def _tables(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
         """Records of starts, final states and ends."""
         starts, ends, states = batch
-        size = states.shape[1]
         begun = self._table(self._start, _START_BODY, _START, starts)
+        ended = self._table(self._end, _END_BODY[states is not None], _END, ends)
+        if states is None:
+            return begun, self._table(self._final, bytes(8), _BOTH, ends[:0]), ended
+        size = states.shape[1]
         final = self._table(self._final, bytes(8 + size), (*_BOTH, ("state", f"V{size}", 8)), ends)
         final["state"] = np.ascontiguousarray(states).view(f"V{size}")[:, 0]
-        ended = self._table(self._end, _END_BODY, _END, ends)
         return begun, final, ended
 
     def _table(self, channel: int, body: bytes, fields: _Fields, rows: Array) -> Array:
