@@ -30,7 +30,7 @@ _CHOOSE: Final = (
 
 
 class _Part(NamedTuple):
-    """Steps of one episode, or if `whole` of several, each ended by a flag, whose final states are all known or none."""
+    """Steps of one episode, or if `whole` of several, each ended by a flag; they have a final state each, or none."""
 
     env: int
     states: Any
