@@ -178,6 +178,19 @@ def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:
     assert finals(autoreset="same-step", next_observations=states[1:] + 10) == [12, 16]
 
 
+def test_many_episodes_of_which_one_has_a_final_state(tmp_path: Path) -> None:
+    states, n = np.arange(3001, dtype=np.float32)[:, None], 3000  # one more than there are steps
+    ends = np.arange(n) % 10 == 9
+    write_rollout(tmp_path / "r.mcap", states, np.zeros((n, 1)), np.ones(n), ends, autoreset="disabled")
+    with Recording(tmp_path / "r.mcap") as recording:
+        *others, last = recording.episodes
+        assert len(others) == 299 and all(episode.final_state is None for episode in others)
+        np.testing.assert_array_equal(last.final_state, [3000])
+        np.testing.assert_array_equal(recording.read().states, states[:-1])
+        assert set(recording.index["length"]) == {10}
+    assert verify_recording(tmp_path / "r.mcap").problems == []
+
+
 def test_lists_are_episodes(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     lengths = [3, 1, 7]
