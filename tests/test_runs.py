@@ -559,7 +559,10 @@ class TestCommands:
                 wrong = CliRunner().invoke(app, [listing, str(tmp_path), "--filter", text])
                 assert wrong.exit_code != 0
                 assert wrong.output.count(f"did you mean {meant!r}") == 1
-        for numbers, text in (("0", "100% of 1"), ("1-2", "33%")):
+        for numbers, text, here, below in (
+            ("0", "100% of 1", "100% (1 of 3 episodes say it)", "100% (1 of 6 episodes say it)"),
+            ("1-2", "33%", "33%", "33% (3 of 6 episodes say it)"),
+        ):
             command(
                 "tag",
                 str(tmp_path / "2.mcap"),
@@ -568,6 +571,8 @@ class TestCommands:
                 f"success={json.dumps(numbers == '0')}",
             )
             assert text in command("ls", str(tmp_path / "2.mcap"), "--columns", "success")
+            assert f"{here}\n" in command("info", str(tmp_path / "2.mcap"))
+            assert f"{below}\n" in command("info", str(tmp_path))
         with pytest.raises(RecordingError, match="is a directory; give one file"):
             edit_run(tmp_path, name="x")
         dated = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "date"])

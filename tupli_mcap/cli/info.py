@@ -50,7 +50,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
     """Prints facts about the recordings of a directory or a server, or about the chosen episodes of them."""
     from tupli_mcap import open as open_dataset
     from tupli_mcap.dataset.chosen import chosen_ids
-    from tupli_mcap.recording.about.success import success_of
+    from tupli_mcap.recording.about.success import success_of, success_text
     from tupli_mcap.recording.description import spread_of
     from tupli_mcap.storage.listing import find_recordings
 
@@ -82,8 +82,8 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
             {
                 "path": shown(source), "recordings": recordings, "runs": runs, "environments": environments,
                 "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
-                "returns": returns, "success": rate, "seeds": len(seeds), "metadata_keys": keys,
-                "setting_keys": settings, "made_of": None if is_url(source) else dataset.made_of,
+                "returns": returns, "success": rate, "success_known": len(said), "seeds": len(seeds),
+                "metadata_keys": keys, "setting_keys": settings, "made_of": None if is_url(source) else dataset.made_of,
             }
         )  # fmt: skip
         return
@@ -97,7 +97,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         "episodes": number(len(headers)) + (f" ({ended})" if ended else ""),
         "steps": number(dataset.n_steps) + _spread_text(lengths, len(headers), " an episode"),
         "return": _spread_text(returns, len(headers)).removeprefix(", "),
-        "success": "" if rate is None else f"{rate:.0%} of the {counted(len(said), 'episode')} that say it",
+        "success": "" if rate is None else success_text(rate, len(said), len(headers)),
         "seeds": f"{number(len(seeds))} different" if seeds else "",
         "metadata": _some(keys),
     }
@@ -171,6 +171,8 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
 
 
 def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
+    from tupli_mcap.recording.about.success import success_text
+
     states = {
         "complete": "complete",
         "recording": "a process is writing to it",
@@ -196,7 +198,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
         *([] if d.made_of is None else [("made of", _made_of_text(d.made_of))]),
-        *([] if d.success is None else [("success", f"{d.success:.0%} of the episodes that say it")]),
+        *([] if d.success is None else [("success", success_text(d.success, d.success_known, d.episodes))]),
         *([("seeds", f"{number(d.seeds)} different")] if d.seeds else []),
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         *([("annotated", _annotations_text(d.annotations))] if d.annotations else []),

@@ -69,7 +69,8 @@ class RecordingDescription:
         metadata_keys: keys of the episodes' metadata.
         info_keys: keys of the infos of its steps; of a long recording, of a sample.
         seeds: number of different seeds of its episodes.
-        success: see `success_rate`.
+        success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
+            none do.
         ends: number of episodes by how they ended.
         observation, action: their spaces in lines for people, see `space_lines`; empty without a step.
         compression: bytes of messages for one byte of chunks in the file; None without a chunk.
@@ -94,6 +95,7 @@ class RecordingDescription:
     info_keys: list[str]
     seeds: int
     success: float | None
+    success_known: int
     num_envs: int
     episodes: int
     steps: int
@@ -121,6 +123,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         FormatError: the environment that the recording carries is damaged, or its labels are.
     """
     positions = np.arange(len(recording.index)) if positions is None else positions
+    said = successes(recording, positions)
     rows, run = recording.index[positions], recording.readable_runs[0]
     contents, seeds = recording.file.contents, recording.seeds
     table = contents.table
@@ -147,7 +150,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         metadata_keys=_metadata_keys(recording, positions),
         info_keys=_info_keys(recording, positions),
         seeds=len({seeds[i] for i in positions.tolist()} - {None}),
-        success=success_rate(recording, positions),
+        success=sum(said) / len(said) if said else None,
+        success_known=len(said),
         num_envs=recording.num_envs,
         episodes=len(rows),
         steps=int(rows["length"].sum()),
@@ -206,13 +210,6 @@ def _info_keys(recording: Recording, positions: Array) -> list[str]:
     with contextlib.suppress(FormatError):  # `verify` names damage; the other facts are known all the same
         return sorted({key for info in sampled_infos(recording, positions) for key in info})
     return []
-
-
-def success_rate(recording: Recording, positions: Array) -> float | None:
-    """The share of episodes that succeeded, among those whose metadata have `success` or `is_success`; None if none
-    have."""
-    said = successes(recording, positions)
-    return sum(said) / len(said) if said else None
 
 
 def successes(recording: Recording, positions: Array) -> list[bool]:

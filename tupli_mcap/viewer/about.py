@@ -12,6 +12,7 @@ import numpy as np
 
 from tupli_mcap.dataset.chosen import Chosen
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.success import success_text
 from tupli_mcap.recording.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import plain, title_of
@@ -100,7 +101,7 @@ def card(recording: Recording) -> str:
             text = f"mean {spread.mean:.4g}, from {spread.min:.4g} to {spread.max:.4g}{f'; {odd}' if odd else ''}"
             rows.append((name, odd if spread.nan == d.episodes else text))
     if d.success is not None:
-        rows.append(("success", f"{d.success:.0%} of the episodes that say it"))
+        rows.append(("success", success_text(d.success, d.success_known, d.episodes)))
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),

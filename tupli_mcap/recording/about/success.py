@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.errors import plural
 
 KEYS = ("is_success", "success")
 """The keys that infos and metadata use."""
@@ -33,6 +34,15 @@ def with_success(metadata: str, info: Any) -> str:
     known = jsonvalue.loads(metadata)
     return (
         metadata if any(key in known for key in KEYS) else jsonvalue.dumps_plain({**known, "success": said})
+    )
+
+
+def success_text(share: float, known: int, episodes: int) -> str:
+    """The share of successes; with the number of episodes that say it, unless all do."""
+    return (
+        f"{share:.0%}"
+        if known == episodes
+        else f"{share:.0%} ({known:,} of {plural(episodes, 'episode')} say it)"
     )
 
 
