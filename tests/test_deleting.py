@@ -205,3 +205,11 @@ def test_a_hidden_file_that_is_named(tmp_path: Path) -> None:
     assert seeds(file) == [0, 2, 3]
     assert "restored 1 episode" in run("restore", str(file))
     assert seeds(file) == [0, 1, 2, 3]
+
+
+def test_what_is_saved_over_a_file_is_not_hidden_by_its_notes(tmp_path: Path) -> None:
+    runs = tupli_mcap.open(record(tmp_path / "a.mcap", 5))
+    good = runs.filter("seed < 3").save(tmp_path / "good.mcap")
+    assert tupli_mcap.open(good).filter("seed = 1").delete() == 1
+    runs.filter("seed < 4").save(good, overwrite=True)
+    assert seeds(good) == [0, 1, 2, 3]

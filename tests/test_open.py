@@ -751,3 +751,47 @@ def test_fields_of_items_have_gymnasium_s_names_too(dataset: Dataset) -> None:
     assert np.array_equal(around["observations"], states)
     assert "rewards: 1.0; " in repr(transition) and "terminals: False" in repr(transition)
     assert "states: float32 (3, 4)" in repr(dataset.windows(3)[0]) and len(repr(around)) < 500
+
+
+def test_another_recording_of_the_same_name_is_not_taken_for_the_listed_one(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 0, 3)
+    dataset, opened = tupli_mcap.open(path), tupli_mcap.open(path)[0]
+    assert len(dataset) == 3
+    path.unlink()
+    record(path, 7, 3)
+    with pytest.raises(tupli_mcap.RecordingError, match="is another recording now; open it again"):
+        opened.annotate(success=True)
+    for use in (
+        lambda: dataset[0],
+        lambda: list(dataset),
+        lambda: dataset.read(),
+        lambda: dataset.windows(2),
+        lambda: dataset.save(tmp_path / "s.mcap"),
+        lambda: dataset.map(lambda episode: episode.rewards, tmp_path / "s.mcap"),
+        lambda: dataset.trim(slice(1), tmp_path / "s.mcap"),
+        lambda: dataset.filter(lambda episode: True),
+    ):
+        with pytest.raises(tupli_mcap.TupliError, match=r"another recording was listed.* open it again"):
+            use()
+    assert not (tmp_path / "s.mcap").exists()
+    assert len(Recording(path).annotations.said) == 0
+
+
+def test_what_is_gone_is_not_left_out_silently(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 0, 4)
+    dataset = tupli_mcap.open(path)
+    windows, listed = pickle.dumps(dataset.windows(2)), pickle.dumps(dataset)
+    tupli_mcap.open(path)[[3]].delete()
+    FileStorage(tmp_path).compact()
+    dataset = pickle.loads(listed)  # which opens the file anew
+    for use in (
+        lambda: dataset[3],
+        lambda: [episode.seed for episode in dataset],
+        lambda: dataset.save(tmp_path / "s.mcap"),
+        lambda: dataset[[3]].save(tmp_path / "s.mcap"),
+    ):
+        with pytest.raises(tupli_mcap.TupliError, match="episode 3 was listed, but is missing"):
+            use()
+    assert [episode.seed for episode in dataset[:3]] == [0, 1, 2]
+    with pytest.raises(tupli_mcap.TupliError, match="was written anew: the file was changed afterwards"):
+        pickle.loads(windows)[0]

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.dataset.items import ListedEpisodes
+from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Source
-from tupli_mcap.dataset.which import candidates
+from tupli_mcap.dataset.which import candidates, may_be_noted
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
@@ -26,6 +28,7 @@ from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.schema import BaseFilter
+from tupli_mcap.storage.base import by_recording
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
@@ -164,23 +167,33 @@ def trim_dataset(
 
 def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
     """Writes the episodes of a dataset; `kept`: by recording and number, the steps that stay."""
-    if len(dataset._chosen) == 1:
-        ((name, numbers),) = dataset._chosen.items()
-        trim_recording(dataset._open(name), target, kept[name], episodes=sorted(numbers), overwrite=True)
+    excerpts = _excerpts(dataset)
+    if len(excerpts) == 1:
+        ((name, excerpt),) = zip(kept, excerpts, strict=True)
+        numbers = excerpt.rows["episode"].tolist()
+        trim_recording(excerpt.recording, target, kept[name], episodes=numbers, overwrite=True)
         return target
-    excerpts = [
+    trimmed = [
         excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
-        for name, excerpt in zip(dataset._chosen, _excerpts(dataset), strict=True)
+        for name, excerpt in zip(kept, excerpts, strict=True)
     ]
     with replacing(target) as (fd, _):
-        merge_excerpts(excerpts, Container(fd, str(target), "zstd"))
+        merge_excerpts(trimmed, Container(fd, str(target), "zstd"))
     return target
 
 
 def _excerpts(dataset: Dataset) -> list[Excerpt]:
-    """The episodes of a dataset, by recording."""
-    opened = [(dataset._open(name), numbers) for name, numbers in dataset._chosen.items()]
-    return [Excerpt(one, one.index[np.isin(one.index["episode"], numbers)]) for one, numbers in opened]
+    """The episodes of a dataset, by recording.
+
+    Raises:
+        NotFoundError: a recording has not all of them any more.
+    """
+    found = []
+    for name, headers in by_recording(dataset.headers).items():
+        recording = dataset._open(name)
+        positions = positions_of(recording, ListedEpisodes.of(name, headers))
+        found.append(Excerpt(recording, recording.index[np.sort(positions)]))
+    return found
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
@@ -211,16 +224,17 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, qu
     _check_new(dataset, target, overwrite=overwrite)
     known = query or ("" if dataset._filter is None else str(dataset._filter))
     facts = {"query": known} if known else {}
-    chosen = dataset._chosen
-    if len(chosen) == 1:
-        ((name, numbers),) = chosen.items()
-        source = dataset._open(name)
+    excerpts = _excerpts(dataset)
+    if len(excerpts) == 1:
+        ((source, rows, *_),) = excerpts
         said = say_made_of([source], "filter", **facts)
-        rewrite_recording(source, target, episodes=sorted(numbers), attachments=said)
+        rewrite_recording(source, target, episodes=rows["episode"].tolist(), attachments=said)
+        if may_be_noted(target):  # the episodes keep their ids, and earlier ones of the file may be deleted
+            restore_episodes(target)
         return target
     made = {"how": "filter" if known else "merge", **facts}
     with replacing(target) as (fd, _):
-        merge_excerpts(_excerpts(dataset), Container(fd, str(target), "zstd"), made=made)
+        merge_excerpts(excerpts, Container(fd, str(target), "zstd"), made=made)
     return target
 
 

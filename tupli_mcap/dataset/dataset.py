@@ -19,6 +19,7 @@ from tupli_mcap.dataset.columns import tables
 from tupli_mcap.dataset.columns.load import read_in_order
 from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.dataset.items import INFOS, ListedEpisodes, RecordedSteps, Steps, info_columns, info_keys
+from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
@@ -36,6 +37,7 @@ from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
+from tupli_mcap.storage.base import uuid_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,12 +143,16 @@ class Dataset(RandomAccess):
 
     def _episode(self, header: EpisodeHeader) -> Episode:
         recording = self._open(header.recording, [header.episode])
-        position = int(np.searchsorted(recording.index["episode"], header.episode))
+        numbers = recording.index["episode"]
+        position = int(np.searchsorted(numbers, header.episode))
+        if (
+            recording.uuid != uuid_of(header)
+            or not (numbers[position : position + 1] == header.episode).any()
+        ):
+            positions_of(recording, ListedEpisodes.of(header.recording, [header]))  # says what has changed
         episode = recording.episodes[position]
         episode.listed = header
         episode.alone = partial(Dataset, self._source, [header])
-        if episode.number != header.episode:
-            raise DatasetError(f"{header.recording} has lost episode {header.episode}; open it again")
         return episode
 
     @property
@@ -498,7 +504,7 @@ class Dataset(RandomAccess):
         """
         doomed: dict[tuple[str, str], list[int]] = {}
         for header in self.headers:
-            doomed.setdefault((header.recording, header.id.rpartition("-")[0]), []).append(header.episode)
+            doomed.setdefault((header.recording, uuid_of(header)), []).append(header.episode)
         return curate.delete(self._source, doomed, force=force, dry_run=dry_run)
 
     # ---- showing

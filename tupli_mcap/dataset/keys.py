@@ -9,6 +9,7 @@ from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
+from tupli_mcap.storage.base import uuid_of
 
 __all__ = ["check_metadata", "keys_of", "values_at"]
 
@@ -32,7 +33,7 @@ def values_at(key: str, headers: Sequence[EpisodeHeader]) -> list[Any]:
 
 def _value(header: EpisodeHeader, key: str) -> Any:
     if key == "run":  # of files without a run, each is one
-        return header.run.get("id") or header.id.partition("-")[0]
+        return header.run.get("id") or uuid_of(header)
     value = look_up(header, path_in(key, EpisodeHeader))
     return None if value is MISSING else value
 

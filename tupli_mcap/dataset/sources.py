@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.models import unchecked_header
 from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.base import by_recording, episode_id
+from tupli_mcap.storage.base import by_recording, episode_id, uuid_of
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.sidecar import Notes, storage_of
 
@@ -212,7 +212,7 @@ class JoinedSource:
         self._of: dict[str, tuple[Source, str]] = {}
         for source, headers in sources:
             for header in headers:
-                uuid = header.id.partition("-")[0]
+                uuid = uuid_of(header)
                 first, known = self._of.setdefault(header.recording, (source, uuid))
                 if known != uuid:
                     raise DatasetError(

@@ -25,6 +25,7 @@ __all__ = [
     "check_choice",
     "choose_episodes",
     "extreme",
+    "may_be_noted",
     "named_positions",
     "places_of",
     "positions_of",
@@ -71,7 +72,7 @@ def check_choice(text: str, filter: BaseFilter | None = None) -> None:
 def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
     """The positions of the episodes that match a filter, without those that the storage has deleted."""
     path, deleted = recording.path, set[int]()
-    if path is not None and _may_be_noted(path):
+    if path is not None and may_be_noted(path):
         from tupli_mcap.storage.sidecar import Notes
 
         deleted = Notes.read(path).about(recording.metadata).deleted
@@ -86,7 +87,7 @@ def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positi
     return positions_of(recording, (header for header in headers if matches(header)))
 
 
-def _may_be_noted(path: Path) -> bool:
+def may_be_noted(path: Path) -> bool:
     """Whether a storage may have deleted episodes of a recording."""
     folders = list(path.absolute().parents)[:3]
     return path.with_name(f"{path.name}.json").exists() or any(

@@ -77,12 +77,16 @@ class Recording(DescribedRecording, DatasetVerbs):
         """Gives episodes (their numbers; None: all) metadata that take precedence over the recorded ones.
 
         Raises:
-            RecordingError: the recording has no path. Other errors are those of `annotate_episodes`.
+            RecordingError: the recording has no path, or another one is there now. Other errors are those of
+                `annotate_episodes`.
         """
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
         if self.path is None:
             raise RecordingError(f"{self.name} cannot be changed here; download it, and open the copy")
+        with Recording(self.path) as there:
+            if there.uuid != self.uuid:
+                raise RecordingError(f"{self.path} is another recording now; open it again")
         annotate_episodes(self.path, values, episodes)
         with Recording(self.path) as changed:
             self.annotations = changed.annotations

@@ -41,6 +41,7 @@ __all__ = [
     "new_name",
     "oldest_first",
     "published_in",
+    "uuid_of",
     "with_tuples",
 ]
 
@@ -337,6 +338,11 @@ def published_in(groups: Sequence[str], group: str) -> list[str]:
 def episode_id(uuid: str, episode: int) -> str:
     """The id of an episode: its recording's UUID and its number."""
     return f"{uuid}-{episode}"
+
+
+def uuid_of(header: EpisodeHeader) -> str:
+    """The UUID of the recording that an episode is of."""
+    return header.id.rpartition("-")[0]
 
 
 def anew(read: Callable[[], _T]) -> _T:

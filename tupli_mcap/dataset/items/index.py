@@ -26,25 +26,31 @@ from tupli_mcap.recording.columns.gather import Files, image_names
 from tupli_mcap.recording.columns.read import StoredSteps
 from tupli_mcap.recording.columns.runs import Segments, SegmentsBuilder
 from tupli_mcap.schema import EpisodeHeader
+from tupli_mcap.storage.base import uuid_of
 
 __all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
 
+_CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
+_HEAD = 1024  # bytes: the file's first metadata are shorter
 _MOST_OPEN = 64  # files; a few more while several threads read
 
 
 class ListedEpisodes(NamedTuple):
-    """Episodes of one recording: the name that opens it, their numbers and listed lengths (int64, both)."""
+    """Episodes of one recording: the name that opens it, their numbers and listed lengths (int64, both), and its UUID,
+    which is empty where the recording is known to be the same."""
 
     recording: str
     numbers: Array
     lengths: Array
+    uuid: str = ""
 
     @classmethod
     def of(cls, recording: str, headers: Iterable[EpisodeHeader]) -> ListedEpisodes:
         """The episodes of a recording as they are listed."""
-        found = [(header.episode, header.n_tuples) for header in headers]
+        listed = list(headers)
+        found = [(header.episode, header.n_tuples) for header in listed]
         numbers, lengths = np.array(found, np.int64).reshape(-1, 2).T
-        return cls(recording, numbers, lengths)
+        return cls(recording, numbers, lengths, uuid_of(listed[0]) if listed else "")
 
     @classmethod
     def each(cls, headers: Iterable[EpisodeHeader]) -> Iterator[ListedEpisodes]:
@@ -57,8 +63,10 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     """The positions of the episodes in the recording's index.
 
     Raises:
-        NotFoundError: an episode is missing, or shorter than listed: the file was changed.
+        NotFoundError: it is another recording, or an episode is missing, or shorter than listed: the file was changed.
     """
+    if listed.uuid not in ("", recording.uuid):
+        raise NotFoundError(f"{recording.name}: another recording was listed: {_CHANGED}")
     numbers = recording.index["episode"].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
     places = np.searchsorted(numbers, listed.numbers, sorter=order)
@@ -69,7 +77,7 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     if gone.any():
         raise NotFoundError(
             f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is missing or shorter: "
-            "the file was changed afterwards; open it again, or list the episodes again with load()"
+            f"{_CHANGED}"
         )
     return positions
 
@@ -164,7 +172,7 @@ class _Builder:
         stored = recording.stored
         source = stored.source
         if stored.where is not None and source.path is not None:
-            source = FileOfMany(self._files, stored.where, source.path, source.size)
+            source = FileOfMany(self._files, stored.where, source.path, source)
         rows = recording.index[positions_of(recording, listed)]
         self._layout_of.append(self._layout(recording.name, stored.layout))
         self._parts.append(_Part(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths))
@@ -250,21 +258,28 @@ class OpenFiles:
         self._forget()
 
     def _forget(self) -> None:
-        self._sources: OrderedDict[str, Source] = OrderedDict()
+        self._sources: OrderedDict[tuple[str, bytes], Source] = OrderedDict()
         self._lock = threading.Lock()
         self._process = os.getpid()
 
-    def source(self, where: str) -> Source:
-        """The open file of a path. It closes when nobody holds it any more."""
+    def source(self, where: str, head: bytes) -> Source:
+        """The open file of a path. It closes when nobody holds it any more.
+
+        Raises:
+            NotFoundError: it does not begin with `head`: another file is there.
+        """
         if self._process != os.getpid():  # the lock may be held by a thread that is not here
             self._forget()
         with self._lock:
-            source = self._sources.get(where)
+            source = self._sources.get((where, head))
             if source is None:
-                source = self._sources[where] = open_source(where)
+                source = open_source(where)
+                if source.size < len(head) or source.read(0, len(head)) != head:
+                    raise NotFoundError(f"{where} was written anew: {_CHANGED}")
+                self._sources[where, head] = source
                 if len(self._sources) > _MOST_OPEN:
                     self._sources.popitem(last=False)  # the last reader's reference closes it
-            self._sources.move_to_end(where)
+            self._sources.move_to_end((where, head))
             return source
 
     def __reduce__(self) -> tuple[type[OpenFiles], tuple[()]]:
@@ -272,25 +287,32 @@ class OpenFiles:
 
 
 class FileOfMany:
-    """A `Source` that is open only while it is among the files read last."""
+    """A `Source` that is open only while it is among the files read last.
 
-    def __init__(self, files: OpenFiles, where: str, path: Path, size: int) -> None:
+    It must begin as it did: with the UUID of the recording, and which rewriting of it this is.
+    """
+
+    def __init__(self, files: OpenFiles, where: str, path: Path, source: Source) -> None:
         self._files = files
         self.name = where
         self.path: Path | None = path
-        self.size = size
+        self.size = source.size
+        self._head = source.read(0, min(_HEAD, source.size))
 
     def read(self, offset: int, length: int) -> bytes:
-        return self._files.source(self.name).read(offset, length)
+        return self._opened().read(offset, length)
 
     def lend(self, offset: int, length: int) -> memoryview:
-        return self._files.source(self.name).lend(offset, length)
+        return self._opened().lend(offset, length)
 
     def view(self, offset: int, length: int) -> memoryview:
-        return self._files.source(self.name).view(offset, length)
+        return self._opened().view(offset, length)
+
+    def _opened(self) -> Source:
+        return self._files.source(self.name, self._head)
 
     def refresh(self) -> None:
-        self.size = self._files.source(self.name).size
+        self.size = self._opened().size
 
     def close(self) -> None:
         """Does nothing: `OpenFiles` closes files."""

@@ -17,7 +17,7 @@ from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in
+from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in, uuid_of
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
@@ -100,7 +100,7 @@ class RecordingFiles:
         notes = Notes.read(path, self._root)
         with contextlib.suppress(RecordingError, FormatError):  # gone, or damaged
             metadata = metadata_at(path)
-            return metadata["uuid"] == _uuid(header) and header.episode not in notes.about(metadata).deleted
+            return metadata["uuid"] == uuid_of(header) and header.episode not in notes.about(metadata).deleted
         return False
 
     def ingest(self, path: Path) -> None:
@@ -127,7 +127,7 @@ class RecordingFiles:
         with self._lock:
             path = self.path(header.recording)
             sidecar = Notes.read(path, self._root).about(metadata_at(path))
-            if sidecar.uuid != _uuid(header):
+            if sidecar.uuid != uuid_of(header):
                 raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
             if header.episode not in self._left(path):  # compacted since the catalog was read
                 raise NotFoundError(f"episode {header.id} was deleted by somebody else meanwhile")
@@ -143,7 +143,7 @@ class RecordingFiles:
         """
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
-            by_recording.setdefault((header.recording, _uuid(header)), set()).add(header.episode)
+            by_recording.setdefault((header.recording, uuid_of(header)), set()).add(header.episode)
         return self.delete_numbers(by_recording, force=True)
 
     def delete_numbers(
@@ -328,8 +328,3 @@ def _is_file(path: Path) -> bool:
         if err.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP):
             return False
         raise
-
-
-def _uuid(header: EpisodeHeader) -> str:
-    """The UUID of an episode's recording."""
-    return header.id.rpartition("-")[0]
