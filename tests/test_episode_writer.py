@@ -461,3 +461,16 @@ def test_what_is_dropped_is_finished(tmp_path: Path) -> None:
     del writer
     gc.collect()
     assert Recording(tmp_path / "r.mcap").complete
+
+
+def test_what_was_discarded_goes_where_the_recording_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    writer = EpisodeWriter("r.mcap", BOX, ACTIONS)
+    for number in range(2):
+        writer.begin(seed=number)
+        writer.step(np.zeros(3, np.float32), 0, 0.0)
+        writer.discard() if number == 0 else writer.end()
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    writer.close()
+    assert [episode.seed for episode in Recording(tmp_path / "r.mcap").episodes] == [1]

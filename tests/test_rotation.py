@@ -447,3 +447,26 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     again = record_rollouts("CartPole-v1", "run.mcap", steps=100, seed=1, mode="a", max_bytes=300_000)
     assert again.path == summary.path or again.path == series(Path("run.mcap"))[1][len(summary.paths)]
     assert again.steps == 100
+
+
+def test_finished_files_may_be_moved_and_the_directory_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("here", "there", "done"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    env = RecordEpisodes(Endless(ends=3), "run.mcap", max_bytes=1)
+    roll(env, 6)
+    Path("run.mcap").rename(tmp_path / "done" / "run.mcap")
+    monkeypatch.chdir(tmp_path / "there")
+    roll(env, 6)
+    env.close()
+    assert list((tmp_path / "there").iterdir()) == []
+    names = sorted(path.name for path in (tmp_path / "here").iterdir())
+    assert names == [f"run_{number:04}.mcap" for number in range(1, len(names) + 1)]
+    monkeypatch.chdir(tmp_path / "here")
+    with RecordEpisodes(Endless(ends=3), "run.mcap", max_bytes=1, mode="a") as env:
+        roll(env, 6)
+    more = sorted(path.name for path in (tmp_path / "here").iterdir())
+    assert more == [f"run_{number:04}.mcap" for number in range(1, len(more) + 1)]
+    assert len(more) > len(names) > 1

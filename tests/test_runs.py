@@ -818,10 +818,12 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     assert verify_recording(path).ok
     listed = json.loads(CliRunner().invoke(app, ["ls", str(path), "--json"]).output)["result"][0]
     assert listed["run"].startswith("one, killed, two") and listed["settings"] == {}  # nothing that all share
-    with pytest.raises(RecordingError, match="has 4 runs; only a recording of one run"):
+    with pytest.raises(RecordingError, match="has 3 runs; only a recording of one run"):
         edit_run(path, name="x")
+    before = path.read_bytes()
     with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):
-        RecordVectorEpisodes(gym.make_vec("CartPole-v1", 1), path, mode="a").reset()
+        RecordVectorEpisodes(gym.make_vec("CartPole-v1", 1), path, mode="a", name="wrong").reset()
+    assert path.read_bytes() == before  # what is refused changes nothing
 
 
 def test_a_damaged_run_does_not_keep_anybody_from_appending(tmp_path: Path) -> None:

@@ -72,7 +72,8 @@ class Captured:
         A recording that is appended to keeps its own environment.
         """
         carried = [one for one in writer.container.attachment_indexes if one.name == _DOCUMENT]
-        if self._digest and any(one.create_time >= self._began for one in carried):
+        is_new = _DOCUMENT in writer.arriving or any(one.create_time >= self._began for one in carried)
+        if self._digest and is_new:
             with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
                 if not trust.is_trusted(self._digest):
                     trust.trust(self._digest)

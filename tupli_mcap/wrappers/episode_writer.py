@@ -314,7 +314,7 @@ class EpisodeWriter(Recorder):
         with _Whole(self._work, self._writer):
             number = stream.discard()
             if number is not None:
-                self._discarded.setdefault(self._writer.path, []).append(number)
+                self._discarded.setdefault(self._writer.place.file, []).append(number)
             self._writer.sync_step()
 
     def close(self) -> None:

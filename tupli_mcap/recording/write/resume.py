@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -63,22 +62,18 @@ def resume(writer: RecordingWriter) -> None:
     finally:
         source.close()
     writer.container.position = contents.data_end
-    indexes = writer.container.attachment_indexes
-    writer.container.attachment_indexes = [each for each in indexes if each.name not in runs]
     known = set(contents.attachments)
     # The two halves of an environment: one that was lost is not made up for by half of another environment.
     known |= set(_ENVIRONMENT) if known.intersection(_ENVIRONMENT) else set()
     given = writer.options.attachments or {}
-    new = {name: a for name, a in given.items() if name not in known} | runs
-    if contents.complete and not new:
+    writer.arriving = {name: a for name, a in given.items() if name not in known} | runs
+    if contents.complete:
         return
     writer.cut()
     for channel in contents.undefined:  # the file was shorter after a power loss
         writer.container.write(writer.container.definitions(channel))
     for rows in contents.tail:
         writer.container.add_chunk(rows)
-    for name, (media_type, data) in new.items():
-        writer.container.add_attachment(name, media_type, data, time.time_ns())
     if contents.tail:  # the journal they come from may have been on the disk, and will be replaced
         sync_file(writer.lock.fd, str(writer.path))
 

@@ -68,7 +68,12 @@ class Rotation:
             options.max_bytes,
             options.max_seconds,
         )
+        if self._limited:  # the program may change its directory before the next file
+            path = os.path.abspath(path)
+            self._folder = None if self._folder is None else Path(path)
         self._paths = [Path(path) if self._folder is None else self._new_in(self._folder)]
+        self._base: Path | None = None  # after which the next files are called, and the number of the last one
+        self._number = 0
         if self._limited and self._folder is None:
             self._join(options.mode)
         self._opened = 0.0
@@ -88,6 +93,7 @@ class Rotation:
     def _join(self, mode: Mode) -> None:
         path = self._paths[0]
         base, later = series(path)
+        self._base = base
         if mode != "a":
             if later:
                 names = ", ".join(one.name for one in list(later.values())[:3])
@@ -169,11 +175,15 @@ class Rotation:
         Raises:
             RecordingError: it cannot be made; the one before can be recorded to as before.
         """
-        base, later = series(self._paths[-1])
-        path = base.with_name(f"{base.stem}_{max(later, default=0) + 1:04}{base.suffix}")
+        if self._base is None:
+            self._base = series(self._paths[0])[0]
+        base = self._base
+        number = max(self._number, *series(base)[1], 0) + 1  # files before it may have been moved away
+        path = base.with_name(f"{base.stem}_{number:04}{base.suffix}")
         with self.beginning():
             writer = self._open(path, "x")
         self._paths.append(path)
+        self._number = number
         return writer
 
 

@@ -84,6 +84,8 @@ class RecordingWriter:
         self.recorded_envs: int | None = None  # on append: sub-environments in the file
         self.recorded_vector = False
         self._is_cut = True  # False on append, while the file still is as it was found
+        # on append: attachments that are added, or replaced, with the first step
+        self.arriving: dict[str, tuple[str, bytes]] = {}
         self._flush_seconds = options.flush_seconds
         self._flushed_at = time.monotonic()
         self._take_file()
@@ -172,6 +174,7 @@ class RecordingWriter:
         self._make_stores(self._areas())
         # after the journal: a file that has channels and no end has one
         self.cut()
+        self._attach()
         self.container.define_channels()
         if self._durable:
             self._settle()
@@ -203,6 +206,15 @@ class RecordingWriter:
                 f"{self.path} could not be cut off at offset {at}: {os_reason(err)}"
             ) from err
         self._is_cut = True
+
+    def _attach(self) -> None:
+        container, arriving = self.container, self.arriving
+        self.arriving = {}
+        container.attachment_indexes = [
+            each for each in container.attachment_indexes if each.name not in arriving
+        ]
+        for name, (media_type, data) in arriving.items():
+            container.add_attachment(name, media_type, data, time.time_ns())
 
     def _areas(self, step_capacity: int = 0) -> list[Area]:
         has_infos = self.channels.info is not None
