@@ -463,7 +463,9 @@ def test_what_is_dropped_is_finished(tmp_path: Path) -> None:
     assert Recording(tmp_path / "r.mcap").complete
 
 
-def test_what_was_discarded_goes_where_the_recording_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_discarded_goes_where_the_recording_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     writer = EpisodeWriter("r.mcap", BOX, ACTIONS)
     for number in range(2):

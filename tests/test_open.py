@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from environments import Sampler, roll
+from gymnasium import spaces
 
 import tupli_mcap
 from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
+SPACE = spaces.Box(-1, 1, (1,), np.float32)
 OWN = ["metadata.side", "metadata.count", "metadata.success", "info.tag"]
 
 
@@ -795,3 +798,54 @@ def test_what_is_gone_is_not_left_out_silently(tmp_path: Path) -> None:
     assert [episode.seed for episode in dataset[:3]] == [0, 1, 2]
     with pytest.raises(tupli_mcap.TupliError, match="was written anew: the file was changed afterwards"):
         pickle.loads(windows)[0]
+
+
+def test_equal_values_of_other_types_stay_on_one_side(tmp_path: Path) -> None:
+    for k, value in enumerate((1, 1.0)):
+        with tupli_mcap.EpisodeWriter(tmp_path / f"{k}.mcap", SPACE, SPACE) as writer:
+            writer.begin(metadata={"task": value})
+            writer.step(np.zeros(1, np.float32), np.zeros(1, np.float32), 0.0)
+    dataset = tupli_mcap.open(tmp_path)
+    for seed in range(8):
+        with pytest.warns(UserWarning, match=r"all episodes are on one side of split\(by='metadata.task'\)"):
+            assert {len(part) for part in dataset.split(0.5, seed=seed, by="metadata.task")} == {0, 2}
+
+
+def test_what_chose_the_episodes_is_noted_where_they_were_listed_before(runs: Path, tmp_path: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    assert len(dataset)
+    saved = dataset.filter("seed < 200").filter("return > 0").save(tmp_path / "s.mcap")
+    made = Recording(saved).made_of
+    assert made is not None
+    assert (made["how"], made["query"]) == ("filter", str((F("seed") < 200) & (F("return") > 0)))
+
+
+def test_two_continued_copies_are_told_apart(tmp_path: Path) -> None:
+    first, second = record(tmp_path / "a.mcap", 0, 2), tmp_path / "b.mcap"
+    shutil.copy(first, second)
+    for path, seed in ((first, 10), (second, 20)):
+        with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+            env.reset(seed=seed)
+            env.step(0)
+    with pytest.warns(
+        UserWarning, match=r"are copies of one recording, and both went on: episode 2 .* by itself"
+    ):
+        assert tupli_mcap.open(tmp_path).headers[-1].seed == 10
+    assert tupli_mcap.open(second).headers[-1].seed == 20
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda dataset: tupli_mcap.open(""), "found an empty text"),
+        (lambda dataset: tupli_mcap.EpisodeWriter("", SPACE, SPACE), "found an empty text"),
+        (lambda dataset: dataset.split(0.5, by=3), "expected by=KEY"),
+        (lambda dataset: dataset.sample(1, seed=-1), "expected a seed from 0"),
+        (lambda dataset: dataset.loader(seed=2**70), "a seed of 64 bits"),
+        (lambda dataset: dataset.loader(batch_size=1.5), "a whole batch_size"),
+    ],
+)
+def test_what_means_nothing_is_one_error(dataset: Dataset, ask: Callable[[Dataset], Any], said: str) -> None:
+    with pytest.raises(TupliError, match=said):
+        ask(dataset)
+    assert len(next(iter(dataset.loader(batch_size=np.int64(4), seed=np.int64(4))))["rewards"]) == 4

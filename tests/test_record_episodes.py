@@ -742,6 +742,8 @@ def test_a_metadata_callback_without_reset_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="metadata_callback: expected an EpisodeMetadataCallback"):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback=lambda step: {})  # type: ignore[arg-type, return-value]
     assert not any(tmp_path.iterdir())
+    with pytest.raises(RecordingError, match="step_callback: expected a function, found 3"):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=3)  # type: ignore[arg-type]
 
 
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:

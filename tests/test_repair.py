@@ -650,6 +650,7 @@ def test_the_command(tmp_path: Path) -> None:
     shown = CliRunner().invoke(app, ["recover", str(path), "--force"])
     assert "STEPS LOST" in shown.output
     assert "the chunk" in shown.output
+    assert f"Delete {path}, or move it away" in " ".join(shown.output.split())
 
 
 def test_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -786,6 +786,12 @@ def test_a_value_that_is_called_success_is_no_success(tmp_path: Path) -> None:
 
 def test_keys_are_texts(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap")
+    endless: list[Any] = []
+    endless.append(endless)
+    with pytest.raises(RecordingError, match="nested too deep"):
+        record(tmp_path / "x.mcap", metadata={"x": endless})
+    refused = CliRunner().invoke(app, ["tag", str(path), "--episodes", "all", "success=no"])
+    assert refused.exit_code == 2 and "expected success=true or success=false, found 'no'" in refused.output
     for change in (
         lambda: edit_run(path, metadata={(1, 2): 2}),  # type: ignore[dict-item]
         lambda: annotate_episodes(path, {1: 2}),  # type: ignore[dict-item]

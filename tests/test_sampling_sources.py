@@ -27,7 +27,7 @@ from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, RecordedSteps, SamplingError, Windows, steps_of
 from tupli_mcap.dataset.sources import FilesSource
-from tupli_mcap.errors import FormatError, NotFoundError, SpaceError
+from tupli_mcap.errors import NotFoundError, SpaceError
 from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -287,7 +287,9 @@ def test_a_file_that_changes(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(path)
     steps = dataset.steps
     shutil.copy(other, path)
-    with pytest.raises(NotFoundError, match="was written anew: the file was changed afterwards; open it again"):
+    with pytest.raises(
+        NotFoundError, match="was written anew: the file was changed afterwards; open it again"
+    ):
         steps.read(["states"], np.arange(10))
     listed = ListedEpisodes(str(path), np.array([0, 99]), np.array([7, 7]))
     with pytest.raises(NotFoundError, match="episode 99 was listed, but is missing or shorter"):

@@ -292,3 +292,12 @@ def test_a_run_has_known_parts(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"\['metadata'\]\['code'\] is a .*module, .*; convert it"):
         write_rollout(tmp_path / "r.mcap", *arrays, run={"metadata": {"code": np}})
     assert not (tmp_path / "r.mcap").exists()
+
+
+def test_infos_may_be_nested(tmp_path: Path) -> None:
+    path, n = tmp_path / "r.mcap", 4
+    write_rollout(
+        path, np.zeros((n, 1), np.float32), np.zeros(n, np.int64), np.ones(n),
+        infos={"episode": {"r": np.arange(n)}}, autoreset="disabled",
+    )  # fmt: skip
+    assert [info["episode"]["r"] for info in Recording(path).episodes[0].infos] == [0, 1, 2, 3]

@@ -135,11 +135,15 @@ def tag(
     """
     from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.recording import annotate_episodes, undo_annotation
+    from tupli_mcap.recording.about.success import KEYS, success_of
     from tupli_mcap.storage.listing import find_recordings
 
     given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
     paths = [local_path(text) for text in given]
     values = dict(pair_of(text) for text in places if text not in given)
+    for key in set(KEYS).intersection(values):
+        if values[key] is not None and success_of({key: values[key]}) is None:
+            raise typer.BadParameter(f"expected {key}=true or {key}=false, found {values[key]!r:.40}")
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
             "expected recordings or directories, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 good=true"
@@ -344,6 +348,11 @@ def recover(
         print_json(report.to_json())
     else:
         _print_recovery(report)
+        if report.damaged and report.target is not None and Path(report.target).parent == Path(file).parent:
+            say("")
+            print_wrapped(
+                f"Delete {file}, or move it away: who opens its directory would read it first.", "", "  "
+            )
     if not report.saved:
         raise typer.Exit(1)
 

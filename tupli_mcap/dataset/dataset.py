@@ -30,7 +30,7 @@ from tupli_mcap.dataset.sources import (
     numbers_by_recording,
     place_of,
 )
-from tupli_mcap.errors import plural
+from tupli_mcap.errors import plural, warn
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
 from tupli_mcap.recording.columns.read import Columns
@@ -231,7 +231,9 @@ class Dataset(RandomAccess):
         found = [header for header in self._listed if matches(header)]
         if not found:
             check_metadata(wanted, self._listed)
-        return self._of(found)
+        made = self._of(found)
+        made._filter = wanted if self._filter is None else self._filter & wanted  # what `save` notes
+        return made
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "steps", "metadata.score"), or of a function of an `Episode`.
@@ -268,6 +270,8 @@ class Dataset(RandomAccess):
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
         """`n` different episodes (or as many as there are), drawn at random, in the order of drawing."""
+        if seed is not None and seed < 0:
+            raise DatasetError(f"expected a seed from 0, found {seed}")
         drawn = np.random.default_rng(seed).permutation(len(self))[: _count(n)]
         return self[drawn]
 
@@ -280,20 +284,24 @@ class Dataset(RandomAccess):
             fraction: expected share of the episodes in the first dataset.
             seed: of the draw.
             by: a key ("run", "metadata.task", "seed"): episodes with the same value stay together. With few different
-                values, all may fall on one side: check both.
+                values, all may fall on one side, which warns.
 
         Raises:
-            DatasetError: the fraction is not between 0 and 1.
+            DatasetError: the fraction is not between 0 and 1, or `by` is no key.
             FilterError: an unknown key.
         """
         if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
+        if not isinstance(by, str | None):
+            raise DatasetError(f"expected by=KEY, such as 'run', found {by!r:.80}")
         values = None if by is None else values_at(by, self.headers)
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
         for i, header in enumerate(self.headers):
-            name = header.id if values is None else repr(values[i])
+            name = header.id if values is None else _same_text(values[i])
             digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
             parts[int.from_bytes(digest[:8], "big") >= float(fraction) * 2**64].append(header)
+        if by is not None and 0 < fraction < 1 and len(self) and not all(parts):
+            warn(f"all episodes are on one side of split(by={by!r}): it has few values; try another seed")
         return self._of(parts[0]), self._of(parts[1])
 
     @property
@@ -549,6 +557,11 @@ def _places(chosen: object, count: int) -> list[int]:
     if len(array) and not -count <= array.min() <= array.max() < count:
         raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")
     return [int(i) % count for i in array]
+
+
+def _same_text(value: Any) -> str:
+    """One text for values that filters take for equal, such as 1 and 1.0."""
+    return repr(int(value) if isinstance(value, float) and value.is_integer() else value)
 
 
 def _count(n: int) -> int:

@@ -49,6 +49,10 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         return Dataset(FilesSource([place_of(source)]))
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
+        if not name:
+            raise DatasetError(
+                "expected a path, a pattern or a URL, found an empty text; name a directory as '.'"
+            )
         folder = Path(name).expanduser()
         if is_server(name):
             from tupli_mcap.storage import TupliAPIClient

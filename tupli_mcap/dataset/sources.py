@@ -6,7 +6,7 @@ import contextlib
 import glob
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -148,7 +148,7 @@ class FilesSource:
     ) -> list[EpisodeHeader]:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
-        files: dict[str, str] = {}  # episode id -> file
+        known: dict[str, EpisodeHeader] = {}
         found: list[EpisodeHeader] = []
         for recording in self._each():
             name = recording.name
@@ -157,11 +157,11 @@ class FilesSource:
             notes = None if is_url(name) else Notes.read(Path(name))
             deleted = set() if notes is None else notes.about(recording.metadata).deleted
             headers = list(episode_headers(recording, name, deleted))
-            copies = [header for header in headers if header.id in files]
+            copies = [header for header in headers if header.id in known]
             if copies:
-                warn(f"{name} holds {len(copies)} episodes of {files[copies[0].id]} again; they are left out")
-            new = [header for header in headers if header.id not in files]
-            files.update((header.id, name) for header in new)
+                warn(_again(name, copies, known))
+            new = [header for header in headers if header.id not in known]
+            known.update((header.id, header) for header in new)
             found += [header for header in new if episode_filter is None or matches(header)]
         return found
 
@@ -232,6 +232,18 @@ class JoinedSource:
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self._sources))
+
+
+def _again(name: str, copies: Sequence[EpisodeHeader], known: Mapping[str, EpisodeHeader]) -> str:
+    """What to warn of where a file has episodes with the ids of other files' ones."""
+    first = known[copies[0].id].recording
+    others = [one.episode for one in copies if one.created_at != known[one.id].created_at]
+    if not others:
+        return f"{name} holds {len(copies)} episodes of {first} again; they are left out"
+    return (
+        f"{name} and {first} are copies of one recording, and both went on: episode {others[0]} of {name} is another "
+        f"one than in {first}; of {name}, {len(copies)} episodes are left out; open it by itself"
+    )
 
 
 def _expand(item: str | os.PathLike[str]) -> Sequence[str]:

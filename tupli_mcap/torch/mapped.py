@@ -10,7 +10,7 @@ import numpy as np
 from torch import Generator
 from torch.utils.data import DataLoader, Dataset
 
-from tupli_mcap.dataset.items import Items, Samples
+from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 from tupli_mcap.torch.tensors import collate
@@ -88,7 +88,13 @@ def loader(
     remote: bool,
 ) -> DataLoader[Any]:
     """See `Dataset.loader`."""
-    generator = None if seed is None else Generator().manual_seed(seed)
+    try:
+        batch_size = operator.index(batch_size)
+        generator = None if seed is None else Generator().manual_seed(operator.index(seed))
+    except (TypeError, ValueError, RuntimeError, OverflowError) as err:
+        raise SamplingError(
+            f"expected a whole batch_size, and a seed of 64 bits, found {batch_size!r:.40} and {seed!r:.40}"
+        ) from err
     return DataLoader(
         MapDataset(items),
         batch_size,

@@ -176,9 +176,7 @@ def _write(writer: EpisodeWriter, part: _Part) -> None:
         writer.episodes(*steps, part.final_state, env=part.env)
         return
     n = len(part.rewards)
-    infos = (
-        [{name: values[i] for name, values in part.infos.items()} for i in range(n)] if part.infos else None
-    )
+    infos = [arrays_at(part.infos, i) for i in range(n)] if part.infos else None
     writer.begin(metadata=part.metadata, env=part.env)
     writer.steps(*steps, infos=infos, env=part.env)
     writer.end(part.final_state, env=part.env)

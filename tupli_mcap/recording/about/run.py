@@ -74,7 +74,13 @@ class Run(SaysWhatIsMeant):
             raise RecordingError(
                 f"metadata: expected a dict with texts as keys (for a Namespace, vars(args)), found {metadata!r:.80}"
             )
-        run = cls(name=name or "", metadata=_plain(dict(metadata or {})), tags=tuple(tags), split=split)
+        try:
+            plain = _plain(dict(metadata or {}))
+        except RecursionError as err:
+            raise RecordingError(
+                "metadata: expected values that JSON can hold, found some nested too deep"
+            ) from err
+        run = cls(name=name or "", metadata=plain, tags=tuple(tags), split=split)
         RecordedRuns([run]).to_json()
         return run
 

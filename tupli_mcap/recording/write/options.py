@@ -100,6 +100,8 @@ class RecordOptions:
                 "metadata_callback: expected an EpisodeMetadataCallback, which is called with each step and has "
                 f"reset(), found {callback!r:.80}; what is the same for all episodes of a run is metadata="
             )
+        if not (self.step_callback is None or callable(self.step_callback)):
+            raise RecordingError(f"step_callback: expected a function, found {self.step_callback!r:.80}")
         if self.durability not in get_args(Durability):
             raise RecordingError(
                 f"durability: expected one of {list(get_args(Durability))}, found {self.durability!r:.80}"
@@ -165,6 +167,8 @@ def _check_directory(place: str | os.PathLike[str] | None) -> None:
 def check_place(path: str | os.PathLike[str]) -> None:
     """Raises RecordingError unless a recording can be written at `path`, as it was given, and now: as a `Path` a URL no
     longer looks like one."""
+    if not os.fspath(path):
+        raise RecordingError("expected a path to record to, found an empty text; name a directory as '.'")
     if "\0" in os.fspath(path):
         raise RecordingError(f"expected a path to record to, found {os.fspath(path)!r}, which holds a NUL")
     if is_url(os.fspath(path)):

@@ -69,10 +69,12 @@ class Rotation:
             options.max_seconds,
         )
         if self._limited:  # the program may change its directory before the next file
-            path = os.path.abspath(path)
-            self._folder = None if self._folder is None else Path(path)
+            path = Path(path).absolute()
+            self._folder = None if self._folder is None else path
         self._paths = [Path(path) if self._folder is None else self._new_in(self._folder)]
-        self._base: Path | None = None  # after which the next files are called, and the number of the last one
+        self._base: Path | None = (
+            None  # after which the next files are called, and the number of the last one
+        )
         self._number = 0
         if self._limited and self._folder is None:
             self._join(options.mode)
