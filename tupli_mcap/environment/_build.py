@@ -24,8 +24,8 @@ _PICTURES = frozenset(
 )
 
 _INSTEAD: Final = (
-    "record with capture_env='pickle', or make the environment yourself and pass it on as env=... where that is "
-    "taken"
+    "record with capture_env='pickle', or make the environment yourself and pass it on: "
+    "tupli_mcap.replay.certify(path, env=...), tupli_mcap.replay.render(path, env=...)"
 )
 
 

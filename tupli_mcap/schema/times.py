@@ -31,10 +31,12 @@ _ISO: Final = re.compile(
     r"(?:[ T](?P<minute>\d\d:\d\d)(?::(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?)? ?(?P<zone>Z|[+-]\d\d:?\d\d)?)?",
     re.ASCII | re.IGNORECASE,
 )
-_AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w) ago", re.ASCII | re.IGNORECASE)
+_AGO: Final = re.compile(
+    r"(\d{1,9}) ?(min|h|d|w|minutes?|hours?|days?|weeks?) ago", re.ASCII | re.IGNORECASE
+)
 _WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 _CALENDAR: Final = re.compile(r"(this|last) (week|month|year)")
-_UNITS: Final = {"min": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+_UNITS: Final = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _EARLIEST_NS: Final = 10**17  # 1973: a smaller number is not in nanoseconds, but in seconds or milliseconds
 
 
@@ -75,7 +77,7 @@ def _span_of_text(text: str, now: datetime.datetime) -> TimeSpan:
         return _calendar(now.astimezone().date(), calendar[2], back=calendar[1] == "last")
     ago = _AGO.fullmatch(text)
     if ago is not None:
-        return _span(now - datetime.timedelta(**{_UNITS[ago[2].lower()]: int(ago[1])}), _MICROSECOND)
+        return _span(now - datetime.timedelta(**{_UNITS[ago[2][0].lower()]: int(ago[1])}), _MICROSECOND)
     iso = _ISO.fullmatch(text)
     if iso is None:
         raise ValueError(f"no time: {text!r}")
