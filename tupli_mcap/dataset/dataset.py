@@ -366,6 +366,8 @@ class Dataset(RandomAccess):
     ) -> Any:
         """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
 
+        It cannot go on within an epoch; `tupli_mcap.torch.StreamDataset` with a `StatefulDataLoader` can.
+
         Args:
             length: number of consecutive steps of each window; without it, items are single transitions.
             fields: as for `windows`, or for `transitions`.
