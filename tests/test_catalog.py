@@ -277,7 +277,7 @@ class TestOrder:
         wanted: Any,
         key: str,
         descending: bool,
-        limit: int = 7,
+        limit: int = 15,
         declared: bool = False,
     ) -> None:
         sort = Sort(key, descending) if key else None
