@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -849,3 +850,16 @@ def test_what_means_nothing_is_one_error(dataset: Dataset, ask: Callable[[Datase
     with pytest.raises(TupliError, match=said):
         ask(dataset)
     assert len(next(iter(dataset.loader(batch_size=np.int64(4), seed=np.int64(4))))["rewards"]) == 4
+
+
+def test_a_recording_beside_those_it_was_made_of_is_named(tmp_path: Path) -> None:
+    for name in "ab":
+        record(tmp_path / f"{name}.mcap", 0, 2)
+    tupli_mcap.open(tmp_path / "a.mcap").trim(slice(0, 3), tmp_path / "trimmed.mcap")
+    with pytest.warns(
+        UserWarning, match=r"trimmed.mcap was made of .*a.mcap, and both are here: .* count twice"
+    ):
+        assert len(tupli_mcap.open(tmp_path)) == 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(tupli_mcap.open([tmp_path / "b.mcap", tmp_path / "trimmed.mcap"])) == 4

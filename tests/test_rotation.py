@@ -445,7 +445,9 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert summary.episodes == sum(len(Recording(path)) for path in summary.paths)
     assert summary.size == sum(path.stat().st_size for path in summary.paths)
     again = record_rollouts("CartPole-v1", "run.mcap", steps=100, seed=1, mode="a", max_bytes=300_000)
-    assert again.path == summary.path or again.path == series(Path("run.mcap").absolute())[1][len(summary.paths)]
+    assert (
+        again.path == summary.path or again.path == series(Path("run.mcap").absolute())[1][len(summary.paths)]
+    )
     assert again.steps == 100
 
 

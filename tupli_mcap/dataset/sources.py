@@ -149,6 +149,8 @@ class FilesSource:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
         known: dict[str, EpisodeHeader] = {}
+        by_uuid: dict[str, str] = {}  # the names of recordings
+        made_of: dict[str, set[str]] = {}  # by name, the UUIDs of others
         found: list[EpisodeHeader] = []
         for recording in self._each():
             name = recording.name
@@ -162,7 +164,13 @@ class FilesSource:
                 warn(_again(name, copies, known))
             new = [header for header in headers if header.id not in known]
             known.update((header.id, header) for header in new)
+            by_uuid[recording.uuid] = name
+            made_of[name] = _made_of(recording)
             found += [header for header in new if episode_filter is None or matches(header)]
+        for name, uuids in made_of.items():
+            if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
+                more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
+                warn(f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice")
         return found
 
     def _each(self) -> Iterator[Recording]:
@@ -232,6 +240,14 @@ class JoinedSource:
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self._sources))
+
+
+def _made_of(recording: Recording) -> set[str]:
+    """The UUIDs of the recordings that this one was made of, without its own."""
+    with contextlib.suppress(FormatError):
+        sources = (recording.made_of or {}).get("sources", [])
+        return {str(one.get("uuid")) for one in sources if isinstance(one, dict)} - {recording.uuid}
+    return set()
 
 
 def _again(name: str, copies: Sequence[EpisodeHeader], known: Mapping[str, EpisodeHeader]) -> str:

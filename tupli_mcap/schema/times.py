@@ -31,9 +31,7 @@ _ISO: Final = re.compile(
     r"(?:[ T](?P<minute>\d\d:\d\d)(?::(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?)? ?(?P<zone>Z|[+-]\d\d:?\d\d)?)?",
     re.ASCII | re.IGNORECASE,
 )
-_AGO: Final = re.compile(
-    r"(\d{1,9}) ?(min|h|d|w|minutes?|hours?|days?|weeks?) ago", re.ASCII | re.IGNORECASE
-)
+_AGO: Final = re.compile(r"(\d{1,9}) ?(min|h|d|w|minutes?|hours?|days?|weeks?) ago", re.ASCII | re.IGNORECASE)
 _WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 _CALENDAR: Final = re.compile(r"(this|last) (week|month|year)")
 _UNITS: Final = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}

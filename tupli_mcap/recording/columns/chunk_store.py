@@ -313,7 +313,9 @@ class ChunkStore:
             )
         data = decompress(name, record[start:], size, where)
         if crc != row_crc or not (self._checked[i] or crc32(data) == crc):
-            raise FormatError(f"{where}: its CRC differs; the chunk is damaged: tupli-mcap recover saves the others")
+            raise FormatError(
+                f"{where}: its CRC differs; the chunk is damaged: tupli-mcap recover saves the others"
+            )
         self._checked[i] = isinstance(record.obj, mmap)  # mapped data is checked once
         return memoryview(data)[skip:] if skip else data
 
