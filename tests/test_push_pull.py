@@ -143,11 +143,31 @@ def test_pulling_a_filter_and_an_episode(admin: TupliAPIClient, tmp_path: Path) 
     assert (gone.exit_code, "there is no episode with id" in gone.stderr) == (1, True)
 
 
+def test_deleted_episodes_of_a_file_are_not_sent(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        for seed in range(4):
+            env.reset(seed=seed)
+            env.step(0)
+    run("delete", path, "--episodes", "3")
+    assert run("push", path, "--dry-run") == f"would send 3 episodes of {path} to {admin.url}\n"
+    assert admin.count_episodes() == 0
+    assert run("push", path) == f"sent 3 episodes of {path} to {admin.url}\n"
+    assert [header.episode for header in admin.list_episodes()] == [0, 1, 2]
+    run("restore", path)
+    run("delete", path, "--episodes", "0")
+    with pytest.raises(StorageError, match="is stored with episode 0, which this file lacks"):
+        admin.push(path)
+    admin.delete_episodes(F("episode") >= 0)
+    with admin.open_recording(admin.push(path)) as recording:
+        assert recording.index["episode"].tolist() == [1, 2, 3]
+
+
 def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_path: Path) -> None:
     record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
     with web_server.serving() as web:
         web.files["/r.mcap"] = (tmp_path / "run.mcap").read_bytes()
-        assert run("push", web.url() + "?sig=SECRET") == f"sent {web.url()} to {admin.url}\n"
+        assert run("push", web.url() + "?sig=SECRET") == f"sent 2 episodes of {web.url()} to {admin.url}\n"
     assert sum(header.n_tuples for header in admin.list_episodes()) == 30
 
 

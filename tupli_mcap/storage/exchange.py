@@ -29,6 +29,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
+from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
@@ -38,6 +39,7 @@ from tupli_mcap.storage.files import FileStorage
 
 __all__ = [
     "Copied",
+    "Pushed",
     "copy_episodes",
     "publish_benchmark",
     "push_recording",
@@ -216,14 +218,26 @@ def _vouch(target: FileStorage, uri: str) -> None:
                     return
 
 
-def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> str | None:
-    """Sends a recording to a server, after the benchmark and artifacts that it carries; returns its name there.
+class Pushed(NamedTuple):
+    """A recording that was sent, or would be.
+
+    Attributes:
+        name: what the server calls it; empty if it was not sent.
+        episodes: how many were sent.
+    """
+
+    name: str
+    episodes: int
+
+
+def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> Pushed:
+    """Sends a recording to a server, without its deleted episodes, after the benchmark and artifacts that it carries.
 
     Raises:
         FormatError: the file is damaged.
         StorageError: the server refuses it: its benchmark is neither stored there nor in the file.
     """
-    with Recording(path) as recording:
+    with without_deleted(path) as kept, Recording(kept) as recording:
         carries = bool(recording.benchmark_id) and DOCUMENT_NAME in recording.attachments
         if carries and not client.list_benchmarks(FilterEQ(key="id", value=recording.benchmark_id)):
             record, _, query = carried_benchmark(recording, path)
@@ -232,10 +246,10 @@ def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False)
                     client.store_artifact(data, metadata)
             if not dry_run:
                 client.store_benchmark(query)
-    if dry_run:
-        return None
-    with progress(path.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
-        return client.push(path, bar.advance)
+        if dry_run:
+            return Pushed("", len(recording))
+        with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
+            return Pushed(client.push(kept, bar.advance), len(recording))
 
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:

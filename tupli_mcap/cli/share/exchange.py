@@ -71,9 +71,11 @@ def push(
             _push_waiting(client, verb, dry_run=dry_run, as_json=as_json)
         elif is_one:
             with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
-                name = push_recording(client, path, dry_run=dry_run)
-            what = shown(source)
-            _tell_sent(to, f"{verb} {what}", dry_run, recordings=[name or what], as_json=as_json)
+                pushed = push_recording(client, path, dry_run=dry_run)
+            what, episodes = shown(source), pushed.episodes
+            line = f"{verb} {counted(episodes, 'episode')} of {what}"
+            names = [pushed.name or what]
+            _tell_sent(to, line, dry_run, recordings=names, episodes=episodes, as_json=as_json)
         else:
             with FileStorage(source) as storage:
                 uri = None if benchmark is None else full_id(storage, benchmark)

@@ -13,15 +13,16 @@ from pydantic import BaseModel, Field
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.mcap.source import TemporarySource
 from tupli_mcap.progress import progress
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.remote import is_cut_cheaper
 from tupli_mcap.storage.api.answers import as_told
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.downloads import fetched
+from tupli_mcap.storage.sidecar import Notes
 
-__all__ = ["Recordings"]
+__all__ = ["Recordings", "without_deleted"]
 
 
 class Recordings:
@@ -81,14 +82,33 @@ class Recordings:
         return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
 
     def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
-        """Store a local recording; returns its name for `open_recording`. `tell` is called with numbers of sent bytes.
+        """Store a local recording, without the episodes that were deleted here; returns its name for `open_recording`.
+        `tell` is called with numbers of sent bytes.
 
         Storing it twice changes nothing; a recording that has grown replaces its earlier version.
 
         Raises:
             StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
         """
-        return send_file(self._session, Path(path), tell=tell)
+        with without_deleted(Path(path)) as kept:
+            return send_file(self._session, kept, tell=tell)
+
+
+@contextlib.contextmanager
+def without_deleted(path: Path) -> Iterator[Path]:
+    """A file with the episodes of a recording that were not deleted: its own file, if none was."""
+    notes = Notes.read(path)
+    if notes.deleted:
+        with Recording(path) as recording:
+            deleted = notes.about(recording.metadata).deleted
+            numbers = [number for number in recording.index["episode"].tolist() if number not in deleted]
+            if recording.complete and len(numbers) < len(recording):
+                with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+                    kept = Path(folder) / path.name
+                    rewrite_recording(recording, kept, episodes=numbers)
+                    yield kept
+                return
+    yield path
 
 
 class _Ticket(BaseModel):
