@@ -51,7 +51,7 @@ from tupli_mcap.schema import (
     FilterIN,
     RLTuple,
 )
-from tupli_mcap.storage import FileStorage, TupliStorage, TupliStorageError
+from tupli_mcap.storage import FileStorage, TupliAPIClient, TupliStorage, TupliStorageError
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
 from tupli_mcap.storage.bundles import bundle_recording
 from tupli_mcap.storage.catalog import database, entries
@@ -294,11 +294,31 @@ class StorageContract:
                 storage.list_episodes(offset=number)
 
     def test_what_is_no_filter(self, storage: TupliStorage) -> None:
-        no_filters: tuple[Any, ...] = ("metadata.score > 3", {"key": "id"}, True, F("id"), lambda h: True)
+        no_filters: tuple[Any, ...] = (b"metadata.score > 3", {"key": "id"}, True, F("id"), lambda h: True)
         for ask in (storage.list_episodes, storage.list_benchmarks, storage.delete_episodes):
             for no_filter in no_filters:
                 with pytest.raises(FilterError, match="expected a filter, such as FilterEQ"):
                     ask(no_filter)
+
+    def test_a_text_is_a_filter(self, storage: TupliStorage, tmp_path: Path) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
+        assert [h.metadata["score"] for h in storage.list_episodes("metadata.score >= 3")] == [3.0, 4.0]
+        assert len(storage.list_episodes("metadata.score >= 3", include_tuples=True)) == 2
+        assert storage.count_episodes("metadata.score < 3") == 3
+        assert len(storage.list_benchmarks(f'id = "{benchmark}"')) == 1
+        assert storage.list_artifacts('name = "none"') == []
+        if isinstance(storage, TupliAPIClient):
+            assert storage.publish_episodes("metadata.score < 3") == 3
+            assert storage.unpublish_episodes('published_in = "global" and metadata.score < 2', "global") == 2
+        if isinstance(storage, FileStorage):
+            storage.bundle(benchmark, tmp_path / "some.mcap", "metadata.score < 2")
+            assert len(tupli_mcap.open(tmp_path / "some.mcap")) == 2
+            assert len(tupli_mcap.open(storage.export(tmp_path / "one.mcap", "metadata.score < 1"))) == 1
+        with pytest.raises(FilterError, match=r"unknown key 'score'.*metadata\.score"):
+            storage.delete_episodes("score > 3")
+        assert storage.delete_episodes("metadata.score > 2") == 2
+        assert storage.count_episodes() == 3
 
     def test_delete_episodes(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id

@@ -6,7 +6,7 @@ keys, values, times          keys, values and times in filters, and their compar
 facts                        checks filters against a model
 predicate                    filters evaluated in memory"""
 
-from tupli_mcap.schema.facts import bound, check_keys, filter_keys
+from tupli_mcap.schema.facts import bound, check_keys, filter_keys, parse_bound
 from tupli_mcap.schema.field import F
 from tupli_mcap.schema.filters import (
     BaseFilter,
@@ -39,7 +39,7 @@ from tupli_mcap.schema.models import (
     EpisodeMetadataCallback,
     RLTuple,
 )
-from tupli_mcap.schema.parse import format_filter, parse_bound, parse_filter
+from tupli_mcap.schema.parse import format_filter, parse_filter
 from tupli_mcap.schema.people import (
     RIGHT,
     ApiToken,

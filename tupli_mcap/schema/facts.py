@@ -25,6 +25,7 @@ from tupli_mcap.schema.filters import (
 )
 from tupli_mcap.schema.keys import join_key, split_key
 from tupli_mcap.schema.models import EpisodeHeader
+from tupli_mcap.schema.parse import key_positions, parse_filter
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
@@ -98,12 +99,15 @@ def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> N
     bound(filter, fields)
 
 
-def bound(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
-    """A filter over items of a model with its times as nanoseconds in UTC; "yesterday" means the day before this call.
+def bound(filter: BaseFilter | str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+    """A filter, or what its text describes, over items of a model (or with these fields) with its times as nanoseconds
+    in UTC; "yesterday" means the day before this call.
 
     Raises:
-        FilterError: As `check_keys`.
+        FilterError: As `check_keys`; for a text also as `parse_filter`.
     """
+    if isinstance(filter, str):
+        return parse_bound(filter, fields)
     if not isinstance(filter, BaseFilter):
         raise FilterError(
             f"expected a filter, such as FilterEQ(key=..., value=...) or F(...) > 3, found {filter!r:.80}"
@@ -113,6 +117,24 @@ def bound(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> BaseFi
     if not isinstance(fields, type):
         return filter
     return _bound(filter, fields, datetime.datetime.now(datetime.UTC))
+
+
+def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+    """The filter that a text describes, `bound` to items of a model, or with these fields.
+
+    Raises:
+        FilterError: as `parse_filter` and `bound`; it has the position, also for an unknown key.
+    """
+    parsed = parse_filter(text)
+    try:
+        return bound(parsed, fields)
+    except FilterError as err:
+        for position, comparison in zip(key_positions(text), comparisons(parsed), strict=True):
+            try:
+                bound(comparison, fields)
+            except FilterError:
+                raise err.at(position) from None
+        raise
 
 
 def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:

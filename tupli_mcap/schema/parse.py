@@ -23,13 +23,10 @@ import ast
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from pydantic import BaseModel
-
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema.facts import bound, comparisons
 from tupli_mcap.schema.filters import (
     BaseFilter,
     FilterAND,
@@ -143,23 +140,9 @@ def parse_filter(text: str) -> BaseFilter:
     return _filter(ast.parse(python, "<filter>", "eval").body, tokens)
 
 
-def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
-    """The filter that a text describes, `bound` to items of a model, or with these fields.
-
-    Raises:
-        FilterError: as `parse_filter` and `bound`; it has the position, also for an unknown key.
-    """
-    parsed = parse_filter(text)
-    try:
-        return bound(parsed, fields)
-    except FilterError as err:
-        keys = (token.position for token in _checked_tokens(text) if token.kind == "key")
-        for position, comparison in zip(keys, comparisons(parsed), strict=True):
-            try:
-                bound(comparison, fields)
-            except FilterError:
-                raise err.at(position) from None
-        raise
+def key_positions(text: str) -> list[int]:
+    """Where the key of each comparison in a filter's text begins, from left to right."""
+    return [token.position for token in _checked_tokens(text) if token.kind == "key"]
 
 
 def format_filter(filter: BaseFilter) -> str:

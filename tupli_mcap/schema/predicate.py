@@ -14,6 +14,7 @@ from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.facts import TIME_PATHS, bound
 from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
+from tupli_mcap.schema.parse import parse_filter
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
 
@@ -25,9 +26,9 @@ MISSING: Final = object()
 
 
 def compile_predicate(
-    filter: BaseFilter | None, fields: type[BaseModel] | Iterable[str] | None = None
+    filter: BaseFilter | str | None, fields: type[BaseModel] | Iterable[str] | None = None
 ) -> Predicate:
-    """A function that tells whether a filter is true for an item: nested mappings, or a pydantic model.
+    """A function that tells whether a filter, or its text, is true for an item: nested mappings, or a pydantic model.
 
     None as the filter is true for every item. With `fields` (a model class, or names), only those top-level keys exist;
     with a model class, times are compared as times.
@@ -38,8 +39,9 @@ def compile_predicate(
     """
     if filter is None:
         return lambda item: True
-    meant = filter if fields is None else bound(filter, fields)
-    return _predicate(meant, timed=isinstance(fields, type))
+    if fields is not None:
+        return _predicate(bound(filter, fields), timed=isinstance(fields, type))
+    return _predicate(parse_filter(filter) if isinstance(filter, str) else filter, timed=False)
 
 
 def bound_predicate(filter: BaseFilter) -> Predicate:

@@ -60,9 +60,9 @@ _Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
 class TupliStorage(ABC):
     """Stores benchmarks, artifacts and episodes and finds them again.
 
-    An unknown id (`uri`) of any form raises NotFoundError; ids are compared, never used as paths. Filters see the
-    fields of the listed headers (`id`, `metadata.score`); None lists everything. Every other failure is a
-    StorageError.
+    An unknown id (`uri`) of any form raises NotFoundError; ids are compared, never used as paths. A filter, an
+    expression or its text, sees the fields of the listed headers (`id`, `metadata.score`); None lists everything. Every
+    other failure is a StorageError.
     """
 
     # --- benchmarks ---
@@ -76,7 +76,7 @@ class TupliStorage(ABC):
         """A stored benchmark with its environment as text; nothing of it is executed."""
 
     @abstractmethod
-    def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
+    def list_benchmarks(self, filter: BaseFilter | str | None = None) -> list[BenchmarkHeader]:
         """The benchmarks that match a filter, oldest first."""
 
     @abstractmethod
@@ -102,7 +102,7 @@ class TupliStorage(ABC):
         """The bytes of an artifact, checked against their hash. `kwargs` are for other storages."""
 
     @abstractmethod
-    def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
+    def list_artifacts(self, filter: BaseFilter | str | None = None) -> list[ArtifactMetadataItem]:
         """The artifacts that match a filter, oldest first."""
 
     @abstractmethod
@@ -141,7 +141,7 @@ class TupliStorage(ABC):
     @overload
     def list_episodes(
         self,
-        filter: BaseFilter | None = None,
+        filter: BaseFilter | str | None = None,
         include_tuples: Literal[False] = False,
         *,
         limit: int | None = None,
@@ -151,7 +151,7 @@ class TupliStorage(ABC):
     @overload
     def list_episodes(
         self,
-        filter: BaseFilter | None,
+        filter: BaseFilter | str | None,
         include_tuples: Literal[True],
         *,
         limit: int | None = None,
@@ -161,7 +161,7 @@ class TupliStorage(ABC):
     @overload
     def list_episodes(
         self,
-        filter: BaseFilter | None = None,
+        filter: BaseFilter | str | None = None,
         *,
         include_tuples: Literal[True],
         limit: int | None = None,
@@ -171,7 +171,7 @@ class TupliStorage(ABC):
     @overload
     def list_episodes(
         self,
-        filter: BaseFilter | None = None,
+        filter: BaseFilter | str | None = None,
         include_tuples: bool = False,
         *,
         limit: int | None = None,
@@ -180,7 +180,7 @@ class TupliStorage(ABC):
 
     def list_episodes(
         self,
-        filter: BaseFilter | None = None,
+        filter: BaseFilter | str | None = None,
         include_tuples: bool = False,
         *,
         limit: int | None = None,
@@ -194,11 +194,13 @@ class TupliStorage(ABC):
         return anew(lambda: list(with_tuples(self._list_headers(filter, limit, offset), self.open_recording)))
 
     @abstractmethod
-    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
+    def _list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    ) -> list[EpisodeHeader]:
         """The episodes that match a filter, in the order of their recordings."""
 
     @abstractmethod
-    def count_episodes(self, filter: BaseFilter | None = None) -> int:
+    def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
         """The number of episodes that match a filter."""
 
     @abstractmethod
@@ -206,7 +208,7 @@ class TupliStorage(ABC):
         """Delete one episode."""
 
     @abstractmethod
-    def delete_episodes(self, filter: BaseFilter) -> int:
+    def delete_episodes(self, filter: BaseFilter | str) -> int:
         """Delete every episode that matches a filter; returns their number."""
 
     def delete_numbers(

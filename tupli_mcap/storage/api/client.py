@@ -140,7 +140,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self._benchmarks[benchmark.id] = benchmark
         outbox_of(self._session)
 
-    def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
+    def list_benchmarks(self, filter: BaseFilter | str | None = None) -> list[BenchmarkHeader]:
         return self._listed("/v1/benchmarks/list", BenchmarkHeader, _listing(filter, BenchmarkHeader))
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
@@ -177,7 +177,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
             raise FormatError(f"{kept} was damaged, and is deleted; try again")
         return data
 
-    def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
+    def list_artifacts(self, filter: BaseFilter | str | None = None) -> list[ArtifactMetadataItem]:
         return self._listed(
             "/v1/artifacts/list", ArtifactMetadataItem, _listing(filter, ArtifactMetadataItem)
         )
@@ -208,17 +208,19 @@ class TupliAPIClient(People, Recordings, TupliStorage):
             name = self.push(path)
         return self._episodes(FilterEQ(key="recording", value=name))
 
-    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
+    def _list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    ) -> list[EpisodeHeader]:
         self.flush()
         return self._episodes(filter, limit, offset)
 
     def _episodes(
-        self, filter: BaseFilter | None, limit: int | None = None, offset: int = 0
+        self, filter: BaseFilter | str | None, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
         told = {**_listing(filter, EpisodeHeader), "limit": limit, "offset": offset}
         return self._listed("/v1/episodes/list", EpisodeHeader, told)
 
-    def count_episodes(self, filter: BaseFilter | None = None) -> int:
+    def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
         self.flush()
         told = _listing(filter, EpisodeHeader)
         return as_told(int, self._session.ask("POST", "/v1/episodes/count", told, repeat=True))
@@ -227,7 +229,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self.flush()
         self._session.ask("DELETE", f"/v1/episodes/{_episode(uri)}")
 
-    def delete_episodes(self, filter: BaseFilter) -> int:
+    def delete_episodes(self, filter: BaseFilter | str) -> int:
         self.flush()
         told = _listing(filter, EpisodeHeader)
         return self._count("POST", "/v1/episodes/delete", told)
@@ -240,15 +242,15 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         """Take an episode away from a group."""
         self._unpublish("episodes", _episode(uri), unpublish_from)
 
-    def publish_episodes(self, filter: BaseFilter, publish_in: str = "global") -> int:
+    def publish_episodes(self, filter: BaseFilter | str, publish_in: str = "global") -> int:
         """Let a group see every episode of yours that matches a filter; returns how many."""
         return self._publish_all(filter, publish_in, published=True)
 
-    def unpublish_episodes(self, filter: BaseFilter, unpublish_from: str) -> int:
+    def unpublish_episodes(self, filter: BaseFilter | str, unpublish_from: str) -> int:
         """Take every episode that matches a filter away from a group; returns how many."""
         return self._publish_all(filter, unpublish_from, published=False)
 
-    def _publish_all(self, filter: BaseFilter, group: str, *, published: bool) -> int:
+    def _publish_all(self, filter: BaseFilter | str, group: str, *, published: bool) -> int:
         self.flush()
         told = {**_listing(filter, EpisodeHeader), "group": group, "published": published}
         return self._count("POST", "/v1/episodes/publish", told, repeat=True)
@@ -303,7 +305,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self._session.ask("DELETE", f"/v1/{kind}/{uri}/published", group=group)
 
 
-def _listing(filter: BaseFilter | None, model: Any) -> dict[str, Any]:
+def _listing(filter: BaseFilter | str | None, model: Any) -> dict[str, Any]:
     """A filter as the server takes it, checked here first."""
     return {"filter": None if filter is None else bound(filter, model).model_dump(mode="json")}
 

@@ -18,6 +18,7 @@ from tupli_mcap.schema import (
     BenchmarkMetadata,
     EpisodeHeader,
     FilterEQ,
+    bound,
 )
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
@@ -50,7 +51,7 @@ def write_bundle(
     storage: FileStorage,
     benchmark_id: str,
     target: Path,
-    filter: BaseFilter | None = None,
+    filter: BaseFilter | str | None = None,
     sign: SigningKey | None = None,
 ) -> Path:
     """Write a benchmark with its artifacts and its episodes (those that match a filter) into a new file.
@@ -64,7 +65,7 @@ def write_bundle(
     _refuse_existing(target)
     attachments = _attachments(storage, benchmark_id)
     of_benchmark: BaseFilter = FilterEQ(key="benchmark_id", value=benchmark_id)
-    wanted = of_benchmark if filter is None else of_benchmark & filter
+    wanted = of_benchmark if filter is None else of_benchmark & bound(filter, EpisodeHeader)
 
     def attempt() -> None:
         headers = storage.list_episodes(wanted)
@@ -77,7 +78,7 @@ def write_bundle(
     return target
 
 
-def export_episodes(storage: FileStorage, target: Path, filter: BaseFilter | None = None) -> Path:
+def export_episodes(storage: FileStorage, target: Path, filter: BaseFilter | str | None = None) -> Path:
     """Write the episodes that match a filter into the new recording `target`, without artifacts.
 
     Raises:

@@ -146,7 +146,7 @@ class Catalog:
             queries.remove_recording(connection, relpath)
 
     def episodes(
-        self, filter: BaseFilter | None = None, *, limit: int | None = None, offset: int = 0
+        self, filter: BaseFilter | str | None = None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
         """The episodes that match a filter, ordered by recording (path) and episode number.
 
@@ -156,7 +156,7 @@ class Catalog:
         with self._read() as connection:
             return list(queries.find_episodes(connection, filter, limit=limit, offset=offset))
 
-    def count(self, filter: BaseFilter | None = None) -> int:
+    def count(self, filter: BaseFilter | str | None = None) -> int:
         """The number of episodes that match a filter. Raises as `episodes` does."""
         with self._read() as connection:
             return queries.count_episodes(connection, filter)
@@ -166,7 +166,7 @@ class Catalog:
         with self._read() as connection:
             return question(connection)
 
-    def explain(self, filter: BaseFilter | None) -> str:
+    def explain(self, filter: BaseFilter | str | None) -> str:
         """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python checks the result again."""
         with self._read() as connection:
             return queries.plan_of(connection, filter)

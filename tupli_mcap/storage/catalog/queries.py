@@ -115,7 +115,7 @@ def put_recording(
 
 def find_episodes(
     connection: Connection,
-    filter: BaseFilter | None,
+    filter: BaseFilter | str | None,
     *,
     limit: int | None = None,
     offset: int = 0,
@@ -162,7 +162,7 @@ def each_once(headers: Iterable[EpisodeHeader]) -> Iterator[EpisodeHeader]:
 
 def count_episodes(
     connection: Connection,
-    filter: BaseFilter | None,
+    filter: BaseFilter | str | None,
     *,
     only: Condition | None = None,
     of: Condition | None = None,
@@ -182,7 +182,7 @@ def count_episodes(
     return count + sum(1 for _ in itertools.islice(_in_pages(connection, asked, found, rows), left))
 
 
-def plan_of(connection: Connection, filter: BaseFilter | None) -> str:
+def plan_of(connection: Connection, filter: BaseFilter | str | None) -> str:
     """The SQL of a filter, its parameters, the database's plan for it, and whether Python checks the rows that it
     finds."""
     asked = _asked(connection, filter, None, None)
@@ -245,7 +245,7 @@ _OF_RECORDING: Final = (RECORDING.c.uuid, RECORDING.c.benchmark_id, RECORDING.c.
 
 def _asked(
     connection: Connection,
-    filter: BaseFilter | None,
+    filter: BaseFilter | str | None,
     only: Condition | None,
     of: Condition | None,
     sort: Sort | None = None,

@@ -56,7 +56,7 @@ class ArtifactFiles:
         self._find(uri)
         return self._read(self._sidecar(uri))
 
-    def list(self, filter: BaseFilter | None) -> list[ArtifactMetadataItem]:
+    def list(self, filter: BaseFilter | str | None) -> list[ArtifactMetadataItem]:
         matches = compile_predicate(filter, ArtifactMetadataItem)
         items = []
         for sidecar in sorted(self._directory.glob("*.json")):

@@ -73,7 +73,7 @@ class BenchmarkFiles:
     def header(self, uri: str) -> BenchmarkHeader:
         return self._header(uri, self._read(uri))
 
-    def list(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
+    def list(self, filter: BaseFilter | str | None) -> list[BenchmarkHeader]:
         matches = compile_predicate(filter, BenchmarkHeader)
         headers = []
         for path in sorted(self._directory.glob("*.json")):

@@ -130,7 +130,7 @@ class FileStorage(TupliStorage):
         """
         return self._benchmarks.undo_edit(uri, dry_run=dry_run)
 
-    def list_benchmarks(self, filter: BaseFilter | None = None) -> list[BenchmarkHeader]:
+    def list_benchmarks(self, filter: BaseFilter | str | None = None) -> list[BenchmarkHeader]:
         return self._benchmarks.list(filter)
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
@@ -167,7 +167,7 @@ class FileStorage(TupliStorage):
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
         return self._artifacts.load(uri)
 
-    def list_artifacts(self, filter: BaseFilter | None = None) -> list[ArtifactMetadataItem]:
+    def list_artifacts(self, filter: BaseFilter | str | None = None) -> list[ArtifactMetadataItem]:
         return self._artifacts.list(filter)
 
     def artifact_users(self, uri: str) -> list[str]:
@@ -205,10 +205,12 @@ class FileStorage(TupliStorage):
             self.ingest(path)
             return self._recordings.of_recording(path)
 
-    def _list_headers(self, filter: BaseFilter | None, limit: int | None, offset: int) -> list[EpisodeHeader]:
+    def _list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    ) -> list[EpisodeHeader]:
         return self._catalog.headers(filter, limit=limit, offset=offset)
 
-    def count_episodes(self, filter: BaseFilter | None = None) -> int:
+    def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
         return self._catalog.count(filter)
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
@@ -220,7 +222,7 @@ class FileStorage(TupliStorage):
         """The recordings that the last query left out, and why: damaged ones, and copies of others."""
         return self._catalog.skipped
 
-    def explain(self, filter: BaseFilter | None) -> str:
+    def explain(self, filter: BaseFilter | str | None) -> str:
         """The SQL that a filter over episodes becomes, and SQLite's plan for it."""
         return self._catalog.explain(filter)
 
@@ -228,7 +230,7 @@ class FileStorage(TupliStorage):
         if not self._recordings.delete([self._recordings.header(uri)]):
             raise NotFoundError(f"episode {uri} was deleted by somebody else meanwhile")
 
-    def delete_episodes(self, filter: BaseFilter) -> int:
+    def delete_episodes(self, filter: BaseFilter | str) -> int:
         return self._recordings.delete(self._catalog.headers(filter))
 
     def delete_numbers(
@@ -319,14 +321,14 @@ class FileStorage(TupliStorage):
         self,
         benchmark_id: str,
         target: str | os.PathLike[str],
-        filter: BaseFilter | None = None,
+        filter: BaseFilter | str | None = None,
         *,
         sign: SigningKey | None = None,
     ) -> Path:
         """Write one file that holds a benchmark, its artifacts and its episodes, see `write_bundle`."""
         return write_bundle(self, benchmark_id, Path(target), filter, sign)
 
-    def export(self, target: str | os.PathLike[str], filter: BaseFilter | None = None) -> Path:
+    def export(self, target: str | os.PathLike[str], filter: BaseFilter | str | None = None) -> Path:
         """Write episodes of one benchmark, those that match a filter, into one file; see `export_episodes`."""
         return export_episodes(self, Path(target), filter)
 

@@ -62,25 +62,25 @@ class SyncedCatalog:
             self._opened.close()
             self._opened = None
 
-    def known(self, filter: BaseFilter, *, limit: int | None = None) -> list[EpisodeHeader]:
+    def known(self, filter: BaseFilter | str, *, limit: int | None = None) -> list[EpisodeHeader]:
         """The episodes in the catalog, without an update; they may be out of date, or none."""
         with contextlib.suppress(*_TROUBLE):
             return self._catalog.episodes(filter, limit=limit)
         return []
 
     def headers(
-        self, filter: BaseFilter | None, *, limit: int | None = None, offset: int = 0
+        self, filter: BaseFilter | str | None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
         return self._settled(lambda: self._catalog.episodes(filter, limit=limit, offset=offset))
 
-    def count(self, filter: BaseFilter | None) -> int:
+    def count(self, filter: BaseFilter | str | None) -> int:
         return self._settled(lambda: self._catalog.count(filter))
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
         """The result of a function of a connection to the up-to-date catalog."""
         return self._settled(lambda: self._catalog.ask(question))
 
-    def explain(self, filter: BaseFilter | None) -> str:
+    def explain(self, filter: BaseFilter | str | None) -> str:
         def ask() -> str:
             self._declare_keys()
             return self._catalog.explain(filter)
