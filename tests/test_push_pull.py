@@ -203,6 +203,25 @@ def test_publish_only_the_episodes_that_match(admin: TupliAPIClient, tmp_path: P
     assert admin.count_episodes(seen) == 0 and len(admin.list_benchmarks(seen)) == 1
 
 
+def test_episodes_without_a_benchmark_are_published_by_a_filter(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=5, seed=1, name="teleop")
+    run("push", tmp_path / "run.mcap")
+    seen, chosen = F("published_in") == "global", ("--filter", 'run.name = "teleop"')
+    assert run("publish", *chosen, "--dry-run") == "would publish 1 episode in global\n"
+    assert admin.count_episodes(seen) == 0
+    told = json.loads(run("publish", *chosen, "--json"))["result"]
+    assert told == {"dry_run": False, "benchmark": None, "group": "global", "episodes": 1}
+    assert admin.count_episodes(seen) == 1
+    assert run("unpublish", *chosen, "--dry-run") == "would hide 1 episode from global\n"
+    assert run("unpublish", *chosen) == "hid 1 episode from global\n"
+    assert admin.count_episodes(seen) == 0
+    for command in ("publish", "unpublish"):
+        refused = CliRunner().invoke(app, [command])
+        assert (refused.exit_code, "expected a BENCHMARK_ID or --filter" in refused.output) == (2, True)
+
+
 @pytest.mark.parametrize("kind", ["pickle", "spec"])
 def test_nothing_from_a_server_runs(admin: TupliAPIClient, tmp_path: Path, kind: str) -> None:
     """Listing, reading and fetching run nothing, and rebuilding is refused, from the server and from the directory."""

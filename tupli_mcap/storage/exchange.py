@@ -42,9 +42,11 @@ __all__ = [
     "Pushed",
     "copy_episodes",
     "publish_benchmark",
+    "publish_own",
     "push_recording",
     "send_waiting",
     "unpublish_benchmark",
+    "unpublish_own",
 ]
 
 
@@ -94,8 +96,7 @@ def _copy(
     chosen = filter
     if benchmark_id is not None:
         wanted[benchmark_id] = []
-        of_it = FilterEQ(key="benchmark_id", value=benchmark_id)
-        chosen = of_it if filter is None else of_it & filter
+        chosen = _of_benchmark(benchmark_id, filter)
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
     for header in each_once(source.list_episodes(chosen)):
@@ -270,15 +271,20 @@ def publish_benchmark(
 ) -> int:
     """Makes a benchmark, its artifacts, and the caller's episodes of it (those that `chosen` is true for) visible to a
     group; returns the number of these episodes."""
-    own = _own_episodes(client, uri, chosen)
     if dry_run:
         client.load_benchmark(uri)
-        return client.count_episodes(own)
-    client.publish_benchmark(uri, group)
-    with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names no artifacts
-        for artifact in unpack(client.load_benchmark(uri).serialized).artifacts:
-            client.publish_artifact(artifact, group)
-    return client.publish_episodes(own, group)
+    else:
+        client.publish_benchmark(uri, group)
+        with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names no artifacts
+            for artifact in unpack(client.load_benchmark(uri).serialized).artifacts:
+                client.publish_artifact(artifact, group)
+    return publish_own(client, group, _of_benchmark(uri, chosen), dry_run=dry_run)
+
+
+def publish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
+    """Makes the caller's episodes that match a filter visible to a group; returns their number."""
+    own = _own(client, chosen)
+    return client.count_episodes(own) if dry_run else client.publish_episodes(own, group)
 
 
 def unpublish_benchmark(
@@ -286,17 +292,24 @@ def unpublish_benchmark(
 ) -> int:
     """Hides a benchmark and the caller's episodes of it from a group; returns the number of these episodes. Its
     artifacts stay visible: other benchmarks may need them. With `chosen`, hides only episodes that it is true for."""
-    seen = _own_episodes(client, uri, chosen) & FilterEQ(key="published_in", value=group)
     if dry_run:
         client.load_benchmark(uri)
-        return client.count_episodes(seen)
-    episodes = client.unpublish_episodes(seen, group)
-    if chosen is None:
+    episodes = unpublish_own(client, group, _of_benchmark(uri, chosen), dry_run=dry_run)
+    if chosen is None and not dry_run:
         client.unpublish_benchmark(uri, group)
     return episodes
 
 
-def _own_episodes(client: TupliAPIClient, uri: str, chosen: BaseFilter | None) -> BaseFilter:
-    me = client.whoami().username
-    own = FilterEQ(key="benchmark_id", value=uri) & FilterEQ(key="created_by", value=me)
-    return own if chosen is None else own & chosen
+def unpublish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
+    """Hides the caller's episodes that match a filter from a group; returns their number."""
+    seen = _own(client, chosen) & FilterEQ(key="published_in", value=group)
+    return client.count_episodes(seen) if dry_run else client.unpublish_episodes(seen, group)
+
+
+def _of_benchmark(uri: str, chosen: BaseFilter | None) -> BaseFilter:
+    of_it = FilterEQ(key="benchmark_id", value=uri)
+    return of_it if chosen is None else of_it & chosen
+
+
+def _own(client: TupliAPIClient, chosen: BaseFilter) -> BaseFilter:
+    return FilterEQ(key="created_by", value=client.whoami().username) & chosen

@@ -12,7 +12,6 @@ import typer
 
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
-    Benchmark,
     DryRun,
     FilterText,
     Json,
@@ -34,6 +33,12 @@ if TYPE_CHECKING:
 __all__ = ["publish", "pull", "push", "unpublish"]
 
 Group = Annotated[str, typer.Option(metavar="GROUP", help="Who sees it: 'global' is everybody.")]
+Published = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[BENCHMARK_ID]", help="A benchmark's id; its first 4 digits are enough.", readable=False
+    ),
+]
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
@@ -173,51 +178,72 @@ def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> Ba
 
 
 def publish(
-    benchmark: Benchmark,
+    benchmark: Published = None,
     group: Group = "global",
     filter_text: FilterText = None,
     dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Let others see a benchmark on a server.
+    """Let others see a benchmark or episodes on a server.
 
-    They also see its artifacts, and your episodes of it (with --filter, only those that match).
+    Of a benchmark, they also see its artifacts, and your episodes of it (with --filter, only
+    those that match). --filter alone publishes your matching episodes, of any benchmark or none.
     """
-    from tupli_mcap.storage.exchange import publish_benchmark
+    from tupli_mcap.storage.exchange import publish_benchmark, publish_own
 
+    chosen = _chosen(benchmark, filter_text)
+    verb = "would publish" if dry_run else "published"
     with server_at(url) as client:
-        uri = full_id(client, benchmark)
-        episodes = publish_benchmark(client, uri, group, filter_of(filter_text), dry_run=dry_run)
-        verb = "would publish" if dry_run else "published"
-        line = f"{verb} {uri[:8]} with {counted(episodes, 'episode')} in {group}"
+        uri = None if benchmark is None else full_id(client, benchmark)
+        if uri is not None:
+            episodes = publish_benchmark(client, uri, group, chosen, dry_run=dry_run)
+            line = f"{verb} {uri[:8]} with {counted(episodes, 'episode')} in {group}"
+        elif chosen is not None:
+            episodes = publish_own(client, group, chosen, dry_run=dry_run)
+            line = f"{verb} {counted(episodes, 'episode')} in {group}"
         _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
 
 def unpublish(
-    benchmark: Benchmark,
+    benchmark: Published = None,
     group: Group = "global",
     filter_text: FilterText = None,
     dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Hide a benchmark on a server from others.
+    """Hide a benchmark or episodes on a server from others.
 
-    It also hides your episodes of it. Its artifacts stay visible, as other benchmarks may
-    need them. With --filter, it hides only your episodes that match.
+    Of a benchmark, it also hides your episodes. Its artifacts stay visible, as other benchmarks
+    may need them. With --filter, it hides only your episodes that match.
     """
-    from tupli_mcap.storage.exchange import unpublish_benchmark
+    from tupli_mcap.storage.exchange import unpublish_benchmark, unpublish_own
 
+    chosen = _chosen(benchmark, filter_text)
+    verb = "would hide" if dry_run else "hid"
     with server_at(url) as client:
-        uri = full_id(client, benchmark)
-        episodes = unpublish_benchmark(client, uri, group, filter_of(filter_text), dry_run=dry_run)
-        hidden = counted(episodes, "episode")
-        rest = f"{uri[:8]} and {hidden} of yours" if filter_text is None else f"{hidden} of {uri[:8]}"
-        line = f"would hide {rest} from {group}" if dry_run else f"hid {rest} from {group}"
+        uri = None if benchmark is None else full_id(client, benchmark)
+        if uri is not None:
+            episodes = unpublish_benchmark(client, uri, group, chosen, dry_run=dry_run)
+            hidden = counted(episodes, "episode")
+            rest = f"{uri[:8]} and {hidden} of yours" if chosen is None else f"{hidden} of {uri[:8]}"
+        elif chosen is not None:
+            episodes = unpublish_own(client, group, chosen, dry_run=dry_run)
+            rest = counted(episodes, "episode")
+        line = f"{verb} {rest} from {group}"
         _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
 
 
-def _tell_published(uri: str, group: str, episodes: int, line: str, *, dry_run: bool, as_json: bool) -> None:
+def _chosen(benchmark: str | None, filter_text: str | None) -> BaseFilter | None:
+    """The filter of `publish` and `unpublish`, which need it or a benchmark."""
+    if benchmark is None and filter_text is None:
+        raise typer.BadParameter("expected a BENCHMARK_ID or --filter")
+    return filter_of(filter_text)
+
+
+def _tell_published(
+    uri: str | None, group: str, episodes: int, line: str, *, dry_run: bool, as_json: bool
+) -> None:
     told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes}
     print_result(told, line, as_json=as_json)
