@@ -163,6 +163,32 @@ def test_deleted_episodes_of_a_file_are_not_sent(admin: TupliAPIClient, tmp_path
         assert recording.index["episode"].tolist() == [1, 2, 3]
 
 
+def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    one, two = paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    for seed, path in enumerate(paths):
+        record_rollouts("CartPole-v1", path, steps=5, seed=seed)
+    uri = fill(tmp_path / "lab", 2)
+    assert run("push", one).startswith(f"sent 1 episode of {one} to {admin.url}\n")
+    assert run("push", one, two, tmp_path / "lab").startswith(
+        f"already there: 1 episode of {one} at {admin.url}\n"
+        f"sent 1 episode of {two} to {admin.url}\n"
+        f"sent 2 episodes of 1 benchmark to {admin.url}\n"
+    )
+    told = json.loads(run("push", one, two, tmp_path / "lab", "--json"))["result"]
+    names = [header.recording for header in admin.list_episodes(F("benchmark_id") == "")]
+    assert sorted(told.pop("recordings")) == sorted(names)
+    assert told == {"dry_run": False, "url": admin.url, "benchmarks": [uri], "episodes": 0}
+    growing = tmp_path / "growing.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), growing) as env:
+        env.reset(seed=0)
+        env.step(0)
+        refused = CliRunner().invoke(app, ["push", str(one), str(growing)])
+    assert refused.exit_code == 1
+    assert f"{growing}: expected a finished recording" in " ".join(refused.stderr.split())
+
+
 def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_path: Path) -> None:
     record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
     with web_server.serving() as web:

@@ -391,7 +391,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "logout": ("logout",),
     "whoami": ("whoami", "whoami --url http://192.0.2.7:8080"),
     "password": ("password", "password ann"),
-    "push": ("push lab/", "push run.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'", "push"),
+    "push": ("push lab/", "push runs/*.mcap", "push lab/ --benchmark 3f2a --filter 'return > 100'", "push"),
     "pull": ("pull 3f2a --storage lab", "pull --filter 'return > 100' --storage lab --dry-run"),
     "publish": (
         "publish 3f2a",

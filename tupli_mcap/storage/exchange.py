@@ -224,11 +224,15 @@ class Pushed(NamedTuple):
 
     Attributes:
         name: what the server calls it; empty if it was not sent.
-        episodes: how many were sent.
+        benchmark_id: of its benchmark; empty if it has none.
+        episodes: how many it has there.
+        was_there: the server had all of it.
     """
 
     name: str
+    benchmark_id: str
     episodes: int
+    was_there: bool
 
 
 def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> Pushed:
@@ -248,9 +252,10 @@ def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False)
             if not dry_run:
                 client.store_benchmark(query)
         if dry_run:
-            return Pushed("", len(recording))
+            return Pushed("", recording.benchmark_id, len(recording), False)
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
-            return Pushed(client.push(kept, bar.advance), len(recording))
+            sent = client.send(kept, bar.advance)
+        return Pushed(sent.name, recording.benchmark_id, len(recording), sent.was_there)
 
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:

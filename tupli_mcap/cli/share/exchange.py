@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -21,9 +21,9 @@ from tupli_mcap.cli.options import (
     full_id,
     server_at,
 )
-from tupli_mcap.cli.output import bytes_of, counted, print_result
+from tupli_mcap.cli.output import bytes_of, counted, print_json, print_result
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.remote import copied, is_url, shown
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
 def push(
-    source: Annotated[
-        str | None, typer.Argument(metavar="[DIR|FILE|URL]", help="A storage, or a recording.")
+    sources: Annotated[
+        list[str] | None, typer.Argument(metavar="[DIR|FILE|URL]", help="Storages, or recordings.")
     ] = None,
     benchmark: Annotated[
         str | None,
@@ -55,50 +55,100 @@ def push(
     url: Url = None,
     as_json: Json = False,
 ) -> None:
-    """Send a storage or a recording to a server.
+    """Send storages or recordings to a server.
 
     Sends all benchmarks of a storage, with their artifacts and episodes, except what the
     server has already. Nobody else sees them until you publish them. Without DIR or FILE, it
     sends the recordings that could not be sent while they were recorded.
     """
-    from tupli_mcap.storage import FileStorage
-    from tupli_mcap.storage.exchange import copy_episodes, push_recording
-
-    is_one = source is not None and (is_url(source) or Path(source).is_file())
-    if (source is None or is_one) and (filter_text is not None or benchmark is not None):
+    sources = sources or []
+    files = {source for source in sources if is_url(source) or Path(source).is_file()}
+    if (files or not sources) and (filter_text is not None or benchmark is not None):
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
-    if not (source is None or is_one or Path(source).is_dir()):
-        raise RecordingError(f"{source} does not exist; give a recording (.mcap) or a directory of them")
-    verb = "would send" if dry_run else "sent"
+    for source in sources:
+        if source not in files and not Path(source).is_dir():
+            raise RecordingError(f"{source} does not exist; give a recording (.mcap) or a directory of them")
+    chosen = filter_of(filter_text)
     with server_at(url) as client:
-        to = client.url
-        if source is None:
-            _push_waiting(client, verb, dry_run=dry_run, as_json=as_json)
-        elif is_one:
-            with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
-                pushed = push_recording(client, path, dry_run=dry_run)
-            what, episodes = shown(source), pushed.episodes
-            line = f"{verb} {counted(episodes, 'episode')} of {what}"
-            names = [pushed.name or what]
-            _tell_sent(to, line, dry_run, recordings=names, episodes=episodes, as_json=as_json)
-        else:
-            with FileStorage(source) as storage:
-                uri = None if benchmark is None else full_id(storage, benchmark)
-                brought = copy_episodes(
-                    storage, client, filter_of(filter_text), benchmark_id=uri, dry_run=dry_run
-                )
-            ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
-            line = f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
-            _tell_sent(to, line, dry_run, benchmarks=ids, episodes=episodes, as_json=as_json)
+        if not sources:
+            _push_waiting(client, dry_run=dry_run, as_json=as_json)
+            return
+        done = []
+        for source in sources:
+            with _naming(source if len(sources) > 1 else ""):
+                if source in files:
+                    pushed = _push_file(client, source, dry_run=dry_run)
+                else:
+                    pushed = _push_storage(client, source, benchmark, chosen, dry_run=dry_run)
+            done.append(pushed)
+            if not as_json:
+                say(pushed.line)
+        if as_json:
+            benchmarks = list(dict.fromkeys(uri for each in done for uri in each.benchmarks))
+            recordings = [name for each in done for name in each.recordings]
+            episodes = sum(each.episodes for each in done)
+            print_json(_told(client.url, dry_run, benchmarks, recordings, episodes))
 
 
-def _push_waiting(client: TupliAPIClient, verb: str, *, dry_run: bool, as_json: bool) -> None:
+class _Pushed(NamedTuple):
+    """What was sent of a source, or would be; the line says so."""
+
+    line: str
+    benchmarks: list[str]
+    recordings: list[str]
+    episodes: int
+
+
+def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed:
+    from tupli_mcap.storage.exchange import push_recording
+
+    with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
+        pushed = push_recording(client, path, dry_run=dry_run)
+    what = f"{counted(pushed.episodes, 'episode')} of {shown(source)}"
+    names = [pushed.name or shown(source)]
+    if pushed.was_there:
+        return _Pushed(f"already there: {what} at {client.url}", [], names, 0)
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", [], names, pushed.episodes)
+
+
+def _push_storage(
+    client: TupliAPIClient, source: str, benchmark: str | None, chosen: BaseFilter | None, *, dry_run: bool
+) -> _Pushed:
+    from tupli_mcap.storage import FileStorage
+    from tupli_mcap.storage.exchange import copy_episodes
+
+    with FileStorage(source) as storage:
+        uri = None if benchmark is None else full_id(storage, benchmark)
+        brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run)
+    ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
+    what = f"{counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", ids, [], episodes)
+
+
+@contextmanager
+def _naming(source: str) -> Iterator[None]:
+    """An error in the block names the source, which may be one of many."""
+    try:
+        yield
+    except TupliError as err:
+        if source and shown(source) not in str(err):
+            raise type(err)(f"{shown(source)}: {err}") from err
+        raise
+
+
+def _verb(dry_run: bool) -> str:
+    return "would send" if dry_run else "sent"
+
+
+def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> None:
     from tupli_mcap.storage.exchange import send_waiting
 
     waiting = send_waiting(client, dry_run=dry_run)
     size = bytes_of(sum(each.size for each in waiting))
-    line = f"{verb} {counted(len(waiting), 'recording')}, {size}," if waiting else "nothing waits to be sent"
-    _tell_sent(client.url, line, dry_run, recordings=[str(each.path) for each in waiting], as_json=as_json)
+    what = f"{counted(len(waiting), 'recording')}, {size},"
+    line = f"{_verb(dry_run)} {what}" if waiting else "nothing waits to be sent"
+    told = _told(client.url, dry_run, [], [str(each.path) for each in waiting], None)
+    print_result(told, f"{line} to {client.url}", as_json=as_json)
     if not as_json:
         say(
             *(f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
@@ -106,19 +156,11 @@ def _push_waiting(client: TupliAPIClient, verb: str, *, dry_run: bool, as_json: 
         )  # fmt: skip
 
 
-def _tell_sent(
-    url: str,
-    line: str,
-    dry_run: bool,
-    *,
-    benchmarks: Sequence[str] = (),
-    recordings: Sequence[str] = (),
-    episodes: int | None = None,
-    as_json: bool,
-) -> None:
-    named = {"benchmarks": list(benchmarks), "recordings": list(recordings)}
-    told = {"dry_run": dry_run, "url": url, **named, "episodes": episodes}
-    print_result(told, f"{line} to {url}", as_json=as_json)
+def _told(
+    url: str, dry_run: bool, benchmarks: list[str], recordings: list[str], episodes: int | None
+) -> dict[str, object]:
+    sent = {"benchmarks": benchmarks, "recordings": recordings, "episodes": episodes}
+    return {"dry_run": dry_run, "url": url, **sent}
 
 
 def pull(

@@ -17,7 +17,7 @@ from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.remote import is_cut_cheaper
 from tupli_mcap.storage.api.answers import as_told
 from tupli_mcap.storage.api.session import Session
-from tupli_mcap.storage.api.upload import Tell, send_file
+from tupli_mcap.storage.api.upload import Sent, Tell, send_file
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.sidecar import Notes
@@ -90,6 +90,10 @@ class Recordings:
         Raises:
             StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
         """
+        return self.send(path, tell).name
+
+    def send(self, path: str | Path, tell: Tell = lambda _: None) -> Sent:
+        """As `push`; tells also whether the server had the recording already."""
         with without_deleted(Path(path)) as kept:
             return send_file(self._session, kept, tell=tell)
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from tupli_mcap.errors import StorageError
@@ -17,7 +17,7 @@ from tupli_mcap.storage.api.answers import UnreachableError, as_told
 from tupli_mcap.storage.api.session import TIMEOUT, Session
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["Tell", "send_file"]
+__all__ = ["Sent", "Tell", "send_file"]
 
 Tell = Callable[[int], None]
 """Is told how many more bytes were sent or fetched; fewer than none, where some have to be sent again."""
@@ -28,8 +28,15 @@ _CHECKED: Final = 20e6  # bytes a second that a slow server reads again to check
 _TUS: Final = {"Tus-Resumable": "1.0.0"}
 
 
-def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell = lambda _: None) -> str:
-    """Sends a recording; returns its name on the server.
+class Sent(NamedTuple):
+    """A recording on the server, by its name; `was_there`: the server had these bytes, and nothing was sent."""
+
+    name: str
+    was_there: bool
+
+
+def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell = lambda _: None) -> Sent:
+    """Sends a recording.
 
     sent_before: episodes with lower numbers were sent before, in parts; those that the server lacks were deleted there,
         and stay so.
@@ -44,7 +51,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
     told = {"sha256": digest} | ({"sent_before": str(sent_before)} if sent_before else {})
     metadata = ",".join(f"{key} {base64.b64encode(text.encode()).decode()}" for key, text in told.items())
     headers = {**_TUS, "Upload-Length": str(size), "Upload-Metadata": metadata}
-    fruitless, reached, shown = 0, 0, 0
+    fruitless, reached, shown, was_there = 0, 0, 0, True
 
     def pieces(offset: int) -> Iterator[bytes]:
         nonlocal shown
@@ -63,7 +70,8 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
         tell(offset - shown)
         shown = offset
         if "Recording" in begun:
-            return _recording(begun)
+            return Sent(_recording(begun), was_there)
+        was_there = False
         fruitless, reached = (fruitless, reached) if offset <= reached else (0, offset)
         try:
             done = session.send(
@@ -78,7 +86,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
                 },
                 timeout=TIMEOUT + size / _CHECKED,
             )
-            return _recording(done.headers)
+            return Sent(_recording(done.headers), was_there)
         except UnreachableError:
             fruitless += 1
             if fruitless == _FRUITLESS:
