@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import sys
 import threading
 from collections.abc import Iterator
@@ -152,7 +153,7 @@ def test_deleted_episodes_of_a_file_are_not_sent(admin: TupliAPIClient, tmp_path
     run("delete", path, "--episodes", "3")
     assert run("push", path, "--dry-run") == f"would send 3 episodes of {path} to {admin.url}\n"
     assert admin.count_episodes() == 0
-    assert run("push", path) == f"sent 3 episodes of {path} to {admin.url}\n"
+    assert run("push", path).startswith(f"sent 3 episodes of {path} to {admin.url}\n")
     assert [header.episode for header in admin.list_episodes()] == [0, 1, 2]
     run("restore", path)
     run("delete", path, "--episodes", "0")
@@ -193,7 +194,8 @@ def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_
     record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
     with web_server.serving() as web:
         web.files["/r.mcap"] = (tmp_path / "run.mcap").read_bytes()
-        assert run("push", web.url() + "?sig=SECRET") == f"sent 2 episodes of {web.url()} to {admin.url}\n"
+        said = run("push", web.url() + "?sig=SECRET")
+        assert said.startswith(f"sent 2 episodes of {web.url()} to {admin.url}\n") and "SECRET" not in said
     assert sum(header.n_tuples for header in admin.list_episodes()) == 30
 
 
@@ -215,6 +217,23 @@ def test_dry_runs_change_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     run("publish", uri)
     assert "would hide" in run("unpublish", uri, "--dry-run")
     assert len(admin.list_episodes(F("published_in") == "global")) == 12
+
+
+def test_push_says_how_to_publish(
+    admin: TupliAPIClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    uri = fill(tmp_path / "lab", 2)
+    assert run("push", tmp_path / "lab").endswith(f"to let others see it: tupli-mcap publish {uri[:8]}\n")
+    assert "to let others" not in run("push", tmp_path / "lab")
+    for seed in range(3):
+        record_rollouts("CartPole-v1", tmp_path / f"{seed}.mcap", steps=5, seed=seed)
+    *_, way = shlex.split(run("push", tmp_path / "0.mcap").splitlines()[1])
+    assert run("publish", "--filter", way) == "published 1 episode in global\n"
+    said = run("push", tmp_path / "1.mcap", tmp_path / "2.mcap")
+    assert said.endswith("to let others see it: tupli-mcap publish BENCHMARK_ID, or --filter FILTER\n")
+    record_rollouts("CartPole-v1", tmp_path / "3.mcap", steps=5, seed=3)
+    monkeypatch.setenv("TUPLI_MCAP_URL", "http://127.0.0.1:1")
+    assert run("push", tmp_path / "3.mcap", "--url", admin.url).endswith(f" --url {admin.url}\n")
 
 
 def test_publish_only_the_episodes_that_match(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -83,23 +85,28 @@ def push(
             done.append(pushed)
             if not as_json:
                 say(pushed.line)
+        new = [] if dry_run else [each for each in done if each.episodes]
         if as_json:
             benchmarks = list(dict.fromkeys(uri for each in done for uri in each.benchmarks))
             recordings = [name for each in done for name in each.recordings]
             episodes = sum(each.episodes for each in done)
             print_json(_told(client.url, dry_run, benchmarks, recordings, episodes))
+        elif new:
+            say(_how_to_publish(new, client.url))
 
 
 class _Pushed(NamedTuple):
-    """What was sent of a source, or would be; the line says so."""
+    """What was sent of a source, or would be; the line says so. `publish`: what publishes it; empty if not known."""
 
     line: str
     benchmarks: list[str]
     recordings: list[str]
     episodes: int
+    publish: str
 
 
 def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed:
+    from tupli_mcap.schema import FilterEQ, format_filter
     from tupli_mcap.storage.exchange import push_recording
 
     with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
@@ -107,8 +114,10 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
     what = f"{counted(pushed.episodes, 'episode')} of {shown(source)}"
     names = [pushed.name or shown(source)]
     if pushed.was_there:
-        return _Pushed(f"already there: {what} at {client.url}", [], names, 0)
-    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", [], names, pushed.episodes)
+        return _Pushed(f"already there: {what} at {client.url}", [], names, 0, "")
+    it = format_filter(FilterEQ(key="recording", value=pushed.name))
+    publish = pushed.benchmark_id[:8] or f"--filter {shlex.quote(it)}"
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", [], names, pushed.episodes, publish)
 
 
 def _push_storage(
@@ -122,7 +131,18 @@ def _push_storage(
         brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run)
     ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
     what = f"{counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
-    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", ids, [], episodes)
+    publish = ids[0][:8] if len(brought) == len(ids) == 1 else ""
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", ids, [], episodes, publish)
+
+
+def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
+    """Says how others get to see what was sent."""
+    from tupli_mcap.storage.api import last_server
+
+    ways = {each.publish for each in done}
+    way = ways.pop() if len(ways) == 1 else ""
+    there = "" if url == (os.environ.get("TUPLI_MCAP_URL") or last_server()) else f" --url {url}"
+    return f"to let others see it: tupli-mcap publish {way or 'BENCHMARK_ID, or --filter FILTER'}{there}"
 
 
 @contextmanager
