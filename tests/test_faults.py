@@ -241,7 +241,11 @@ def test_too_many_open_files_are_no_missing_recordings(tmp_path: Path) -> None:
             lambda d: RecordEpisodes(sampler(), d / "r.mcap", record_info=5),
             "record_info: expected True, False",
         ),
-        (lambda d: RecordEpisodes(sampler(), "file:///tmp/r.mcap"), "expected a local path to record to"),
+        (lambda d: RecordEpisodes(sampler(), "file:///tmp/r.mcap"), "found a URL; .* and copy the file"),
+        (
+            lambda d: RecordEpisodes(sampler(), "http://127.0.0.1:8080"),
+            r"tupli-mcap push FILE .*TupliEnvWrapper\(env, storage=TupliAPIClient\(URL\)\)",
+        ),
     ],
 )
 def test_wrong_arguments_are_said(tmp_path: Path, use: Any, message: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import is_url, is_web, shown
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -172,8 +172,11 @@ def check_place(path: str | os.PathLike[str]) -> None:
     if "\0" in os.fspath(path):
         raise RecordingError(f"expected a path to record to, found {os.fspath(path)!r}, which holds a NUL")
     if is_url(os.fspath(path)):
+        then = "copy the file"
+        if is_web(os.fspath(path)):
+            then = "tupli-mcap push FILE sends it; or TupliEnvWrapper(env, storage=TupliAPIClient(URL)) does so itself"
         raise RecordingError(
-            f"{path}: expected a local path to record to, found a URL; record to a path, and copy the file"
+            f"{shown(str(path))}: expected a local path to record to, found a URL; record to a path, and {then}"
         )
     now = time.time()
     if not 0 < now < (1 << 63) / 1e9:  # a `log_time` of 0 says that there is no row
