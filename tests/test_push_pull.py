@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shlex
 import sys
 import threading
@@ -188,6 +189,28 @@ def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
         refused = CliRunner().invoke(app, ["push", str(one), str(growing)])
     assert refused.exit_code == 1
     assert f"{growing}: expected a finished recording" in " ".join(refused.stderr.split())
+
+
+def test_a_run_without_a_name_keeps_that_of_its_file(admin: TupliAPIClient, tmp_path: Path) -> None:
+    files = [
+        "lab/teleop.mcap",
+        "my räw dáta #1.mcap",
+        "20261126T150639-ppo-35c375effd9c.mcap",
+        os.fsdecode(b"\xff.mcap"),
+    ]
+    (tmp_path / "lab").mkdir()
+    for seed, name in enumerate(files):
+        record_rollouts("CartPole-v1", tmp_path / name, steps=5, seed=seed)
+        run("push", (tmp_path / name).parent if seed == 0 else tmp_path / name)
+    fill(tmp_path / "more", 1)
+    run("push", tmp_path / "more")
+    names = [
+        re.fullmatch(r"\d{8}T\d{6}-(.*)[0-9a-f]{12}", each.run["name"]) for each in admin.list_episodes()
+    ]
+    assert sorted(name[1] for name in names if name) == ["_-", "cart-", "my_r_w_d_ta_1-", "ppo-", "teleop-"]
+    for header in admin.list_episodes():
+        with admin.open_recording(header.recording) as recording:
+            assert recording.run.name == header.run["name"]
 
 
 def test_pushing_a_recording_from_another_web_server(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -225,8 +225,10 @@ class Library:
             quotas.demand_room(connection, self.settings, caller, 0)  # the upload is counted already
         return found
 
-    def take_in(self, caller: Caller, incoming: Incoming) -> str:
+    def take_in(self, caller: Caller, incoming: Incoming, file: str = "") -> str:
         """Stores a recording whose upload is complete; returns its name. If the server fails, the upload stays.
+
+        file: the name of the caller's file, which becomes part of the recording's name.
 
         Raises:
             ChecksumError: its bytes do not have the announced SHA-256.
@@ -237,7 +239,9 @@ class Library:
             incoming.verify()
             with self.database.reading() as connection:
                 known = arrivals.stored_already(connection, caller, upload.digest)
-            name = known or self._keep(caller, upload.path, upload.digest, sent_before=upload.sent_before)
+            name = known or self._keep(
+                caller, upload.path, upload.digest, file=file, sent_before=upload.sent_before
+            )
         except UnavailableError:
             raise
         except TupliError:
@@ -270,7 +274,9 @@ class Library:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
             return self._keep(caller, path, digest, room=path.stat().st_size)
 
-    def _keep(self, caller: Caller, path: Path, digest: str, *, sent_before: int = 0, room: int = 0) -> str:
+    def _keep(
+        self, caller: Caller, path: Path, digest: str, *, file: str = "", sent_before: int = 0, room: int = 0
+    ) -> str:
         """Moves a recording to the blobs, and catalogs its episodes; returns its name.
 
         room: the bytes for which the caller's quota needs room; that of an upload is counted already.
@@ -284,7 +290,7 @@ class Library:
                     quotas.demand_room(connection, self.settings, caller, room)
                 # before it becomes part of a path: an id in a file may hold anything
                 arrivals.demand_benchmark(connection, caller, recording.benchmark_id)
-                place = arrivals.new_place(recording.benchmark_id)
+                place = arrivals.new_place(recording.benchmark_id, file)
                 pend(connection, place)
             try:
                 self.blobs.keep(place, path)

@@ -17,6 +17,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, plural
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.remote import shown
 from tupli_mcap.schema import (
@@ -165,7 +166,7 @@ def _copy_recording(
     with _file_with(source, name, numbers, place) as path:
         if isinstance(target, TupliAPIClient):
             with progress(path.stat().st_size, f"sending {place}", in_bytes=True) as bar:
-                target.push(path, bar.advance)
+                target.send(path, bar.advance, file_name(name))
             return
         if uri or not isinstance(target, FileStorage):
             goal = target.new_recording_path(uri)
@@ -235,8 +236,11 @@ class Pushed(NamedTuple):
     was_there: bool
 
 
-def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False) -> Pushed:
+def push_recording(
+    client: TupliAPIClient, path: Path, *, name: str | None = None, dry_run: bool = False
+) -> Pushed:
     """Sends a recording to a server, without its deleted episodes, after the benchmark and artifacts that it carries.
+    `name`: its path or URL, where `path` is a copy.
 
     Raises:
         FormatError: the file is damaged.
@@ -254,7 +258,7 @@ def push_recording(client: TupliAPIClient, path: Path, *, dry_run: bool = False)
         if dry_run:
             return Pushed("", recording.benchmark_id, len(recording), False)
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
-            sent = client.send(kept, bar.advance)
+            sent = client.send(kept, bar.advance, path.name if name is None else file_name(name))
         return Pushed(sent.name, recording.benchmark_id, len(recording), sent.was_there)
 
 

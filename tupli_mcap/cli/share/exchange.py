@@ -110,7 +110,7 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
     from tupli_mcap.storage.exchange import push_recording
 
     with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
-        pushed = push_recording(client, path, dry_run=dry_run)
+        pushed = push_recording(client, path, name=source, dry_run=dry_run)
     what = f"{counted(pushed.episodes, 'episode')} of {shown(source)}"
     names = [pushed.name or shown(source)]
     if pushed.was_there:

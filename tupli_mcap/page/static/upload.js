@@ -71,7 +71,7 @@ async function send(form, file, row) {
   let offset = Number(begun.headers.get("Upload-Offset"));
   for (let tries = 0; recording === null; ) {
     row.show("sent", offset);
-    const headers = { "Upload-Offset": String(offset), "Content-Type": "application/offset+octet-stream", "Tus-Resumable": "1.0.0" };
+    const headers = { "Upload-Offset": String(offset), "Recording-Name": encodeURIComponent(file.name), "Content-Type": "application/offset+octet-stream", "Tus-Resumable": "1.0.0" };
     try {
       const answer = await ask(form, "PATCH", place, headers, file.slice(offset, offset + PIECE));
       offset = Number(answer.headers.get("Upload-Offset"));

@@ -8,7 +8,7 @@ import contextlib
 import re
 from collections.abc import AsyncIterator
 from typing import Annotated
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 from fastapi import APIRouter, Body, Header, HTTPException, Request, Response
 from pydantic import BaseModel
@@ -106,6 +106,10 @@ async def go_on_with_upload(
     request: Request,
     upload_id: str,
     upload_offset: Annotated[int, Header(ge=0)],
+    recording_name: Annotated[
+        str,
+        Header(description="the name of the file, as URLs have it; it becomes part of the recording's name"),
+    ] = "",
 ) -> Response:
     """Adds bytes to an upload. The last ones store the recording; the header `Recording` is then its name (quoted)."""
     upload = await run_in_threadpool(_find, library, caller, upload_id)
@@ -117,7 +121,8 @@ async def go_on_with_upload(
         await _append(incoming, request.stream())
         told = {**_TUS, "Upload-Offset": str(incoming.offset)}
         if incoming.offset == upload.length:
-            told["Recording"] = quote(await run_in_threadpool(library.take_in, caller, incoming))
+            name = await run_in_threadpool(library.take_in, caller, incoming, unquote(recording_name))
+            told["Recording"] = quote(name)
     return Response(status_code=204, headers=told)
 
 

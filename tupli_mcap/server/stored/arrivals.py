@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import secrets
 from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
@@ -33,6 +34,8 @@ __all__ = ["demand_benchmark", "demand_short", "new_place", "register", "stored_
 
 _MOST_METADATA: Final = 64 << 10  # characters of JSON
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
+_OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}")  # see `new_name`
+_ODD: Final = re.compile(r"[^A-Za-z0-9._-]+")  # in URLs of buckets
 
 
 def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) -> None:
@@ -62,9 +65,13 @@ def demand_short(recording: Recording) -> None:
             )
 
 
-def new_place(benchmark_id: str) -> str:
-    """A new place for a recording of a stored benchmark, or of none."""
-    return f"recordings/{benchmark_id or _PLAIN}/{new_name()}"
+def new_place(benchmark_id: str, file: str) -> str:
+    """A new place for a recording of a stored benchmark, or of none. What is plain in the name of its file is part of
+    it: a run without a name is named after its file."""
+    stem = file.removesuffix(".mcap")
+    made = _OF_STORAGE.fullmatch(stem)
+    name = _ODD.sub("_", (made["name"] or "") if made else stem)
+    return f"recordings/{benchmark_id or _PLAIN}/{new_name(name)}"
 
 
 def stored_already(connection: Connection, caller: Caller, digest: str) -> str | None:

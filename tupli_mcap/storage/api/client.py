@@ -205,7 +205,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
             path = Path(folder) / "episodes.mcap"
             write_episodes(path, episodes, benchmark)
-            name = self.push(path)
+            name = self.send(path).name
         return self._episodes(FilterEQ(key="recording", value=name))
 
     def _list_headers(

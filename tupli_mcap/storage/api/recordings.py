@@ -90,12 +90,12 @@ class Recordings:
         Raises:
             StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
         """
-        return self.send(path, tell).name
+        return self.send(path, tell, Path(path).name).name
 
-    def send(self, path: str | Path, tell: Tell = lambda _: None) -> Sent:
-        """As `push`; tells also whether the server had the recording already."""
+    def send(self, path: str | Path, tell: Tell = lambda _: None, name: str = "") -> Sent:
+        """As `push`; tells also whether the server had the recording already. `name`: of its file, for the server."""
         with without_deleted(Path(path)) as kept:
-            return send_file(self._session, kept, tell=tell)
+            return send_file(self._session, kept, name=name, tell=tell)
 
 
 @contextlib.contextmanager

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
-from urllib.parse import unquote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.storage.api.answers import UnreachableError, as_told
@@ -35,8 +36,12 @@ class Sent(NamedTuple):
     was_there: bool
 
 
-def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell = lambda _: None) -> Sent:
+def send_file(
+    session: Session, path: Path, *, name: str = "", sent_before: int = 0, tell: Tell = lambda _: None
+) -> Sent:
     """Sends a recording.
+
+    name: of its file here, which becomes part of its name on the server.
 
     sent_before: episodes with lower numbers were sent before, in parts; those that the server lacks were deleted there,
         and stay so.
@@ -81,6 +86,7 @@ def send_file(session: Session, path: Path, *, sent_before: int = 0, tell: Tell 
                 headers={
                     **_TUS,
                     "Upload-Offset": str(offset),
+                    "Recording-Name": quote(os.fsencode(name)),
                     "Content-Type": "application/offset+octet-stream",
                     "Content-Length": str(size - offset),
                 },
