@@ -46,7 +46,7 @@ _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 def push(
     sources: Annotated[
-        list[str] | None, typer.Argument(metavar="[DIR|FILE|URL]", help="Storages, or recordings.")
+        list[str] | None, typer.Argument(metavar="DIR|FILE|URL", help="Storages, or recordings.")
     ] = None,
     benchmark: Annotated[
         str | None,
