@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation, RescaleAction
 from jsonschema import Draft202012Validator
 
+import tupli_mcap
 from tupli_mcap import FormatError, RecordEpisodes, Recording, SpaceError
 from tupli_mcap.environment import documented_labels
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
@@ -255,3 +256,26 @@ def test_of_leaves_that_are_not_there_are_ignored(tmp_path: Path) -> None:
     attachments = {LABELS_NAME: ("application/json", data.encode())}
     recording = record(gym.make("CartPole-v1"), tmp_path / "r.mcap", attachments=attachments)
     assert recording.labels == Labels({}, {"action": ("a", "b")})
+
+
+def test_a_table_has_a_column_for_each_dimension(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+
+    def columns(
+        space: spaces.Space[Any], action: spaces.Space[Any], labels: dict[str, list[str]]
+    ) -> list[str]:
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
+        record(Sampler(space, action), path, labels=labels)
+        table = tupli_mcap.open(path).to_pandas()
+        return [name for name in table if str(name).startswith(("state", "action"))]
+
+    equal = {"state": ["x", "x", "x (1)", "state of charge"], "action": ["push"]}
+    assert columns(spaces.Box(-1, 1, (4,)), spaces.Box(-1, 1, (1,)), equal) == [
+        "state.x", "state.x (1)", "state.x (1) (2)", "state.state of charge", "action.push"
+    ]  # fmt: skip
+    dotted = spaces.Dict({"arm.x": spaces.Box(-1, 1, ()), "arm": spaces.Dict({"x": spaces.Box(-1, 1, ())})})
+    assert columns(dotted, spaces.Dict({"action": spaces.Discrete(2)}), {}) == [
+        "state.arm.x", "state.arm.x (1)", "action.action"
+    ]  # fmt: skip
+    pair = spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1,))])
+    assert columns(pair, spaces.Discrete(2), {"state[1]": ["x"]}) == ["state[0]", "state[1]: x", "action"]

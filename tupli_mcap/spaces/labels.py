@@ -160,3 +160,13 @@ def element_names(leaf: Leaf, labels: Labels, elements: Sequence[int] | None = N
         return (prefix,) * len(chosen)
     places = np.stack(np.unravel_index(chosen, leaf.shape), axis=1).tolist()
     return tuple(f"{prefix}[{','.join(map(str, place))}]" for place in places)
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """The names, where one that was there before gets its place: `x`, `x (1)`."""
+    found: dict[str, None] = {}
+    for i, name in enumerate(names):
+        while name in found:
+            name += f" ({i})"
+        found[name] = None
+    return list(found)

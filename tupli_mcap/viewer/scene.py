@@ -14,7 +14,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.description import by_scale
-from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.labels import Labels, distinct
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names, entity_of, escaped, title_of
 from tupli_mcap.viewer.panels import (
@@ -196,14 +196,10 @@ def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
     n, start = int(space.n), int(space.start)
     entity, names = entity_of(leaf), material.labels.values.get(leaf.path)
     if (n <= _MOST_LANES or names is not None) and material.rows <= _MOST_LANE_ROWS:
-        labels = _distinct([str(start + i) for i in range(n)] if names is None else names)
+        # the viewer would take equal labels for one state
+        labels = distinct([str(start + i) for i in range(n)] if names is None else names)
         return Lanes(leaf, column, entity, title_of(leaf), labels)
     return Series(leaf, column, entity, title_of(leaf), (0,), (title_of(leaf),), stepped=True)
-
-
-def _distinct(labels: Sequence[str]) -> list[str]:
-    """Makes equal labels differ: the viewer would take them for one state."""
-    return [label if labels.index(label) == i else f"{label} ({i})" for i, label in enumerate(labels)]
 
 
 def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Panel]:

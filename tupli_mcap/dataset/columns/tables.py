@@ -13,7 +13,7 @@ from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.labels import element_names
+from tupli_mcap.spaces.labels import distinct, element_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -153,17 +153,15 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
 
 def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mapping[str, Any]:
     """A column for each element of each leaf; one of objects for images, large arrays, and values of variable size."""
-    columns: dict[str, Any] = {}
+    columns: list[tuple[str, Any]] = []
     for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
         values = leaf.get(column)
-        if isinstance(values, list):
-            columns[leaf.path] = values
-            continue
-        if leaf.apart or leaf.size > _MOST_COLUMNS:
-            columns[leaf.path] = list(values)
+        if isinstance(values, list) or leaf.apart or leaf.size > _MOST_COLUMNS:
+            columns.append((leaf.path, list(values)))
             continue
         flat = values.reshape(len(values), leaf.size)
-        own = element_names(leaf, labels)
-        names = [name if name.startswith(root) else f"{root}.{name}" for name in own]
-        columns |= {name: flat[:, i] for i, name in enumerate(names)}
-    return columns
+        begun = not isinstance(leaf.keys[0], str) if leaf.keys else leaf.path not in labels.dimensions
+        prefix = "" if begun else f"{root}."  # names of other leaves begin with the root
+        columns += [(prefix + name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
+    names = distinct([name for name, _ in columns])
+    return {name: values for name, (_, values) in zip(names, columns, strict=True)}
