@@ -279,3 +279,22 @@ def test_a_table_has_a_column_for_each_dimension(tmp_path: Path) -> None:
     ]  # fmt: skip
     pair = spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1,))])
     assert columns(pair, spaces.Discrete(2), {"state[1]": ["x"]}) == ["state[0]", "state[1]: x", "action"]
+
+
+def test_labels_on_which_recordings_differ_are_not_used(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    same, sources = {"action": ["left", "right"]}, []
+    for name, labels in (("a", ["p", "q"]), ("b", ["q", "p"]), ("c", None)):
+        env = Sampler(spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (2,)))
+        given = same if labels is None else {"state": labels, **same}
+        sources.append(tmp_path / f"{name}.mcap")
+        record(env, sources[-1], labels=given)
+    names = ["action.left", "action.right", "state[0]", "state[1]"]
+    with pytest.warns(UserWarning, match=r"a\.mcap and .*b\.mcap have different labels of state; indexes"):
+        table = tupli_mcap.open(tmp_path).to_pandas()
+    assert sorted(name for name in table if str(name).startswith(("state", "action"))) == names
+    agreeing = tupli_mcap.open(sources[::2]).to_pandas()
+    assert {"state.p", "state.q"} < set(agreeing)
+    with pytest.warns(UserWarning, match="have different labels of state; indexes"):
+        tupli_mcap.merge_recordings(sources, tmp_path / "all.mcap")
+    assert Recording(tmp_path / "all.mcap").labels == Labels({"action": ("left", "right")}, {})

@@ -415,7 +415,7 @@ class Dataset(RandomAccess):
     # ---- out
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
-        """One row per step or per episode, one column per dimension, with its label if the recording has one.
+        """One row per step or per episode, one column per dimension, with its label if the recordings agree on one.
 
         Infos and metadata have a column for each key: `info.x`, `metadata.score`. An image, or an array of more than
         500 numbers, is one column, with an array in each cell. Times are in UTC, with their zone.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.errors import FormatError, SpaceError
+from tupli_mcap.errors import FormatError, SpaceError, warn
 from tupli_mcap.spaces.leaves import Leaf
 
 LABELS_NAME = "labels.json"
@@ -118,6 +118,24 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
                 f"found {len(texts)}"
             )
     return Labels(dimensions, values, known.step_seconds)
+
+
+def common_labels(of: Mapping[str, Labels]) -> Labels:
+    """The labels of recordings, by their names; of a leaf on which two differ none, and a warning says so."""
+    common, differing, where = Labels.none(), list[str](), ""
+    for part in ("dimensions", "values"):
+        parts = {name: getattr(labels, part) for name, labels in of.items()}
+        for path in dict.fromkeys(path for texts in parts.values() for path in texts):
+            said = {texts[path]: name for name, texts in parts.items() if path in texts}
+            if len(said) == 1:
+                getattr(common, part)[path] = next(iter(said))
+            else:
+                differing.append(path)
+                where = where or " and ".join(list(said.values())[:2])
+    if differing:
+        warn(f"{where} have different labels of {', '.join(differing)}; indexes are used instead")
+    seconds = {labels.step_seconds for labels in of.values()} - {None}
+    return common._replace(step_seconds=seconds.pop() if len(seconds) == 1 else None)
 
 
 def _dimensions(leaf: Leaf) -> int | None:

@@ -13,7 +13,7 @@ from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.labels import distinct, element_names
+from tupli_mcap.spaces.labels import common_labels, distinct, element_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -138,9 +138,11 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
     }
     recording = dataset.example
     if recording is not None:
-        columns |= _named(found.states, recording.layout, recording.labels, "state")
-        columns |= _named(found.actions, recording.layout, recording.labels, "action")
-        columns |= _named(found.rewards, recording.layout, recording.labels, "reward")
+        own = {name: dataset._open(name).labels for name in dataset._chosen}
+        labels = common_labels(own or {recording.name: recording.labels})
+        columns |= _named(found.states, recording.layout, labels, "state")
+        columns |= _named(found.actions, recording.layout, labels, "action")
+        columns |= _named(found.rewards, recording.layout, labels, "reward")
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
     columns |= _columns_of("info", found.infos)
     repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}

@@ -32,6 +32,7 @@ from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Tr
 from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, common_labels
 
 _ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 _MOST_TURNS = 100
@@ -90,7 +91,7 @@ def merge_recordings(
     which would not fit. Each step has the infos that were recorded of it. Episodes get new numbers, times stay.
     Recordings that were made at the same time, or that have different numbers of sub-environments, become different
     sub-environments; their episodes are numbered one recording after the other, and their runs tell them apart. The
-    environment and the labels are those of the first recording.
+    environment is that of the first recording; labels on which recordings differ are left out.
 
     Args:
         positions: returns the positions of the episodes to merge; by default of all.
@@ -400,11 +401,15 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
             ):
                 continue
             data = recording.read_attachment(name)
-            if attachments.setdefault(name, (info.media_type, data))[1] != data and name != "labels.json":
+            if attachments.setdefault(name, (info.media_type, data))[1] != data and name != LABELS_NAME:
                 raise UnmergeableError(
                     f"{recording.name}: its attachment {name!r} differs from that of an earlier recording; a merged "
                     "recording can have only one of a name"
                 )
+    labelled = [recording for recording in sources if LABELS_NAME in recording.attachments]
+    if len({recording.read_attachment(LABELS_NAME) for recording in labelled}) > 1:
+        labels = common_labels({recording.name: recording.labels for recording in labelled})
+        attachments[LABELS_NAME] = LABELS_MEDIA_TYPE, labels.to_json()
     return attachments
 
 
