@@ -786,6 +786,17 @@ def test_the_files_of_a_run_are_one_line_and_what_was_made_of_them_is_another(tm
     assert [len(group.rows) for group in twice.groups] == [3, 3]
 
 
+def test_an_episode_in_two_files_of_a_directory_counts_once(tmp_path: Path) -> None:
+    scored(tmp_path / "a.mcap", [2, 3, 4])
+    tupli_mcap.open(tmp_path / "a.mcap").filter("steps > 2").save(tmp_path / "b.mcap")
+    again = "b.mcap holds 2 episodes of .*a.mcap again; they are left out"
+    for source in (tmp_path, [tmp_path]):
+        with pytest.warns(UserWarning, match=again):
+            assert [len(group.rows) for group in report(source).groups] == [3]
+    with pytest.warns(UserWarning, match=again), pytest.raises(RecordingError, match="no episode matches"):
+        report(tmp_path, episode_filter=F("steps") > 9)
+
+
 def test_the_interval_of_a_mean() -> None:
     values = np.random.default_rng(3).normal(7, 2, (400, 2))
     mean, low, high = mean_interval(values)

@@ -42,6 +42,7 @@ __all__ = [
     "chosen_ids",
     "extremes",
     "subjects_of",
+    "subjects_once",
 ]
 
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
@@ -113,6 +114,23 @@ def subjects_of(
             yield from subjects_of(item, episode_filter)
     else:
         raise RecordingError(f"expected a path, Recording, Dataset or storage, found {source!r:.80}")
+
+
+def subjects_once(
+    source: Examinable | Iterable[Examinable], episode_filter: BaseFilter | None
+) -> Iterator[Subject]:
+    """As `subjects_of`, but an episode that is in two files of a directory counts once, and a file in it that cannot be
+    read is left out, both with a warning, as in a dataset."""
+    if isinstance(source, str | os.PathLike):
+        many = _many_at(os.fspath(source))
+        if many is not None:
+            yield from _of_headers(many, many.episodes(episode_filter))
+            return
+    elif not isinstance(source, Recording | Listed) and isinstance(source, Iterable):
+        for item in source:
+            yield from subjects_once(item, episode_filter)
+        return
+    yield from subjects_of(source, episode_filter)
 
 
 def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:

@@ -11,7 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_of
+from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
 from tupli_mcap.dataset.which import named_positions
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.plots import texts
@@ -50,7 +50,8 @@ def report(
 
     Args:
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
-            `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out.
+            `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out, and so, with a
+            warning, are those that another file of the same directory has.
         episode: the episode whose steps are shown: a number, "best", "worst", "first" or "last"; for one recording
             also several, such as "3,7".
         episode_filter: show only episodes that match it.
@@ -67,8 +68,8 @@ def report(
     if x is not None and x not in get_args(X):
         raise RecordingError(f"expected {', '.join(get_args(X))} as x, found {x!r:.80}")
     with styled():  # before anything is read: matplotlib may be missing
-        subjects = list(subjects_of(source, episode_filter))
-        if not subjects:
+        subjects = list(subjects_once(source, episode_filter))
+        if not subjects and episode_filter is None:
             raise RecordingError("expected a recording (.mcap), found none; give a path")
         measured = []
         for subject in subjects:
