@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 import tupli_mcap
 from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
+from tupli_mcap.jsonvalue import loads
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -686,6 +687,25 @@ def test_columns_without_a_common_type_come_to_arrow_as_json(tmp_path: Path) -> 
     steps = dataset.to_arrow().to_pydict()
     assert steps["info.fact"] == ["1", '"x"']
     assert [len(value) for value in steps["info.map"]] == [2**63 % 3 + 1, 1]
+
+
+def test_what_arrow_has_no_type_for_comes_as_json(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    values = {"complex": 1j, "array": np.array([1j, 2]), "text": "a\ud800", "wide": np.longdouble(0.5)}
+    text = gym.spaces.Text(2, charset="a\ud800")
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", text, gym.spaces.Discrete(2)) as writer:
+        for _ in range(2):
+            writer.begin(metadata=values)
+            writer.step("a\ud800", 0, 1.0, True, info=values)
+    dataset = tupli_mcap.open(tmp_path)
+    assert (
+        dataset.to_pandas()["info.text"].tolist() == dataset.to_pandas()["state"].tolist() == ["a\ud800"] * 2
+    )
+    for table in (dataset.to_arrow().to_pydict(), dataset.to_arrow("episodes").to_pydict()):
+        own = {name.rpartition(".")[2]: column for name, column in table.items() if column[0] == column[1]}
+        assert [loads(value) for value in own["complex"]] == [1j, 1j]
+        assert loads(own["array"][0]).tolist() == [1j, 2] and loads(own["text"][1]) == "a\ud800"
+        assert float(own["wide"][0]) == 0.5
 
 
 def test_an_empty_leaf_has_statistics(tmp_path: Path) -> None:

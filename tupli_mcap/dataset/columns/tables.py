@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -48,7 +49,10 @@ def arrow(dataset: Dataset, level: Level) -> pa.Table:
         raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
     typed = {}
     for name in frame.columns:
-        if frame[name].dtype == object:
+        dtype = frame[name].dtype
+        if (
+            dtype.kind in "Oc" or dtype.itemsize > 8
+        ):  # Arrow has no complex numbers, and floats of 8 bytes at most
             typed[name] = _arrow_column(list(frame[name]), pyarrow)
             frame[name] = None
     table = pyarrow.Table.from_pandas(frame, preserve_index=False)
@@ -63,13 +67,18 @@ def _arrow_column(values: Sequence[Any], pyarrow: Any) -> Any:
     kinds = {(value.dtype, value.ndim) for value in arrays}
     if len(arrays) == len(values) and len(kinds) == 1:
         ((dtype, ndim),) = kinds
-        kind = pyarrow.from_numpy_dtype(dtype)
-        for _ in range(ndim):
-            kind = pyarrow.list_(kind)
+        with contextlib.suppress(pyarrow.ArrowNotImplementedError):  # complex numbers
+            kind = pyarrow.from_numpy_dtype(dtype)
+            for _ in range(ndim):
+                kind = pyarrow.list_(kind)
     listed = [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
     try:
         return pyarrow.array(listed, kind, from_pandas=True)
-    except (pyarrow.ArrowException, OverflowError):  # numbers beside texts, or too large ones
+    except (
+        pyarrow.ArrowException,
+        OverflowError,
+        UnicodeEncodeError,
+    ):  # mixed, too large, with a lone surrogate
         return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
 
@@ -122,8 +131,17 @@ def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     for key in keys:
         values = [item.get(key) for item in items]
         some_whole = {type(value) for value in values} == {int, type(None)}
-        columns[f"{root}.{key}"] = _whole_numbers(values) if some_whole else values
+        columns[f"{root}.{key}"] = _whole_numbers(values) if some_whole else _texts(values)
     return columns
+
+
+def _texts(values: Sequence[Any]) -> Any:
+    """Values, some of which may be texts: as objects if one has a lone surrogate, since pandas keeps texts as UTF-8."""
+    try:
+        "".join(value for value in values if isinstance(value, str)).encode()
+    except UnicodeEncodeError:
+        return import_pandas().Series(values, dtype=object)
+    return values
 
 
 def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
@@ -159,7 +177,7 @@ def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mappin
     for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
         values = leaf.get(column)
         if isinstance(values, list) or leaf.apart or leaf.size > _MOST_COLUMNS:
-            columns.append((leaf.path, list(values)))
+            columns.append((leaf.path, _texts(list(values))))
             continue
         flat = values.reshape(len(values), leaf.size)
         begun = not isinstance(leaf.keys[0], str) if leaf.keys else leaf.path not in labels.dimensions
