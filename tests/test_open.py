@@ -224,6 +224,24 @@ def test_keys(dataset: Dataset) -> None:
     assert not {"episode_return", "n_tuples", "created_at"} & set(keys)
 
 
+def test_keys_can_be_written_in_filters(tmp_path: Path) -> None:
+    odd = ["a b.c", "x y", "ä-1", '"', ""]
+    with tupli_mcap.RecordEpisodes(
+        gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata=dict.fromkeys(odd, 1)
+    ) as env:
+        env.reset()
+        env.step(0)
+    dataset = tupli_mcap.open(tmp_path)
+    keys = [key for key in dataset.keys if "metadata" in key]
+    assert {'run.metadata."a b.c"', 'run.metadata."x y"', "run.metadata.ä-1"} < set(keys)
+    for key in keys:
+        assert len(dataset.filter(f"{key} = 1")) == len(dataset.sort(key)) == len(dataset.split(1, by=key)[0])
+    with pytest.raises(FilterError, match=r"did you mean 'run\.metadata\.\"a b\.c\"'\?"):
+        dataset.sort('metadata."a b.c"')
+    with pytest.raises(FilterError, match=r"did you mean '\"a b\.c\"'\?"):
+        dataset.sort("run.metadata.a b.c")
+
+
 def test_sort_keeps_equal_ones_in_order(dataset: Dataset) -> None:
     for descending in (False, True):
         found = dataset.sort("metadata.side", descending=descending)

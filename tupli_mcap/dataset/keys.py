@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from tupli_mcap.errors import FilterError, did_you_mean
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, format_key
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
@@ -16,11 +16,11 @@ __all__ = ["check_metadata", "keys_of", "values_at"]
 
 def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
     """The keys of facts about episodes, and of the metadata of any of them."""
-    own = {"metadata." + key for header in headers for key in header.metadata}
     runs = {id(header.run): header.run for header in headers}.values()
-    own |= {"run." + key for run in runs for key in run if key != "metadata"}
-    own |= {"run.metadata." + key for run in runs for key in run.get("metadata", {})}
-    return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | own)
+    own: set[tuple[str, ...]] = {("metadata", key) for header in headers for key in header.metadata}
+    own |= {("run", key) for run in runs for key in run if key != "metadata"}
+    own |= {("run", "metadata", key) for run in runs for key in run.get("metadata", {})}
+    return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | set(map(format_key, own)))
 
 
 def values_at(key: str, headers: Sequence[EpisodeHeader]) -> list[Any]:
@@ -50,9 +50,10 @@ def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
         path = path_in(comparison.key or "", EpisodeHeader)
         for there, keys in known.items():
             if path[:-1][: len(there)] == there and (name := path[len(there)]) not in keys:
-                elsewhere = [".".join((*place, name)) for place, others in known.items() if name in others]
-                meant = f" (did you mean {elsewhere[0]!r}?)" if elsewhere else did_you_mean(name, keys)
+                elsewhere = [format_key((*place, name)) for place, others in known.items() if name in others]
+                written = sorted(format_key([key]) for key in keys)
+                meant = f" (did you mean {elsewhere[0]!r}?)" if elsewhere else did_you_mean(name, written)
                 raise FilterError(
                     f"no episode has {comparison.key}{meant}; "
-                    f"{'.'.join(there)} has {', '.join(sorted(keys)) or 'no keys'}"
+                    f"{'.'.join(there)} has {', '.join(written) or 'no keys'}"
                 )

@@ -39,7 +39,7 @@ from tupli_mcap.schema.models import (
     EpisodeMetadataCallback,
     RLTuple,
 )
-from tupli_mcap.schema.parse import format_filter, parse_filter
+from tupli_mcap.schema.parse import format_filter, format_key, parse_filter
 from tupli_mcap.schema.people import (
     RIGHT,
     ApiToken,
@@ -98,6 +98,7 @@ __all__ = [
     "evaluate_columns",
     "filter_keys",
     "format_filter",
+    "format_key",
     "join_key",
     "parse_bound",
     "parse_filter",

@@ -265,13 +265,17 @@ def _format(filter: BaseFilter, outer: bool) -> str:
 
 
 def _format_key(filter: BaseFilter) -> str:
-    first, *rest = path_of(filter)
+    first, *rest = path = path_of(filter)
     if not _PLAIN_KEY.fullmatch(first) or (first.lower() in _RESERVED and not rest):
         raise FilterError(f"filter key {filter.key!r} has no text: it does not start with a word")
-    segments = (
-        part if _PLAIN_SEGMENT.fullmatch(part) else json.dumps(part, ensure_ascii=False) for part in rest
+    return format_key(path)
+
+
+def format_key(path: Sequence[str]) -> str:
+    """A key as texts of filters have it: `join_key` that also quotes names with spaces and signs."""
+    return ".".join(
+        part if _PLAIN_SEGMENT.fullmatch(part) else json.dumps(part, ensure_ascii=False) for part in path
     )
-    return ".".join((first, *segments))
 
 
 def _format_value(value: Any) -> str:
