@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from environments import Scripted
 from gymnasium.envs.classic_control import CartPoleEnv
 from mcap.writer import Writer
 from typer.core import TyperGroup
@@ -706,7 +707,15 @@ class TestLook:
     )
     def test_spaces_are_written_to_be_read(self, space: gym.Space[Any], said: list[str]) -> None:
         leaves = flatten_space(space, "state", NameRegistry())
-        assert space_lines(leaves, Labels.none()) == said
+        assert space_lines(leaves, Labels.none(), {leaf.name: leaf.dtype for leaf in leaves}) == said
+
+    def test_info_says_which_dtype_is_stored(self, here: Path) -> None:
+        space = gym.spaces.Dict(q=gym.spaces.Box(-np.inf, np.inf, (7,), np.float32))
+        env = Scripted(lambda step: {"q": np.full(7, 0.1)}, space)
+        with pytest.warns(UserWarning, match="float64"), RecordEpisodes(env, "r.mcap") as recorder:
+            recorder.reset()
+            recorder.step(0)
+        assert "observation  q: 7 numbers (float64, declared float32)\n" in ok("info", "r.mcap")
 
     def test_info_of_texts_counts_their_characters(self, here: Path) -> None:
         space = gym.spaces.Dict({"say": gym.spaces.Text(20), "bit": gym.spaces.Text(1, charset="01")})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue, signing
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.journal.file import recorded_journal
 from tupli_mcap.mcap.lock import is_locked
@@ -160,8 +160,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         returns=spread_of(rows["return"]),
         observation_space=describe_space(recording.observation_space) if recording.num_envs else None,
         action_space=describe_space(recording.action_space) if recording.num_envs else None,
-        observation=space_lines(layout.state, recording.labels) if layout else [],
-        action=space_lines(layout.action, recording.labels) if layout else [],
+        observation=space_lines(layout.state, recording.labels, layout.dtypes) if layout else [],
+        action=space_lines(layout.action, recording.labels, layout.dtypes) if layout else [],
         compression=int(chunks["uncompressed"].sum()) / stored if stored else None,
         channels=_channels(contents),
         attachments=[info._asdict() for info in recording.attachments.values()],
@@ -239,15 +239,18 @@ def describe_space(space: gym.Space[Any]) -> str:
     return " ".join(str(space).split())
 
 
-def space_lines(leaves: Sequence[Leaf], labels: Labels) -> list[str]:
+def space_lines(leaves: Sequence[Leaf], labels: Labels, stored: Mapping[str, DType]) -> list[str]:
     """A space in lines: one for each leaf, and below it one for each dimension if their bounds differ.
 
     For example `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`.
+
+    Args:
+        stored: dtypes of leaves by their names, which may differ from the declared ones.
     """
-    return [line for leaf in leaves for line in _leaf_lines(leaf, labels)]
+    return [line for leaf in leaves for line in _leaf_lines(leaf, labels, stored.get(leaf.name))]
 
 
-def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
+def _leaf_lines(leaf: Leaf, labels: Labels, stored: DType | None) -> list[str]:
     name = f"{short_path(leaf)}: " if leaf.keys else ""
     if leaf.kind == "variable":
         return [name + describe_space(leaf.space)]
@@ -258,7 +261,8 @@ def _leaf_lines(leaf: Leaf, labels: Labels) -> list[str]:
     sizes = " x ".join(map(str, leaf.shape)) or "1"
     what = f"{name}{sizes} number{'' if sizes == '1' else 's'}"
     whole = isinstance(leaf.space, gym.spaces.MultiDiscrete | gym.spaces.MultiBinary)
-    kind = "" if whole else f" ({leaf.dtype})"
+    dtype = leaf.dtype if stored == leaf.dtype else f"{stored}, declared {leaf.dtype}"
+    kind = "" if whole else f" ({dtype})"
     if not leaf.size:
         return [what + kind]
     alike = bool((low == low[0]).all() and (high == high[0]).all())
