@@ -786,6 +786,23 @@ def test_the_files_of_a_run_are_one_line_and_what_was_made_of_them_is_another(tm
     assert [len(group.rows) for group in twice.groups] == [3, 3]
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 9])
+def test_the_legend_is_beside_the_title(count: int, tmp_path: Path) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    for i in range(count):
+        scored(tmp_path / f"{'ABCDEFGHI'[i]}-method-with-a-long-name.mcap", [20, 30, 40])
+    made = report(tmp_path)
+    canvas = FigureCanvasAgg(made.figure)
+    canvas.draw()
+    legends = [axes for axes in made.figure.axes if axes.get_legend() and axes.get_title(loc="left")]
+    checked = [axes for axes in legends if axes.get_title(loc="left") in ("return", "length (steps)")]
+    assert len(checked) == 2
+    for axes in checked:
+        title = axes._left_title.get_window_extent()
+        assert axes.get_legend().get_window_extent(canvas.get_renderer()).x0 > title.x1
+
+
 def test_an_episode_in_two_files_of_a_directory_counts_once(tmp_path: Path) -> None:
     scored(tmp_path / "a.mcap", [2, 3, 4])
     tupli_mcap.open(tmp_path / "a.mcap").filter("steps > 2").save(tmp_path / "b.mcap")

@@ -20,6 +20,7 @@ COLUMNS = 4  # of small cells
 LEFT, RIGHT, TOP, BOTTOM = 0.62, 0.18, 0.26, 0.42  # inches around the axes of a cell
 _WIDTH, _EDGE, _HEADING, _LINE = 10.0, 0.25, 0.36, 0.175  # inches
 _TEXT_COLUMNS = 150
+_LEGEND = 74  # characters that fit beside the title of a wide panel
 _RC: dict[str, Any] = {
     "figure.dpi": 110, "font.size": 8.5, "lines.linewidth": 1.3, "patch.linewidth": 0,
     "axes.titlesize": 9, "axes.titlelocation": "left", "axes.titlepad": 4, "axes.labelsize": 8.5,
@@ -88,10 +89,16 @@ def colours(count: int) -> list[str]:
 
 
 def legend_above(axes: Any) -> None:
-    """The legend in one line above the axes, right of the title; of many entries, the first and the last."""
+    """The legend in one line above the axes, right of the title; of many entries, the first and the last.
+
+    Names that would not fit beside the title are cut: the head has them whole.
+    """
     handles, names = axes.get_legend_handles_labels()
     if len(handles) > len(SERIES):
         handles, names = [handles[0], handles[-1]], [names[0], f"… {names[-1]} ({len(names)})"]
+    longest = _LEGEND // max(1, len(names)) - 5  # the mark of a name takes as much room as 5 characters
+    if sum(map(len, names)) > longest * len(names):
+        names = [cut(name, longest) for name in names]
     if handles:
         axes.legend(
             handles, names, loc="lower right", bbox_to_anchor=(1.01, 0.985), ncols=len(handles), borderaxespad=0.0,
