@@ -624,6 +624,15 @@ def test_a_live_recording_is_refused(tmp_path: Path) -> None:
             recover_recording(path)
 
 
+def test_a_directory_is_not_recovered(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is a directory; give one file"):
+        recover_recording(tmp_path)
+    result = CliRunner().invoke(app, ["recover", str(tmp_path)])
+    loop = f'for file in {tmp_path}/*.mcap; do tupli-mcap recover --in-place "$file"; done'
+    found = f"{tmp_path} is a directory; give one recording (.mcap), or finish each with: {loop}"
+    assert (result.exit_code, " ".join(result.stderr.split())) == (1, f"error: {found}")
+
+
 @pytest.mark.parametrize("content", [b"", b"nonsense" * 100, b"\x89MCAP0\r\n", bytes(5000)])
 def test_nothing_to_save(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -340,6 +341,11 @@ def recover(
 
     if in_place and (output is not None or force):
         raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")
+    if file.is_dir():
+        each = f'for file in {shlex.quote(str(file))}/*.mcap; do tupli-mcap recover --in-place "$file"; done'
+        raise RecordingError(
+            f"{file} is a directory; give one recording (.mcap), or finish each with: {each}"
+        )
     if in_place:
         report = finish_recording(file, dry_run=dry_run)
     else:

@@ -288,5 +288,7 @@ def is_locked(path: Path) -> bool:
             drop_private(file)
     except (FileNotFoundError, PermissionError):
         return False
+    except IsADirectoryError as err:
+        raise RecordingError(f"{path} is a directory; give one file, a recording (.mcap)") from err
     except OSError as err:
         raise RecordingError(f"{path}: cannot tell whether it is being recorded: {os_reason(err)}") from err
