@@ -50,9 +50,7 @@ def arrow(dataset: Dataset, level: Level) -> pa.Table:
     typed = {}
     for name in frame.columns:
         dtype = frame[name].dtype
-        if (
-            dtype.kind in "Oc" or dtype.itemsize > 8
-        ):  # Arrow has no complex numbers, and floats of 8 bytes at most
+        if dtype.kind in "Oc" or dtype.itemsize > 8:  # Arrow has no complex numbers, and no longer floats
             typed[name] = _arrow_column(list(frame[name]), pyarrow)
             frame[name] = None
     table = pyarrow.Table.from_pandas(frame, preserve_index=False)
@@ -74,11 +72,7 @@ def _arrow_column(values: Sequence[Any], pyarrow: Any) -> Any:
     listed = [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
     try:
         return pyarrow.array(listed, kind, from_pandas=True)
-    except (
-        pyarrow.ArrowException,
-        OverflowError,
-        UnicodeEncodeError,
-    ):  # mixed, too large, with a lone surrogate
+    except (pyarrow.ArrowException, OverflowError, UnicodeEncodeError):  # numbers beside texts, say
         return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
 
