@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -251,6 +252,36 @@ def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: User
     users.ann.add_group_members(members("robots", "bob", "member"))
     users.ann.unpublish_episodes(F("steps") > 0, "robots")
     assert users.bob.list_episodes() == []
+
+
+def test_groups_that_one_may_not_see_are_not_named(users: Users, things: Things) -> None:
+    users.ann.create_group(Group(name="spies"))
+    for group in ("global", "spies", "bob"):
+        users.ann.publish_benchmark(things.benchmark, group)
+        users.ann.publish_artifact(things.artifact, group)
+        users.ann.publish_episode(things.episodes[0].id, group)
+
+    def told(user: TupliAPIClient) -> list[list[str]]:
+        artifact = {"artifact_id": things.artifact}
+        pytupli = httpx.post(f"{user.url}/episodes/list", json={}, headers=token_of(user), timeout=120)
+        sent = httpx.get(
+            f"{user.url}/artifacts/download", params=artifact, headers=token_of(user), timeout=120
+        )
+        seen = [
+            *user.list_benchmarks(), user.load_benchmark(things.benchmark), *user.list_artifacts(),
+            *user.list_episodes(F("id") == things.episodes[0].id),
+        ]  # fmt: skip
+        groups = [item.published_in for item in seen]
+        groups += [item["published_in"] for item in pytupli.json() if item["id"] == things.episodes[0].id]
+        return [*groups, json.loads(sent.headers["X-Metadata"])["published_in"]]
+
+    assert told(users.ann) == told(users.admin) == 6 * [["ann", "global", "spies", "bob"]]
+    assert told(users.eve) == 6 * [["ann", "global", "bob"]]
+    for user, shown in ((users.eve, False), (users.ann, True)):
+        (ann,) = [each for each in user.list_users() if each.username == "ann"]
+        assert ("spies" in [held.group for held in ann.memberships]) == shown
+    users.ann.delete_group("spies")
+    assert told(users.ann) == told(users.eve) == 6 * [["ann", "global", "bob"]]
 
 
 def test_nothing_is_published_in_a_group_that_is_not_there_or_not_known(users: Users, things: Things) -> None:

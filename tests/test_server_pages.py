@@ -331,7 +331,16 @@ class TestPeople:
             assert len(episodes_of(bob)) == 2
             assert ann.post("/group/members/delete", data=told).status_code == 303
             assert episodes_of(bob) == []
+            shared = {"code": own, "dataset": "-", "group": "global"}
+            ann.post("/share", data=shared)
+            ids = [each["id"] for each in episodes_of(bob)]
+            both = f"/compare?episode={ids[0]}&episode={ids[1]}&"
+            for address in ("/users?", "/share?dataset=-&", f"/episode/{ids[0]}?", both, "/episodes?"):
+                shown = bob.get(f"{address}format=json")  # not the group, which bob is not in
+                assert (shown.status_code, "legs" in shown.text, "global" in shown.text) == (200, False, True)
+            ann.post("/share", data={**shared, "published": "false"})
             assert ann.post("/group/delete", data=told).status_code == 303
+            assert "legs" not in ann.get("/share?dataset=-").text
 
     def test_users(self, server: str) -> None:
         with browser(server, "ann") as ann, browser(server, "admin", PASSWORD) as admin:

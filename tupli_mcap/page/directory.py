@@ -14,7 +14,7 @@ from sqlalchemy import ColumnElement, Connection, true
 
 from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.entries import entry_of, put_entry
@@ -88,6 +88,9 @@ class _OpenToAll:
 
     def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
         return true()
+
+    def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
+        return list(headers)
 
 
 class DirectoryShelf(_OpenToAll):

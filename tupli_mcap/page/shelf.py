@@ -53,6 +53,10 @@ class Shelf(Protocol):
         """The condition on EPISODE for the episodes that the reader may see."""
         ...
 
+    def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
+        """The same headers, but published only in groups of which the reader may know."""
+        ...
+
     def open(self, recording: str, *, of: int = 1) -> Recording:
         """An open recording of the catalog. Others use it at the same time: do not close it.
 
@@ -111,7 +115,7 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
     missing = [uri for uri in uris if uri not in known]
     if missing:
         raise NotFoundError(f"there is no episode {missing[0][:80]!r} here")
-    return found
+    return shelf.as_told(connection, found)
 
 
 def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:

@@ -154,7 +154,7 @@ def table_of(
         )
     except FilterError as err:
         return Table((), str(err), err.position)
-    more, rows = len(found) > _ROWS, found[:_ROWS]
+    more, rows = len(found) > _ROWS, shelf.as_told(connection, found[:_ROWS])
     if before:
         rows.reverse()
     count = len(rows)

@@ -49,7 +49,7 @@ def delete_user(request: Request, visit: Code, username: _Text = "") -> Response
 def _users(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
     visit.caller.demand(Right.USER_READ)
     with visit.library.database.reading() as connection:
-        users = accounts.list_users(connection)
+        users = accounts.list_users(connection, visit.caller)
     may = {"create": visit.caller.may(Right.USER_CREATE), "delete": visit.caller.may(Right.USER_DELETE)}
     return form_page(request, visit, "users.html", {"users": users}, wrong=wrong, status=status, may=may)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections import Counter
 from functools import partial
 from typing import Annotated, Any
 
@@ -17,7 +18,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, parse_bound
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import DeniedError, Right, readable
+from tupli_mcap.server.people.access import DeniedError, Right, known_audiences, readable
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.storage.benchmark_json import unpack
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
@@ -119,9 +120,13 @@ def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str,
         .where(of_dataset(key), seen)
         .group_by(TALLY.c.created_by, TALLY.c.published_in)
     )
+    known, counts = known_audiences(connection, visit.caller), Counter[tuple[str, tuple[str, ...]]]()
+    for name, groups, count in connection.execute(query):
+        owner = unescape_text(name)
+        counts[owner, tuple(known(owner, json.loads(groups)))] += int(count)
     return [
-        {"owner": unescape_text(owner), "published_in": json.loads(groups), "episodes": int(count)}
-        for owner, groups, count in connection.execute(query)
+        {"owner": owner, "published_in": list(groups), "episodes": count}
+        for (owner, groups), count in counts.items()
     ]
 
 

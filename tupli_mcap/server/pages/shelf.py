@@ -15,9 +15,9 @@ from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.page.shelf import seen_episodes
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people.access import Caller, Right, readable, readable_episodes
+from tupli_mcap.server.people.access import Caller, Right, as_told, readable, readable_episodes
 from tupli_mcap.server.stored.selection import Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
@@ -60,6 +60,9 @@ class LibraryShelf:
 
     def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
         return readable_episodes(connection, self._caller)
+
+    def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
+        return as_told(connection, self._caller, headers)
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
         """The recording; if the caller may read only some of its episodes, a recording of these."""

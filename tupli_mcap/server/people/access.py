@@ -7,14 +7,14 @@ name. An item can be read by its owner, and by users with the right to read in a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
 from sqlalchemy import Connection, FromClause, and_, not_, or_, select
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
-from tupli_mcap.schema import Right
+from tupli_mcap.schema import DBItem, Right
 from tupli_mcap.server.tables import AUDIENCE, FILE, GROUP, USER
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, first_of
 from tupli_mcap.storage.texts import escape_text
@@ -26,12 +26,15 @@ __all__ = [
     "Caller",
     "DeniedError",
     "Right",
+    "as_told",
     "demand_audience",
+    "known_audiences",
     "left_alone",
     "readable",
     "readable_episodes",
 ]
 
+_Item = TypeVar("_Item", bound=DBItem)
 GLOBAL: Final = "global"
 """The group of all signed-in users."""
 GUEST: Final = "$$GUEST$$"
@@ -146,6 +149,35 @@ def readable_episodes(connection: Connection, caller: Caller) -> ColumnElement[b
 
 def _seen(caller: Caller, rows: FromClause) -> ColumnElement[bool]:
     return readable(caller, Right.EPISODE_READ, rows.c.created_by, rows.c.published_in)
+
+
+def known_audiences(connection: Connection, caller: Caller) -> Callable[[str, Sequence[str]], list[str]]:
+    """A function of an item's owner and groups: those of the groups that the caller may know of. Every list of groups
+    that is sent goes through it.
+
+    Nobody is told of groups that are gone. The owner knows the others; everybody else, their own and `global`, and with
+    the right to read groups or users in `global`, the names of these.
+    """
+    groups = set(connection.execute(select(GROUP.c.name)).scalars())
+    users = set(connection.execute(select(USER.c.name)).scalars())
+    there = {GLOBAL, *groups, *users}
+    known = there & {GLOBAL, *caller.rights}
+    known |= groups if caller.may(Right.GROUP_READ) else set()
+    known |= users if caller.may(Right.USER_READ) else set()
+
+    def shown(owner: str, names: Sequence[str]) -> list[str]:
+        seen = there if owner == caller.name else known
+        return [name for name in names if name in seen or name == owner]
+
+    return shown
+
+
+def as_told(connection: Connection, caller: Caller, items: Sequence[_Item]) -> list[_Item]:
+    """The same items, but published only in groups of which the caller may know."""
+    known = known_audiences(connection, caller)
+    return [
+        item.model_copy(update={"published_in": known(item.created_by, item.published_in)}) for item in items
+    ]
 
 
 def demand_audience(connection: Connection, caller: Caller, right: Right, group: str) -> None:

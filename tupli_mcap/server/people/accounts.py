@@ -135,10 +135,16 @@ def demand_over(connection: Connection, caller: Caller, name: str) -> None:
             caller.demand(right)
 
 
-def list_users(connection: Connection) -> dict[str, dict[str, list[str]]]:
-    """All users, oldest first, each with the roles by group, as from `memberships_of`."""
+def list_users(connection: Connection, caller: Caller) -> dict[str, dict[str, list[str]]]:
+    """All users, oldest first, each with the roles by group, as from `memberships_of`, in the groups that the caller
+    may see."""
     names = connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars()
-    return _with_memberships(connection, list(names), select(*_MEMBERSHIPS))
+    found = _with_memberships(connection, list(names), select(*_MEMBERSHIPS))
+    seen = {GLOBAL, *(group["name"] for group in list_groups(connection, caller))}
+    return {
+        name: {group: roles for group, roles in held.items() if group in seen or group == name}
+        for name, held in found.items()
+    }
 
 
 def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:

@@ -142,7 +142,7 @@ def list_users(library: Served, caller: Reader) -> list[User]:
     """All users."""
     caller.demand(Right.USER_READ)
     with library.database.reading() as connection:
-        users = accounts.list_users(connection)
+        users = accounts.list_users(connection, caller)
     return [User(username=name, memberships=held) for name, held in users.items()]
 
 

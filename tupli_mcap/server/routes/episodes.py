@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ
 from tupli_mcap.server.database import audit, demand_few
-from tupli_mcap.server.people.access import Right
+from tupli_mcap.server.people.access import Right, as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
@@ -51,11 +51,10 @@ def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body
     most = library.settings.max_page
     size = most if told.limit is None else min(told.limit, most)
     with library.database.reading() as connection:
-        found = list(
-            episodes.find_episodes(
-                connection, caller, told.filter, limit=size, offset=told.offset, after=_after(told.cursor)
-            )
+        page = episodes.find_episodes(
+            connection, caller, told.filter, limit=size, offset=told.offset, after=_after(told.cursor)
         )
+        found = as_told(connection, caller, list(page))
     full = len(found) == size and size > 0
     return listed(found, _cursor(found[-1].recording, found[-1].episode) if full else None)
 

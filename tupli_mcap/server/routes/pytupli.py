@@ -34,7 +34,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import Caller, DeniedError, Right
+from tupli_mcap.server.people.access import Caller, DeniedError, Right, as_told
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.throttle import Turns
 from tupli_mcap.server.routes.accounts import Credentials
@@ -104,7 +104,7 @@ def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
     """All users."""
     caller.demand(Right.USER_READ)
     with library.database.reading() as connection:
-        users = accounts.list_users(connection)
+        users = accounts.list_users(connection, caller)
     return [_user(name, held) for name, held in users.items()]
 
 
@@ -358,7 +358,8 @@ def _pages(library: Library, caller: Caller, wanted: BaseFilter | None) -> Itera
     most, after = library.settings.max_page, None
     while True:
         with library.database.reading() as connection:
-            page = list(episodes.find_episodes(connection, caller, wanted, limit=most, after=after))
+            found = episodes.find_episodes(connection, caller, wanted, limit=most, after=after)
+            page = as_told(connection, caller, list(found))
         yield page
         if len(page) < most:
             return

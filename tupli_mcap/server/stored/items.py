@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 from sqlalchemy import Connection, Row, Select, delete, insert, select, update
 
@@ -26,7 +26,15 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people import quotas
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, demand_audience, left_alone, readable
+from tupli_mcap.server.people.access import (
+    Caller,
+    DeniedError,
+    Right,
+    as_told,
+    demand_audience,
+    left_alone,
+    readable,
+)
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import oldest_first, published_in
@@ -37,6 +45,7 @@ from tupli_mcap.storage.texts import is_hash
 __all__ = ["Items", "Kind", "artifact_key"]
 
 Kind = Literal["benchmark", "artifact"]
+_Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
 _CREATE: Final = {"benchmark": Right.BENCHMARK_CREATE, "artifact": Right.ARTIFACT_CREATE}
 _READ: Final = {"benchmark": Right.BENCHMARK_READ, "artifact": Right.ARTIFACT_READ}
 _DELETE: Final = {"benchmark": Right.BENCHMARK_DELETE, "artifact": Right.ARTIFACT_DELETE}
@@ -73,20 +82,21 @@ class Items:
                 connection, caller, "benchmark", header, content=query.serialized, needs=needs, size=size
             )
             audit(connection, caller.name, "store_benchmark", uri)
-        return _benchmark(own)
+        return _told(connection, caller, BenchmarkHeader, own)[0]
 
     def load_benchmark(self, connection: Connection, caller: Caller, uri: str) -> Benchmark:
         """As `TupliStorage.load_benchmark`; NotFoundError also if the caller may not read it."""
         row = self._find(connection, caller, "benchmark", uri)
         content = connection.execute(select(ITEM.c.content).where(ITEM.c.number == row.number)).scalar_one()
-        return Benchmark(**dict(_benchmark(row)), serialized=content or "")
+        header = _told(connection, caller, BenchmarkHeader, row)[0]
+        return Benchmark(**dict(header), serialized=content or "")
 
     def list_benchmarks(
         self, connection: Connection, caller: Caller, filter: BaseFilter | None
     ) -> list[BenchmarkHeader]:
         """The readable benchmarks that match a filter, oldest first."""
         matches = compile_predicate(filter, BenchmarkHeader)
-        found = [_benchmark(row) for row in self._readable(connection, caller, "benchmark")]
+        found = _told(connection, caller, BenchmarkHeader, *self._readable(connection, caller, "benchmark"))
         return oldest_first(header for header in found if matches(header))
 
     def delete_benchmark(self, connection: Connection, caller: Caller, uri: str) -> None:
@@ -106,7 +116,7 @@ class Items:
             item = ArtifactMetadataItem.create_new(**dict(metadata), id=uri, hash=uri, created_by=caller.name)
             own = self._add(connection, caller, "artifact", item, size=len(data))
             audit(connection, caller.name, "store_artifact", uri)
-        return _artifact(own)
+        return _told(connection, caller, ArtifactMetadataItem, own)[0]
 
     def has_artifact(self, connection: Connection, caller: Caller, data: bytes) -> bool:
         """Whether a caller, who may store artifacts, has stored these bytes already."""
@@ -115,14 +125,16 @@ class Items:
 
     def load_artifact(self, connection: Connection, caller: Caller, uri: str) -> ArtifactMetadataItem:
         """The metadata of a readable artifact; its bytes are kept under `artifact_key`."""
-        return _artifact(self._find(connection, caller, "artifact", uri))
+        found = self._find(connection, caller, "artifact", uri)
+        return _told(connection, caller, ArtifactMetadataItem, found)[0]
 
     def list_artifacts(
         self, connection: Connection, caller: Caller, filter: BaseFilter | None
     ) -> list[ArtifactMetadataItem]:
         """The readable artifacts that match a filter, oldest first."""
         matches = compile_predicate(filter, ArtifactMetadataItem)
-        found = [_artifact(row) for row in self._readable(connection, caller, "artifact")]
+        rows = self._readable(connection, caller, "artifact")
+        found = _told(connection, caller, ArtifactMetadataItem, *rows)
         return oldest_first(item for item in found if matches(item))
 
     def artifact_users(self, connection: Connection, caller: Caller, uri: str) -> list[str]:
@@ -285,14 +297,10 @@ def artifact_key(uri: str) -> str:
     return f"artifacts/{uri}"
 
 
-def _benchmark(row: Row[Any]) -> BenchmarkHeader:
-    return BenchmarkHeader.model_validate(_header(row))
-
-
-def _artifact(row: Row[Any]) -> ArtifactMetadataItem:
-    return ArtifactMetadataItem.model_validate(_header(row))
-
-
-def _header(row: Row[Any]) -> dict[str, Any]:
-    told: dict[str, Any] = jsonvalue.loads(row.header)
-    return {**told, "published_in": json.loads(row.published_in)}
+def _told(connection: Connection, caller: Caller, model: type[_Item], *rows: Row[Any]) -> list[_Item]:
+    """Items as the caller is told of them."""
+    found = [
+        model.model_validate({**jsonvalue.loads(row.header), "published_in": json.loads(row.published_in)})
+        for row in rows
+    ]
+    return as_told(connection, caller, found)
