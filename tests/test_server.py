@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 from serving import PASSWORD, serving
 from test_storage import episode, query
+from typer.testing import CliRunner
 
+from tupli_mcap.cli.app import app
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
@@ -33,6 +35,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
+from tupli_mcap.storage.api.answers import SignInError
 
 FOR_ALL = {
     ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
@@ -514,4 +517,27 @@ def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch
                 assert len(recording) == 1
             with pytest.raises(StorageError, match="guests may change nothing .* sign in"):
                 guest.store_artifact(b"x", ArtifactMetadata(name="x"))
+        admin.close()
+
+
+def test_a_sign_in_that_has_ended_makes_no_guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with serving(Settings(tmp_path / "served", guests=True)) as url:
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "guest"))
+        said = CliRunner().invoke(app, ["whoami", "--url", url]).stdout
+        assert "nobody is signed in" in said and "GUEST" not in said
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "there"))
+        with TupliAPIClient(url) as there:
+            there.login("admin", PASSWORD)
+            there.change_password("admin", "another password", old=PASSWORD)
+        with pytest.raises(StorageError, match="sign in"):
+            admin.list_benchmarks()
+        for _ in range(2):  # not with what guests see
+            with pytest.raises(SignInError, match="sign-in of admin at .* has ended; sign in again"):
+                admin.list_benchmarks()
+        assert admin.username == "admin"
+        admin.logout()
+        assert (admin.username, admin.list_benchmarks()) == ("", [])
+        admin.login("admin", "another password")
+        assert admin.list_benchmarks() == []
         admin.close()

@@ -40,12 +40,13 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
     with server_at(url) as client:
         me = client.whoami()
         memberships = {membership.group: membership.roles for membership in me.memberships}
-        found: dict[str, Any] = {"url": client.url, "username": me.username, "memberships": memberships}
+        name = me.username if client.username else ""  # a guest has a name that nobody has given
+        found: dict[str, Any] = {"url": client.url, "username": name, "memberships": memberships}
     if as_json:
         print_json(found)
         return
     roles = [(group, ", ".join(held)) for group, held in memberships.items()]
-    print_facts([("server", found["url"]), ("user", found["username"]), *roles])
+    print_facts([("server", found["url"]), ("user", name or "nobody is signed in"), *roles])
 
 
 def signup(username: Username, url: Url = None, as_json: Json = False) -> None:

@@ -16,7 +16,15 @@ from urllib.parse import urlsplit
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
 from tupli_mcap.remote import AUTHORITY, shown
-from tupli_mcap.storage.api.answers import LATER, Page, TokenPair, UnreachableError, as_told, error_of
+from tupli_mcap.storage.api.answers import (
+    LATER,
+    Page,
+    SignInError,
+    TokenPair,
+    UnreachableError,
+    as_told,
+    error_of,
+)
 from tupli_mcap.storage.api.tokens import TokenStore, user_tokens
 
 if TYPE_CHECKING:
@@ -131,7 +139,7 @@ class Session:
             except UnreachableError:
                 raise
             except TupliError:
-                self.tokens.forget(self.url)
+                self.tokens.end(self.url)
                 return False
             self.tokens.put(self.url, self.tokens.username(self.url), as_told(TokenPair, pair).model_dump())
             return True
@@ -301,7 +309,16 @@ class Session:
             time.sleep(0.2 * 2**attempt)
 
     def _token(self) -> str:
-        return os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
+        """Empty for a guest, whom nobody becomes by a sign-in that has ended."""
+        token = os.environ.get(_TOKEN_VARIABLE) or self.tokens.tokens(self.url).get("access_token", "")
+        name = "" if token else self.tokens.username(self.url)
+        if name:
+            url = shown(self.url)
+            raise SignInError(
+                f"the sign-in of {name} at {url} has ended; sign in again: tupli-mcap login {name} --url {url}, "
+                f"or go on as a guest: tupli-mcap logout --url {url}"
+            )
+        return token
 
 
 class _NoTickets(logging.Filter):

@@ -49,11 +49,11 @@ class TokenStore:
         return next(reversed(self._servers()), "")
 
     def username(self, url: str) -> str:
-        """Who is signed in; empty if nobody is."""
+        """Who is signed in, or was until the sign-in ended; empty if nobody is."""
         return str(self._servers().get(url, {}).get("username", ""))
 
     def tokens(self, url: str) -> dict[str, str]:
-        """`access_token` and `refresh_token`; empty if nobody is signed in."""
+        """`access_token` and `refresh_token`; empty if nobody is signed in any more."""
         found = self._servers().get(url, {})
         if "keyring" in found and "access_token" not in found:
             found |= _from_keyring(found["keyring"])
@@ -68,12 +68,19 @@ class TokenStore:
             self._write({**self._others(url), url: {"username": username, **told}})
 
     def forget(self, url: str) -> None:
-        """Deletes the tokens for a server."""
+        """Deletes the user and the tokens for a server."""
+        self._keep_only(url, {})
+
+    def end(self, url: str) -> None:
+        """Deletes the tokens for a server, but not the user: their sign-in has ended."""
+        self._keep_only(url, {"username": self.username(url)})
+
+    def _keep_only(self, url: str, kept: dict[str, Any]) -> None:
         with self._lock:
             account = self._servers().get(url, {}).get("keyring")
             if account is not None:
                 _out_of_keyring(account)
-            self._write({**self._others(url), url: {}})
+            self._write({**self._others(url), url: kept})
 
     def use(self, url: str) -> None:
         """Makes a server the last used one."""
