@@ -447,6 +447,15 @@ class TestLook:
         assert told["recording"] == "deep/b.mcap"
         assert (told["steps"], told["state"], told["error"]) == (200, "complete", None)
 
+    def test_names_with_the_marks_of_urls(self, here: Path, cartpole: Path) -> None:
+        (here / "lab#2").mkdir()
+        path = shutil.copy(cartpole, here / "lab#2" / "what? run#3.mcap")
+        (told,) = run("ls", path.parent, "--json").json
+        assert told["recording"] == str(path)
+        assert run("info", path.parent, "--json").json["path"] == str(path.parent)
+        assert "lab#2" in ok("info", path.parent)
+        assert "run#3.mcap" in repr(tupli_mcap.open(path))
+
     def test_ls_of_nothing(self, here: Path) -> None:
         assert ok("ls") == "no recordings\n"
         assert run("ls", "--json").json == []

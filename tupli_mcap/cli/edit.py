@@ -37,7 +37,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import say
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_url, shown
+from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
@@ -100,7 +100,7 @@ def split(
     found = recordings_of([source])
     if len(found) != 1:
         raise typer.BadParameter(
-            f"expected one recording, found {len(found)} at {shown(source)}; give one of them"
+            f"expected one recording, found {len(found)} at {shown_name(source)}; give one of them"
         )
     parts = split_recording(found[0], output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
     if as_json:

@@ -26,7 +26,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote import is_pattern, is_server, is_url, shown
+from tupli_mcap.remote import is_pattern, is_server, is_url, shown_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -80,7 +80,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
     if as_json:
         print_json(
             {
-                "path": shown(source), "recordings": recordings, "runs": runs, "environments": environments,
+                "path": shown_name(source), "recordings": recordings, "runs": runs, "environments": environments,
                 "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
                 "returns": returns, "success": rate, "success_known": len(said), "seeds": len(seeds),
                 "metadata_keys": keys, "setting_keys": settings, "made_of": None if is_url(source) else dataset.made_of,
@@ -89,7 +89,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         return
     ended = ", ".join(f"{count:,} {name}" for name, count in ends.items())
     lines = {
-        "server" if is_server(source) else "pattern" if is_url(source) else "directory": shown(source),
+        "server" if is_server(source) else "pattern" if is_url(source) else "directory": shown_name(source),
         "recordings": number(recordings),
         "runs": _some(runs),
         "settings": _some(settings),

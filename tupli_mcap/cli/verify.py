@@ -12,7 +12,7 @@ from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, TupliError
-from tupli_mcap.remote import is_url, shown
+from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording, VerifyReport
@@ -63,7 +63,7 @@ def verify(
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import StorageReport, verify_paths
 
-    addresses = {shown(path): path for path in paths if is_url(path)}
+    addresses = {shown_name(path): path for path in paths if is_url(path)}
     storage_report = StorageReport()
     for report in verify_paths(paths):
         storage_report.files.append(report)
@@ -161,13 +161,13 @@ class _Replays:
                 certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
-            self._found.append((shown(path), None, str(err)))
+            self._found.append((shown_name(path), None, str(err)))
             if not quiet:
                 fail(str(err))
             return
-        self._found.append((shown(path), certificate, ""))
+        self._found.append((shown_name(path), certificate, ""))
         if not quiet:
-            say(f"{shown(path)}: {_outcome(certificate)}")
+            say(f"{shown_name(path)}: {_outcome(certificate)}")
             for line in _lines(certificate, seconds):
                 print_wrapped(line, "  ", "    ")
 

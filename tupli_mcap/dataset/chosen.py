@@ -26,7 +26,7 @@ from tupli_mcap.dataset.which import (
 )
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, shown
+from tupli_mcap.remote import is_server, is_url, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
@@ -191,7 +191,7 @@ def chosen_from(
             if not isinstance(source, Recording):
                 many = _many_at(os.fspath(source))
                 if many is not None:
-                    chosen += _of_many(many, shown(os.fspath(source)), text, wanted, stack)
+                    chosen += _of_many(many, shown_name(os.fspath(source)), text, wanted, stack)
                     continue
                 source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
             among = candidates(source, wanted)

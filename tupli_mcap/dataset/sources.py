@@ -16,7 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_url, matching, shown
+from tupli_mcap.remote import is_url, matching, shown, shown_name
 from tupli_mcap.schema import (
     BaseFilter,
     BenchmarkHeader,
@@ -205,7 +205,7 @@ class FilesSource:
         return self._folders[root], path.relative_to(root).as_posix()
 
     def __repr__(self) -> str:
-        return repr(shown(self.names[0])) if len(self.names) == 1 else f"{len(self.names)} files"
+        return repr(shown_name(self.names[0])) if len(self.names) == 1 else f"{len(self.names)} files"
 
 
 class JoinedSource:

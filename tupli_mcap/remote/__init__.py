@@ -10,7 +10,7 @@ names:    recognises URLs, and removes secrets from them.
 """
 
 from tupli_mcap.remote.failures import AUTHORITY, why
-from tupli_mcap.remote.names import is_server, is_url, is_web, shown
+from tupli_mcap.remote.names import is_server, is_url, is_web, shown, shown_name
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
 from tupli_mcap.remote.plan import is_cut_cheaper
@@ -29,6 +29,7 @@ __all__ = [
     "open_store",
     "open_url",
     "shown",
+    "shown_name",
     "watching",
     "why",
 ]

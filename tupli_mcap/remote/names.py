@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from urllib.parse import urlsplit
 
-__all__ = ["is_server", "is_url", "is_web", "shown"]
+__all__ = ["is_server", "is_url", "is_web", "shown", "shown_name"]
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
@@ -29,3 +29,8 @@ def is_server(name: str) -> bool:
 def shown(text: str) -> str:
     """Removes user names, passwords and signatures from the URLs in a text."""
     return _SECRET.sub(lambda found: found[1] or "", text)
+
+
+def shown_name(name: str) -> str:
+    """The name of a file as users see it: a URL without secrets, or a path as it is, which may have any characters."""
+    return shown(name) if is_url(name) else name

@@ -19,7 +19,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
-from tupli_mcap.remote import is_url, matching, shown
+from tupli_mcap.remote import is_url, matching, shown_name
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
@@ -204,7 +204,7 @@ def list_recordings(
         try:
             found = recordings_at(source)
         except TupliError as err:
-            yield ListedRecording(shown(str(source)), error=str(err))
+            yield ListedRecording(shown_name(str(source)), error=str(err))
             continue
         for file in found:
             listed = _listed(file, source if isinstance(source, Path) and source.is_dir() else None, choose)
@@ -275,7 +275,7 @@ def _shared(settings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
 def _listed(
     file: Path | str, root: Path | None, choose: Callable[[Recording], Array] | None
 ) -> ListedRecording:
-    name = shown(str(file))
+    name = shown_name(str(file))
     try:
         notes = Notes.read(file, root) if isinstance(file, Path) else None
         with Recording(file) as recording:
