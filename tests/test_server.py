@@ -461,6 +461,7 @@ def test_what_is_no_recording_is_not_kept(users: Users, tmp_path: Path) -> None:
         place = begin(users.url, token, announced or sent)
         answer = patch(place, token, sent)
         assert answer.status_code == status, answer.text
+        assert str(tmp_path) not in answer.text
         assert httpx.head(place, headers=token).status_code == 410
     place = begin(users.url, token, b"abc", length=3)
     assert patch(place, token, b"abcd").status_code == 413

@@ -281,7 +281,7 @@ class Library:
 
         room: the bytes for which the caller's quota needs room; that of an upload is counted already.
         """
-        with Recording(path) as recording:
+        with _unnamed(path), Recording(path) as recording:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
             arrivals.demand_short(recording)
@@ -432,3 +432,12 @@ class Library:
     def close(self) -> None:
         """Close the database."""
         self.database.close()
+
+
+@contextlib.contextmanager
+def _unnamed(path: Path) -> Iterator[None]:
+    """Errors in what a user has sent do not name its place on the server."""
+    try:
+        yield
+    except FormatError as err:
+        raise FormatError(str(err).replace(str(path), "the file")) from err
