@@ -326,6 +326,27 @@ class TestChosen:
                 expected = web.get(f"{listed}&format=json").json()["episodes"]
                 assert [e.id for e in found] == [e["id"] for e in expected]
 
+    def test_python_loads_the_episodes_of_each_dataset_and_no_others(self, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        with tupli_mcap.TupliEnvWrapper(gym.make("CartPole-v1"), storage=FileStorage(tmp_path)) as env:
+            env.store(name="balance")
+            env.reset(seed=1)
+            env.step(0)
+        box, zero = gym.spaces.Box(-1, 1, (1,), np.float32), np.zeros(1, np.float32)
+        with tupli_mcap.EpisodeWriter(tmp_path / "nameless.mcap", box, box) as writer:
+            writer.begin()
+            writer.step(zero, zero, reward=1.0, terminal=True)
+            writer.end(zero)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            keys = [dataset["key"] for dataset in told(client, "/")["datasets"]]
+            assert len(keys) == 3 and "-" in keys
+            for key in keys:
+                (line,) = re.findall(r'data-copy="(tupli_mcap[^"]*)"', client.get(f"/dataset/{key}").text)
+                found = eval(html.unescape(line), {"tupli_mcap": tupli_mcap})
+                assert [e.id for e in found] == [
+                    e["id"] for e in told(client, "/episodes", dataset=key)["episodes"]
+                ]
+
     def test_lines_beside_rows(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         sparks = web.get("/sparks", params={"episode": [e["id"] for e in best]}).json()
         assert sparks["name"] == "Cart Position"  # the rewards are always the same

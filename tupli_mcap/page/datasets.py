@@ -178,10 +178,11 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
 
 def dataset_filter(key: str) -> str:
     """The text of a filter for the episodes of a dataset; empty for no key, or one that encodes an unusual name."""
-    if not key or key.startswith(("~", _NAMELESS)):
+    if not key or key.startswith("~"):
         return ""
-    name = "benchmark_id" if is_hash(key) else "run.environment"
-    return format_filter(FilterEQ(key=name, value=key))
+    benchmark_id, environment = _meant(key)
+    of = FilterEQ(key="benchmark_id", value=benchmark_id)
+    return format_filter(of if benchmark_id else FilterEQ(key="run.environment", value=environment) & of)
 
 
 def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:
