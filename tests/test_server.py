@@ -335,6 +335,9 @@ def test_users_and_groups_have_one_name_space(users: Users) -> None:
     for name in ("ann", "global", "$$GUEST$$"):
         with pytest.raises(StorageError, match="already exists"):
             users.eve.create_group(Group(name=name))
+    for name in (".", "..", "a/b", ""):
+        with pytest.raises(StorageError, match="expected a group name"):
+            users.eve.create_group(Group(name=name))
     users.eve.create_group(Group(name="lab"))
     for name in ("lab", "global", "bob"):
         with pytest.raises(StorageError, match="already exists|expected a user name"):

@@ -46,7 +46,7 @@ __all__ = [
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))
 _DUMMY: Final = _HASHES.hash("nobody has this password")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}")
-_GROUP: Final = re.compile(r"[^/\\\x00-\x1f\x7f]{1,100}")
+_GROUP: Final = re.compile(r"(?!\.+$)[^/\\\x00-\x1f\x7f]{1,100}")  # addresses cannot have a part of dots
 _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's own name
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
@@ -232,7 +232,8 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
     _demand_short(description)
     if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name) or not _alike(name):
         raise StorageError(
-            f"expected a group name of 1 to 100 printable characters without slashes, found {name!r:.80}"
+            "expected a group name of 1 to 100 printable characters, without slashes and not only dots, "
+            f"found {name!r:.80}"
         )
     if not _reserve(connection, name, "group"):
         raise ConflictError("Group already exists")
