@@ -312,6 +312,8 @@ class TestPeople:
             assert ann.post("/share", data=some).status_code == 303
             assert [e["metadata"]["success"] for e in episodes_of(bob)] == [True]
             assert ann.post("/share", data={**some, "published": "false"}).status_code == 303
+            none = ann.post("/share", data={**told, "filter": "steps = 999"})
+            assert (none.status_code, "none of your episodes" in none.text) == (400, True)
             wrong = ann.post("/share", data={**told, "filter": "steps >"})
             assert (wrong.status_code, "needs a value" in wrong.text) == (400, True)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request, Response
 from sqlalchemy import Connection, func, select
 
-from tupli_mcap.errors import FormatError, NotFoundError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, parse_bound
@@ -60,6 +60,8 @@ def change(
             turn = episodes.publish if published else episodes.unpublish
             wanted = own if wanted is None else own & wanted
             changed = turn(connection, visit.caller, wanted, group, only=of_dataset(found.key))
+            if not changed and filter.strip():
+                raise StorageError("none of your episodes of this dataset matches the filter; give another one")
             if not changed and not whole:
                 raise DeniedError("nothing of this is yours; only the owners may publish it")
 
