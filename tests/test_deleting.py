@@ -98,6 +98,10 @@ def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:
 
 
 def test_of_a_directory_by_filter(runs: Path) -> None:
+    for place in (runs, runs / "a.mcap"):
+        assert "no episode has metadata.lost" in run(
+            "delete", str(place), "--filter", "metadata.lost", code=2
+        )
     assert "deleted 4 episodes" in run("delete", str(runs), "--filter", "seed >= 2")
     assert seeds(runs) == [0, 1, 0, 1]
     storage = FileStorage(runs)

@@ -204,6 +204,8 @@ def _delete_in_files(
 
     files = [str(file) for given in paths for file in find_recordings(given)]
     doomed = numbers_in(files, episodes, wanted)
+    if wanted is not None and files and not doomed:
+        len(dataset_of(files).filter(wanted))  # raises FilterError if no episode has such a key
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
     return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run) if files else 0
 

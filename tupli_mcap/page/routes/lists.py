@@ -14,6 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 from markupsafe import Markup
 from sqlalchemy import Connection, func, select
 
+from tupli_mcap.dataset.keys import check_metadata
 from tupli_mcap.errors import FilterError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
@@ -152,6 +153,10 @@ def table_of(
                 backwards=bool(before),
             )
         )
+        if not found and at is None and wanted is not None:
+            among = list(find_episodes(connection, None, limit=_MANY + 1, only=only, of=of_some))
+            if len(among) <= _MANY:
+                check_metadata(wanted, among)
     except FilterError as err:
         return Table((), str(err), err.position)
     more, rows = len(found) > _ROWS, shelf.as_told(connection, found[:_ROWS])

@@ -61,7 +61,9 @@ def change(
             wanted = own if wanted is None else own & wanted
             changed = turn(connection, visit.caller, wanted, group, only=of_dataset(found.key))
             if not changed and filter.strip():
-                raise StorageError("none of your episodes of this dataset matches the filter; give another one")
+                raise StorageError(
+                    "none of your episodes of this dataset matches the filter; give another one"
+                )
             if not changed and not whole:
                 raise DeniedError("nothing of this is yours; only the owners may publish it")
 
