@@ -369,6 +369,28 @@ class TestPeople:
             )
             assert httpx.get(f"{server}/v1/me", headers=machine).status_code == 401
 
+    def test_a_refused_form_keeps_what_was_sent_but_no_password(self, server: str) -> None:
+        forms = {
+            "/sign-in": {"username": "ann", "password": "wrong words"},
+            "/groups": {"name": "bob", "description": "those with arms"},
+            "/group/members": {"name": "kept", "user": "nobody here", "role": "contributor"},
+            "/account/tokens": {"name": "node 8", "scope": "write", "days": "9999"},
+            "/users": {"username": "bob", "password": "wrong words"},
+        }
+        with browser(server, "admin", PASSWORD) as admin, browser(server) as guest:
+            own = code(admin)
+            assert admin.post("/groups", data={"code": own, "name": "kept"}).status_code == 303
+            for address, sent in forms.items():
+                who = guest if address == "/sign-in" else admin
+                answer = who.post(address, data={**sent, "code": own})
+                assert answer.status_code in (400, 401, 404, 409), answer.text
+                for name, value in sent.items():
+                    kept = f'value="{value}"' in answer.text or f"selected>{value}<" in answer.text
+                    kept |= f'value="{value}" selected' in answer.text
+                    assert kept == (name not in ("password", "code")), (address, name)
+                assert "wrong words" not in answer.text
+            admin.post("/group/delete", data={"code": own, "name": "kept"})
+
     def test_pages_with_codes_are_not_kept(self, server: str) -> None:
         with browser(server, "ann") as ann:
             assert ann.get("/account").headers["cache-control"] == "no-store"

@@ -8,17 +8,19 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Form, Request, Response
 from fastapi.responses import JSONResponse
 
+from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute
 from tupli_mcap.server.database import audit
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, begin
 from tupli_mcap.server.people import accounts
+from tupli_mcap.server.wire import told
 
 __all__ = ["router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
-_Days = Annotated[int, Form(ge=1, le=3650)]
+_Days = Annotated[int, Form()]
 
 
 @router.get("/account")
@@ -52,10 +54,14 @@ def create_token(
     days: _Days = 90,
 ) -> Response:
     """Creates a token for a machine, and shows it once."""
-    library, made = visit.library, dict[str, Any]()
-    with library.database.writing() as connection:
-        audit(connection, visit.caller.name, "create_api_token", name)
-        made = library.tokens.create_api_token(connection, visit.caller, name, scope, days)
+    library = visit.library
+    try:
+        with library.database.writing() as connection:
+            audit(connection, visit.caller.name, "create_api_token", name)
+            made = library.tokens.create_api_token(connection, visit.caller, name, scope, days)
+    except TupliError as err:
+        status, text = told(err)
+        return _page(request, visit, text, status, sent={"name": name, "scope": scope, "days": str(days)})
     return _page(request, visit, made=made)
 
 
@@ -80,10 +86,16 @@ def access(visit: Code) -> Response:
 
 
 def _page(
-    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, made: dict[str, Any] | None = None
+    request: Request,
+    visit: Visit,
+    wrong: str = "",
+    status: int = 200,
+    *,
+    made: dict[str, Any] | None = None,
+    sent: dict[str, str] | None = None,
 ) -> Response:
     with visit.library.database.reading() as connection:
         tokens = visit.library.tokens.list_api_tokens(connection, visit.caller)
         memberships = accounts.memberships_of(connection, visit.caller.name)
     facts = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
-    return form_page(request, visit, "account.html", facts, wrong=wrong, status=status, made=made)
+    return form_page(request, visit, "account.html", facts, wrong=wrong, status=status, sent=sent, made=made)

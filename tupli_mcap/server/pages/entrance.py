@@ -65,7 +65,7 @@ def sign_in(
         pair = library.sign_in(username, password, address)
     except TupliError as err:
         status, text = told(err)
-        return _sign_in_page(request, library, following, text, status, new=new)
+        return _sign_in_page(request, library, following, text, status, new=new, username=username)
     response = done(_local(following))
     session.begin(request, response, pair["refresh_token"], library.settings.refresh_seconds)
     return response
@@ -89,10 +89,11 @@ def _sign_in_page(
     status: int = 200,
     *,
     new: bool = False,
+    username: str = "",
 ) -> Response:
     response = page(
         request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),
-        open_signup=library.settings.open_signup, new=new,
+        open_signup=library.settings.open_signup, new=new, username=username,
     )  # fmt: skip
     response.headers["Cache-Control"] = "no-store"
     return response

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -24,13 +25,15 @@ def form_page(
     *,
     wrong: str = "",
     status: int = 200,
+    sent: Mapping[str, str] | None = None,
     **more: Any,
 ) -> Response:
-    """A page with forms for a signed-in user. wrong: why the last form was refused."""
+    """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
     shown: dict[str, Any] = {
         "shelf": shelf_of(request, visit),
         "code": visit.code,
         "wrong": wrong,
+        "sent": defaultdict(str, sent or {}),
         "me": visit.caller,
     }
     response = page(request, template, facts, status=status, **shown, **more)

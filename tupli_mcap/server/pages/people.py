@@ -17,6 +17,7 @@ __all__ = ["router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
+_Sent = dict[str, str] | None
 
 
 @router.get("/users")
@@ -33,7 +34,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
         visit.caller.demand(Right.USER_CREATE)
         visit.library.create_user(visit.caller, username, password, "")
 
-    return tried(change, partial(_users, request, visit), "/users")
+    return tried(change, partial(_users, request, visit, sent={"username": username}), "/users")
 
 
 @router.post("/users/delete")
@@ -46,12 +47,16 @@ def delete_user(request: Request, visit: Code, username: _Text = "") -> Response
     return tried(change, partial(_users, request, visit), "/users")
 
 
-def _users(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
+def _users(
+    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None
+) -> Response:
     visit.caller.demand(Right.USER_READ)
     with visit.library.database.reading() as connection:
         users = accounts.list_users(connection, visit.caller)
     may = {"create": visit.caller.may(Right.USER_CREATE), "delete": visit.caller.may(Right.USER_DELETE)}
-    return form_page(request, visit, "users.html", {"users": users}, wrong=wrong, status=status, may=may)
+    return form_page(
+        request, visit, "users.html", {"users": users}, wrong=wrong, status=status, sent=sent, may=may
+    )
 
 
 @router.get("/groups")
@@ -68,14 +73,19 @@ def create_group(request: Request, visit: Code, name: _Text = "", description: _
         with visit.library.database.writing() as connection:
             accounts.create_group(connection, visit.caller, name, description or None)
 
-    return tried(change, partial(_groups, request, visit), address("group", name=name))
+    sent = {"name": name, "description": description}
+    return tried(change, partial(_groups, request, visit, sent=sent), address("group", name=name))
 
 
-def _groups(request: Request, visit: Visit, wrong: str = "", status: int = 200) -> Response:
+def _groups(
+    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None
+) -> Response:
     with visit.library.database.reading() as connection:
         groups = accounts.list_groups(connection, visit.caller)
         own = accounts.memberships_of(connection, visit.caller.name)
-    return form_page(request, visit, "groups.html", {"groups": groups}, wrong=wrong, status=status, own=own)
+    return form_page(
+        request, visit, "groups.html", {"groups": groups}, wrong=wrong, status=status, sent=sent, own=own
+    )
 
 
 @router.get("/group")
@@ -94,7 +104,8 @@ def add_member(
         with visit.library.database.writing() as connection:
             accounts.add_members(connection, visit.caller, name, [(user, [role])])
 
-    return tried(change, partial(_group, request, visit, name), address("group", name=name))
+    again = partial(_group, request, visit, name, sent={"user": user, "role": role})
+    return tried(change, again, address("group", name=name))
 
 
 @router.post("/group/members/delete")
@@ -119,7 +130,9 @@ def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
     return tried(change, partial(_group, request, visit, name), "/groups")
 
 
-def _group(request: Request, visit: Visit, name: str, wrong: str = "", status: int = 200) -> Response:
+def _group(
+    request: Request, visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent: _Sent = None
+) -> Response:
     with visit.library.database.reading() as connection:
         group = accounts.members_of(connection, visit.caller, name)
         roles = [role["role"] for role in accounts.list_roles(connection)]
@@ -128,4 +141,6 @@ def _group(request: Request, visit: Visit, name: str, wrong: str = "", status: i
         "update": caller.may(Right.GROUP_UPDATE, name),
         "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
     }
-    return form_page(request, visit, "group.html", group, wrong=wrong, status=status, may=may, roles=roles)
+    return form_page(
+        request, visit, "group.html", group, wrong=wrong, status=status, sent=sent, may=may, roles=roles
+    )

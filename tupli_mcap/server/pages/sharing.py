@@ -104,7 +104,7 @@ def _page(
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
         "episodes": audiences,
     }
-    shown = {"dataset": dataset, "groups": groups, "filter": filter}
+    shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter}
     return form_page(request, visit, "share.html", facts, wrong=wrong, status=status, **shown)
 
 

@@ -31,6 +31,7 @@ __all__ = ["SignInError", "Tokens"]
 
 _API_PREFIX: Final = "tmcap_"
 _ALGORITHM: Final = "HS256"
+_MOST_DAYS: Final = 3650  # of a token for machines
 _MOST_API_TOKENS: Final = 100  # of a user
 
 
@@ -134,6 +135,10 @@ class Tokens:
         """A new token for a machine: its listed fields, and the `token` itself, which is not stored."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
+        if days is not None and not 1 <= days <= _MOST_DAYS:
+            raise StorageError(
+                f"expected 1 to {_MOST_DAYS} days, found {days}; make another token after them"
+            )
         own = select(func.count()).select_from(API_TOKEN).where(API_TOKEN.c.user == caller.name)
         if connection.execute(own).scalar_one() >= _MOST_API_TOKENS:
             raise StorageError(f"expected at most {_MOST_API_TOKENS} tokens of {caller.name}; revoke some")
