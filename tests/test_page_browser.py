@@ -130,13 +130,16 @@ class TestEverybody:
                 page.goto(place)
                 assert violations(page) == [], place
 
-    def test_a_phone(self, chromium: Browser, lab: str) -> None:
-        with opened(chromium, lab) as (page, _):
-            page.set_viewport_size({"width": 360, "height": 740})
-            for place in places(lab):
-                page.goto(place)
-                wide = page.evaluate("document.documentElement.scrollWidth")
-                assert wide <= 360, place
+    def test_a_phone(self, chromium: Browser, lab: str, server: str) -> None:
+        for address, shown in ((lab, places(lab)), (server, ["/upload", "/groups", "/users", "/account"])):
+            with opened(chromium, address) as (page, _):
+                page.set_viewport_size({"width": 320, "height": 740})
+                if address == server:
+                    sign_in(page)
+                for place in shown:
+                    page.goto(place)
+                    wide = page.evaluate("document.documentElement.scrollWidth")
+                    assert wide <= 320, place
 
     def test_without_scripts(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, java_script_enabled=False) as (page, _):
