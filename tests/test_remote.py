@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import itertools
 import json
 import multiprocessing
@@ -177,6 +178,17 @@ def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:
         assert np.array_equal(recording.read().states, Recording(large).read().states)
 
 
+def test_a_server_that_tells_no_length(server: WebServer) -> None:
+    server.ranges = server.heads = False
+    with pytest.raises(RecordingError, match="its server does not tell how long it is; download the file"):
+        Recording(server.url())
+    server.heads, server.lengths = True, False
+    with pytest.raises(RecordingError, match="its server does not tell how long it is; download the file"):
+        Recording(server.url())
+    with pytest.raises(RecordingError, match="does not exist"):
+        Recording(server.url("/nothing.mcap"))
+
+
 def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
     server.failures = [503, 500]
     recording = Recording(server.url())
@@ -248,6 +260,9 @@ def test_what_is_no_recording(server: WebServer) -> None:
         Recording(server.url("/text.mcap"))
     with pytest.raises(RecordingError, match=r"nothing\.mcap does not exist"):
         Recording(server.url("/nothing.mcap"))
+    server.files["/packed.mcap"] = gzip.compress(server.files["/r.mcap"][:9999])
+    with pytest.raises(tupli_mcap.FormatError, match=r"compressed with gzip; unpack it; if a web server"):
+        Recording(server.url("/packed.mcap"))
     with pytest.raises(RecordingError, match="a web server does not list its files"):
         tupli_mcap.open(server.url("/*.mcap"))
 

@@ -33,6 +33,7 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.tags: dict[str, str] = {}
         self.asked: list[Asked] = []
         self.suffixes = self.ranges = self.conditions = True
+        self.lengths = self.heads = True  # whether it says how long files are, and answers HEAD
         self.failures: list[int] = []  # status codes of the next answers
         self.delay = 0.0  # seconds before each answer
 
@@ -68,6 +69,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         match = self.headers.get("If-Match")
         if server.failures:
             status, body = server.failures.pop(0), b"no"
+        elif self.command == "HEAD" and not server.heads:
+            status, body = 405, b""
         elif data is None:
             status, body = 404, b"no"
         elif server.conditions and match not in (None, tag):
@@ -85,7 +88,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.send_response(status)
         for name, value in headers.items():
             self.send_header(name, value)
-        self.send_header("Content-Length", str(len(body)))
+        if server.lengths:
+            self.send_header("Content-Length", str(len(body)))
+        else:
+            self.close_connection = True
         self.end_headers()
         if not head:
             self.wfile.write(body)

@@ -32,6 +32,7 @@ except ImportError:
     from zlib import crc32 as _crc32
 
 MAGIC = b"\x89MCAP0\r\n"  # begins and ends a file
+_GZIP = b"\x1f\x8b"
 PROFILE = "tupli_mcap"
 RECORD = struct.Struct("<BQ")  # start of every record: opcode, and the length of what follows
 # RECORD, times of the first and the last message, uncompressed size, CRC, length of the compression's name; then the
@@ -297,6 +298,11 @@ def check_magic(source: Source) -> None:
     if source.size == 0:
         raise FormatError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
     head = source.read(0, min(len(MAGIC), source.size))
+    if head.startswith(_GZIP):
+        raise FormatError(
+            f"{source.name}: expected an MCAP file, found one compressed with gzip; unpack it; if a web server "
+            "compresses it (Content-Encoding), have it send the file as it is"
+        )
     if head != MAGIC:
         raise FormatError(
             f"{source.name}: expected an MCAP file, found {head!r} at its start; "

@@ -181,8 +181,8 @@ class _StoredObject:
 
         try:
             found = self._ask({"range": {"suffix": length}})
-        except (RefusedError, NotSupportedError):
-            size = asked(self._url, lambda: self._store.head(self._path))["size"]
+        except (RefusedError, NotSupportedError) as err:
+            size = self._size(answered=isinstance(err, NotSupportedError))
             if not size:
                 return End(memoryview(b""), 0, "")
             try:
@@ -190,6 +190,23 @@ class _StoredObject:
             except (RefusedError, NotSupportedError) as err:
                 raise NoRangesError from err
         return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
+
+    def _size(self, *, answered: bool) -> int:
+        """Its size. answered: whether the server has sent it whole, so that it is there."""
+        try:
+            return int(asked(self._url, lambda: self._store.head(self._path))["size"])
+        except RefusedError:
+            pass
+        except BrokenOffError as err:
+            if "Content-Length" not in str(err):
+                raise
+        except RecordingError:  # some say so of requests that they do not know
+            if not answered:
+                raise
+        raise RecordingError(
+            f"{shown(self._url)} cannot be read in place, as its server does not tell how long it is; download the "
+            "file, and open that"
+        )
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data, at = bytearray(stop - start), 0
