@@ -256,6 +256,8 @@ class StorageContract:
         assert header.metadata == {"score": 2.5}
         assert (header.n_tuples, header.terminated, header.timeout) == (4, True, False)
         assert header.episode_return == 10.0
+        assert storage.list_episodes(FilterIN(key="seed", value=[10**40])) == []
+        assert storage.count_episodes(F("metadata.score") < 10**40) == 1
         (item,) = storage.list_episodes(include_tuples=True)
         assert item.id == header.id
         assert [t.action for t in item.tuples] == [0, 1, 0, 1]  # type: ignore[union-attr]

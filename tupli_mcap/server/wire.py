@@ -36,6 +36,7 @@ from tupli_mcap.server.people.throttle import TooManyError
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
+from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = [
@@ -102,13 +103,23 @@ def _affordable(told: Any) -> Any:
         inner, value = (part.get("filters"), part.get("value")) if isinstance(part, dict) else (None, None)
         if isinstance(inner, list) and inner:
             parts += inner
-        else:
-            count += len(value) if isinstance(value, list) else 1
+            continue
+        count += len(value) if isinstance(value, list) else 1
+        if count <= _MOST_VALUES and isinstance(value, dict | list):
+            part["value"] = _restored(value)
     if count > _MOST_VALUES:
         raise ValueError(
             f"expected a filter with at most {_MOST_VALUES} values, found more; ask in several parts"
         )
     return told
+
+
+def _restored(value: Any) -> Any:
+    """A value that JSON lacks, such as a large integer, from its tag; see `jsonvalue`."""
+    try:
+        return restored(value)
+    except (FormatError, RecursionError) as err:
+        raise ValueError(str(err)) from err
 
 
 AskedFilter = Annotated[BaseFilter, BeforeValidator(_affordable)]
