@@ -242,6 +242,8 @@ class StorageContract:
             storage.delete_artifact(item.id)
         storage.delete_artifact(item.id, force=True)
         assert storage.list_artifacts() == []
+        with pytest.raises(NotFoundError, match="there is no artifact"):
+            storage.artifact_users(item.id)
 
     def test_an_artifact_is_bytes(self, storage: TupliStorage) -> None:
         with pytest.raises(StorageError, match="expected the bytes of an artifact, found str"):

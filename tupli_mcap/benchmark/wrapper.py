@@ -370,11 +370,11 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         gone: list[str] = []
         kept: dict[str, tuple[str, ...]] = {}
         for artifact in artifacts if delete_artifacts else ():
-            users = tuple(self.storage.artifact_users(artifact))
-            if users:
-                kept[artifact] = users
-                continue
             with contextlib.suppress(NotFoundError):  # gone already
+                users = tuple(self.storage.artifact_users(artifact))
+                if users:
+                    kept[artifact] = users
+                    continue
                 self.storage.delete_artifact(artifact)
                 gone.append(artifact)
         return DeletedBenchmark(uri, episodes, tuple(gone), MappingProxyType(kept))

@@ -107,7 +107,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def artifact_users(self, uri: str) -> list[str]:
-        """The ids of the benchmarks that need an artifact."""
+        """The ids of the benchmarks that need an artifact. Raises NotFoundError if there is no such artifact."""
 
     @abstractmethod
     def delete_artifact(self, uri: str, *, force: bool = False) -> None:

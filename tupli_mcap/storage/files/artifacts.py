@@ -52,6 +52,10 @@ class ArtifactFiles:
             )
         return data
 
+    def demand(self, uri: str) -> None:
+        """Raises NotFoundError if there is no such artifact."""
+        self._find(uri)
+
     def item(self, uri: str) -> ArtifactMetadataItem:
         self._find(uri)
         return self._read(self._sidecar(uri))

@@ -171,6 +171,7 @@ class FileStorage(TupliStorage):
         return self._artifacts.list(filter)
 
     def artifact_users(self, uri: str) -> list[str]:
+        self._artifacts.demand(uri)
         return [
             header.id for header in self.list_benchmarks() if uri in self._benchmarks.artifacts(header.id)
         ]
