@@ -248,6 +248,22 @@ class TestRun:
             edit_run(tmp_path / "all.mcap", name="x")
         assert verify_recording(tmp_path / "some.mcap").ok
 
+    def test_of_the_episodes_that_ls_chooses(self, tmp_path: Path) -> None:
+        paths = [
+            record(tmp_path / f"{i}.mcap", 1, name=f"w{i}", tags=[f"tag{i}"], metadata={"lr": i, "gamma": 1})
+            for i in range(3)
+        ]
+        path = str(tmp_path / "all.mcap")
+        merge_recordings(paths, path)
+
+        def told(filter: str) -> list[Any]:
+            words = ["--filter", filter, "--columns", "run,tags,episodes,settings", "--json"]
+            (row,) = json.loads(command("ls", path, *words))["result"]
+            return list(row.values())
+
+        assert told('run.name = "w1"') == ["w1", ["tag1"], 1, {"lr": 1, "gamma": 1}]
+        assert told('run.name != "w0"') == ["w1, w2", ["tag1"], 2, {"gamma": 1}]
+
     def test_can_be_edited(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap", metadata={"lr": 1, "old": 2})
         before = Recording(path)

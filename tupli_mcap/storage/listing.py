@@ -15,7 +15,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -272,6 +272,15 @@ def _shared(settings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _runs_of(recording: Recording, positions: Array) -> list[Run]:
+    """The runs of some episodes, each once, in their order; without episodes, all runs."""
+    runs = recording.readable_runs
+    if len(runs) == 1 or not len(positions):
+        return runs
+    places = recording.run_places
+    return [runs[place] for place in dict.fromkeys(places[i] for i in positions.tolist())]
+
+
 def _listed(
     file: Path | str, root: Path | None, choose: Callable[[Recording], Array] | None
 ) -> ListedRecording:
@@ -287,7 +296,8 @@ def _listed(
                 kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
             rows = recording.index[kept]
             returns = spread_of(rows["return"])
-            said, run = successes(recording, kept), recording.readable_runs[0]
+            said, runs = successes(recording, kept), _runs_of(recording, kept)
+            run = runs[0]
             return ListedRecording(
                 path=name,
                 episodes=len(rows),
@@ -298,14 +308,14 @@ def _listed(
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,
                 state=state_of(recording),
-                name=", ".join(dict.fromkeys(run.name for run in recording.readable_runs)),
+                name=", ".join(dict.fromkeys(run.name for run in runs)),
                 environment=run.environment,
                 started=run.started,
                 success=sum(said) / len(said) if said else None,
                 success_known=len(said),
                 split=run.split,
                 tags=run.tags,
-                settings=_shared(each.metadata for each in recording.readable_runs),
+                settings=_shared(each.metadata for each in runs),
             )
     except (TupliError, OSError) as err:
         return ListedRecording(name, error=str(err))
