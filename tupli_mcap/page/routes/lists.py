@@ -35,6 +35,7 @@ _ROWS: Final = 50
 _COUNTED: Final = 1_000  # beyond so many episodes, a page says "More than"
 _KEYS: Final = 4  # most keys of metadata that get a column
 _MANY: Final = 50_000  # episodes, all of whose metadata take a while to read
+_ASKED: Final = 1_000  # of at most so many episodes, a key that none has is named
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,8 @@ def table_of(
             )
         )
         if not found and at is None and wanted is not None:
-            among = list(find_episodes(connection, None, limit=_MANY + 1, only=only, of=of_some))
-            if len(among) <= _MANY:
+            among = list(find_episodes(connection, None, limit=_ASKED + 1, only=only, of=of_some))
+            if len(among) <= _ASKED:
                 check_metadata(wanted, among)
     except FilterError as err:
         return Table((), str(err), err.position)
