@@ -718,6 +718,16 @@ class TestLook:
         leaves = flatten_space(space, "state", NameRegistry())
         assert space_lines(leaves, Labels.none(), {leaf.name: leaf.dtype for leaf in leaves}) == said
 
+    def test_episodes_of_several_recordings_say_which(self, here: Path) -> None:
+        for name, run_name in (("a", "ppo"), ("b", "sac"), ("c", "sac")):
+            with RecordEpisodes(gym.make("CartPole-v1"), f"{name}.mcap", name=run_name) as env:
+                env.reset(seed=1)
+                env.step(0)
+        head, *rows = (line.split() for line in ok("episodes", "a.mcap", "b.mcap").splitlines())
+        assert head[:3] == ["ID", "RUN", "STEPS"] and [row[1] for row in rows] == ["ppo", "sac"]
+        head, *rows = (line.split() for line in ok("episodes", "a.mcap", "b.mcap", "c.mcap").splitlines())
+        assert head[1] == "RECORDING" and [row[1] for row in rows] == ["a.mcap", "b.mcap", "c.mcap"]
+
     def test_info_says_which_dtype_is_stored(self, here: Path) -> None:
         space = gym.spaces.Dict(q=gym.spaces.Box(-np.inf, np.inf, (7,), np.float32))
         env = Scripted(lambda step: {"q": np.full(7, 0.1)}, space)
@@ -1311,7 +1321,9 @@ class TestProgram:
         ):
             lines = ok(*args).splitlines()
             assert max(map(len, lines)) <= width or args[0] == "info"
-            assert len({len(line) for line in lines}) > 1 or (width == 60 and args[0].startswith("list-"))
+            assert len({len(line) for line in lines}) > 1 or (
+                width == 60 and args[0][:5] in ("list-", "episo")
+            )
 
     @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
     def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:

@@ -107,7 +107,7 @@ def test_some_pictures_of_a_size(tmp_path: Path) -> None:
             film(episodes, tmp_path / "c.gif", **wrong)  # type: ignore[arg-type]
     words = ["render", str(tmp_path / "r.mcap"), "-e", "all", "--width", "40", "--every", "3"]
     told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "d.gif"), "--camera", "state['wrist']"])
-    assert "d.gif: 6 recorded pictures" in told.output
+    assert "d.gif: 6 recorded pictures\n" in told.output and "r.mcap: episode 0, return " in told.output
     with Image.open(tmp_path / "d.gif") as image:
         assert image.size[0] == 40
     told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "e.gif"), "--camera", "front"])

@@ -428,6 +428,7 @@ class TestCommandLine:
         code, out, err = run("render", path, "-o", tmp_path / "best.gif", "--width", 60)
         assert (code, err) == (0, "")
         assert f"best.gif: {len(best) + 1} frames of 1 episode, 60 x 40, 50 a second" in out
+        assert out.splitlines()[1] == f"{path}: episode {best.number}, return {best.return_:.0f}"
         code, out, _ = run(
             "render", path, "-o", tmp_path / "best.gif", "--episodes", "0,2", "--force", "--json"
         )

@@ -373,12 +373,15 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
         fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
         print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])
         return
-    several = len({header.recording for header in headers}) > 1
+    recordings = {header.recording for header in headers}
+    several = len(recordings) > 1
+    by_run = several and len({header.run.get("name", "") for header in headers}) == len(recordings)
+    source = Column("RUN", shrink="end") if by_run else Column("RECORDING", shrink="start")
     roomy = (terminal_width() or _ROOMY) >= _ROOMY
     several_envs = any(header.env for header in headers)
     returns = numbers([header.episode_return for header in headers])
     columns = (
-        *([Column("ID")] if several else [Column("EPISODE", "right")]),
+        *([Column("ID"), source] if several else [Column("EPISODE", "right")]),
         *([Column("ENV", "right")] if several_envs else []),
         Column("STEPS", "right"),
         Column("RETURN", "right"),
@@ -392,6 +395,7 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
         rows.append(
             (
                 short_ids(header.id) if several else str(header.episode),
+                *([header.run.get("name", "") if by_run else short_ids(header.recording)] if several else []),
                 *([str(header.env)] if several_envs else []),
                 number(header.n_tuples),
                 total,

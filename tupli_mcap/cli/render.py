@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -88,10 +88,11 @@ def render(
         _chosen(source, episodes or "best", filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
+        which = _which(recording, chosen)
         recorded = output.suffix.lower() != ".mcap" and not rerun
         if recorded and (camera is not None or all(map(has_pictures, chosen))):
             made = film(chosen, output, camera=camera, every=every, width=width, overwrite=force)
-            _print_film(output, made.pictures, as_json=as_json)
+            _print_film(output, made.pictures, which, as_json=as_json)
             return
         if camera is not None:
             raise typer.BadParameter("--camera is for recorded pictures; leave it out to run episodes again")
@@ -106,22 +107,31 @@ def render(
             overwrite=force,
             progress=progress,
         )
-    _tell(report, as_json=as_json)
+    _tell(report, which, as_json=as_json)
 
 
-def _tell(report: RenderReport, *, as_json: bool) -> None:
+def _which(recording: Recording, chosen: Sequence[Episode]) -> str:
+    """The recording and the numbers and returns of episodes: `run.mcap: episode 7, return 120`."""
+    shown = [f"episode {one.number}, return {number(one.return_)}" for one in chosen[:_MOST_NAMES]]
+    more = f"; and {len(chosen) - _MOST_NAMES} more" if len(chosen) > _MOST_NAMES else ""
+    return f"{recording.name}: {'; '.join(shown)}{more}"
+
+
+def _tell(report: RenderReport, which: str, *, as_json: bool) -> None:
     """Prints what was rendered; exits with 1 if not all of it could be."""
     if as_json:
         print_json(_plain(report))
     else:
-        _print(report)
+        _print(report, which)
     if not report.ok:
         raise typer.Exit(1)
 
 
-def _print_film(path: Path, pictures: int, *, as_json: bool) -> None:
+def _print_film(path: Path, pictures: int, which: str, *, as_json: bool) -> None:
     told = {"path": path, "frames": pictures, "recorded": True, "ok": True}
     print_result(told, f"{path}: {counted(pictures, 'recorded picture')}", as_json=as_json)
+    if not as_json:
+        say(which)
 
 
 @contextlib.contextmanager
@@ -155,7 +165,7 @@ def _plain(report: RenderReport) -> dict[str, object]:
     }
 
 
-def _print(report: RenderReport) -> None:
+def _print(report: RenderReport, which: str) -> None:
     if report.path is not None:
         rendered = sum(1 for episode in report.episodes if episode.frames)
         say(
@@ -163,6 +173,7 @@ def _print(report: RenderReport) -> None:
             f"{report.width} x {report.height}, {report.fps:.4g} a second, "
             f"{bytes_of(report.path.stat().st_size)} in {report.seconds:.1f} s"
         )
+        say(which)
     if report.signature_left_out:
         say("the copy has no signature: the recording was signed without these frames")
     for skipped in report.skipped:
