@@ -728,6 +728,18 @@ class TestLook:
         head, *rows = (line.split() for line in ok("episodes", "a.mcap", "b.mcap", "c.mcap").splitlines())
         assert head[1] == "RECORDING" and [row[1] for row in rows] == ["a.mcap", "b.mcap", "c.mcap"]
 
+    def test_patterns(self, cartpole: Path, here: Path) -> None:
+        for name in ("x/a", "y/b"):
+            Path(name).parent.mkdir()
+            shutil.copy(cartpole, f"{name}.mcap")
+        assert [item["recording"] for item in run("ls", "*/*.mcap", "--json").json] == [
+            "x/a.mcap",
+            "y/b.mcap",
+        ]
+        assert run("episodes", "?/b.mcap").code == 0
+        assert "found none" not in run("plot", "x/*.mcap", "-o", "x.png").err and Path("x.png").exists()
+        assert fails("ls", "*.mcap") == "no file matches '*.mcap'; give the path of a recording (.mcap)"
+
     def test_info_says_which_dtype_is_stored(self, here: Path) -> None:
         space = gym.spaces.Dict(q=gym.spaces.Box(-np.inf, np.inf, (7,), np.float32))
         env = Scripted(lambda step: {"q": np.full(7, 0.1)}, space)

@@ -124,7 +124,7 @@ def ls(
         list[str] | None,
         typer.Argument(
             metavar="PATH|URL",
-            help="Recordings, directories, storages, URLs; by default, this directory.",
+            help="Recordings, directories, patterns, storages, URLs; by default, this directory.",
         ),
     ] = None,
     filter_text: FilterText = None,
@@ -138,8 +138,8 @@ def ls(
     state, split, tags, settings. The last three appear only with --columns; settings are the
     metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over
     episodes. STATE is `complete`; `recording` while a process writes the file; `recovered` if
-    its writer was killed or failed: all finished steps are there as long as the journal is. A
-    server does not tell SIZE and STATE.
+    its writer was killed or failed: all finished steps are there; `incomplete` if its journal is
+    missing, too. A server does not tell SIZE and STATE.
     Deleted episodes are not counted. With --filter, only the episodes that match are counted.
     """
     wanted = filter_of(filter_text)

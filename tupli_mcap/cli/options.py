@@ -36,7 +36,7 @@ def local_path(text: str | Path) -> Path:
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", parser=local_path)]
 Sources = Annotated[
-    list[str], typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs.")
+    list[str], typer.Argument(metavar="PATH|URL", help="Recordings, directories, patterns, storages, URLs.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead.")]
 Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The new recording (.mcap).")]

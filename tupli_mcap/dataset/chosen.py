@@ -6,6 +6,7 @@ Storages take long to import, and most files need none, so they are imported whe
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -134,15 +135,13 @@ def subjects_once(
 
 
 def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
-    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.listing import recordings_at
 
     error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
-    files = [name]
-    if not is_url(name):
-        try:
-            files = [str(file) for file in find_recordings(Path(name))]
-        except TupliError as err:
-            files, error = [], err
+    try:
+        files = [str(file) for file in recordings_at(name)]
+    except TupliError as err:
+        files, error = [], err
     for file in files:
         yield Subject(file, partial(Recording, file, cache_bytes=_CACHE_BYTES), choose)
     if not files:
@@ -235,15 +234,16 @@ def _parsed(text: str) -> BaseFilter:
 
 
 def _many_at(place: str) -> EpisodeSource | None:
-    """The episodes of a server or of a directory; None for the place of one recording."""
+    """The episodes of a server, a directory or a pattern; None for the place of one recording."""
     if is_server(place):
         return _stored(place)
-    if is_url(place) or not Path(place).is_dir():
+    path = Path(place)
+    if is_url(place) or not (path.is_dir() or (glob.has_magic(place) and not path.exists())):
         return None
     from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.listing import recordings_at
 
-    files = find_recordings(Path(place))
+    files = [Path(file) for file in recordings_at(place)]
     if not files:
         raise RecordingError(f"{place} holds no recording (.mcap)")
     return FilesSource(files, of_directory=True)

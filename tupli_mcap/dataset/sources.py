@@ -30,6 +30,7 @@ from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import by_recording, episode_id, uuid_of
 from tupli_mcap.storage.benchmark_json import restored
+from tupli_mcap.storage.listing import files_matching
 from tupli_mcap.storage.sidecar import Notes, storage_of
 
 if TYPE_CHECKING:
@@ -276,8 +277,7 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
         )
     if path.exists():
         return [str(path)]
-    matches = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    files = [match for match in matches if not Path(match).is_dir()]
+    files = [str(file) for file in files_matching(path)]
     if not files:
         what = "no file matches" if glob.has_magic(name) else "there is no file"
         raise RecordingError(f"{what} {name!r}; give the path of a recording (.mcap)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -213,12 +214,25 @@ def list_recordings(
 
 
 def recordings_at(source: Path | str) -> Sequence[Path | str]:
-    """The recordings of a path, as `find_recordings` finds them, or the URLs that match a URL.
+    """The recordings of a path, as `find_recordings` finds them, or the files or URLs that match a pattern.
 
     Raises:
         RecordingError: there are none.
     """
-    return matching(source) if isinstance(source, str) and is_url(source) else find_recordings(Path(source))
+    if isinstance(source, str) and is_url(source):
+        return matching(source)
+    path = Path(source)
+    if path.exists() or not glob.has_magic(str(path)):
+        return find_recordings(path)
+    if not (files := files_matching(path)):
+        raise RecordingError(f"no file matches {str(path)!r}; give the path of a recording (.mcap)")
+    return files
+
+
+def files_matching(pattern: Path) -> list[Path]:
+    """The files that match a pattern, sorted; `**` matches folders."""
+    found = sorted(glob.glob(str(pattern), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
+    return [path for path in map(Path, found) if not path.is_dir()]
 
 
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
