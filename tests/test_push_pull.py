@@ -27,11 +27,20 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.cli import app
-from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.environment import EnvironmentRecord, capture
 from tupli_mcap.errors import FormatError, StorageError, UntrustedError
-from tupli_mcap.schema import ArtifactMetadata, BenchmarkMetadata, F
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    BenchmarkMetadata,
+    BenchmarkQuery,
+    F,
+    Group,
+    GroupMembership,
+    GroupMembershipQuery,
+)
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, pack
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.exchange import copy_episodes
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -475,3 +484,78 @@ def test_a_served_directory_may_have_files_of_any_names(tmp_path: Path) -> None:
             }
     fetched = {path.read_bytes() for path in (tmp_path / "mine").rglob("*.mcap")}
     assert fetched == set(files.values())
+
+
+# --- what is somebody else's ---
+
+
+def signed_in(admin: TupliAPIClient, name: str) -> TupliAPIClient:
+    """A new user, who is signed in on this machine from now on."""
+    made_by(Person(admin.url, "admin"), name)
+    admin.login(name, f"{name}'s password")
+    return admin
+
+
+def recorded_to(client: TupliAPIClient, uri: str) -> None:
+    env = TupliEnvWrapper.load(client, uri)
+    env.reset(seed=7)
+    env.step(env.action_space.sample())
+    env.close()
+    client.flush()
+
+
+def test_publishing_own_episodes_of_somebody_else_s_benchmark(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = pushed(admin, tmp_path / "lab")
+    run("publish", uri)
+    bob = signed_in(admin, "bob")
+    for command in (["publish"], ["publish", "--dry-run"]):
+        refused = CliRunner().invoke(app, [*command, uri])
+        assert (refused.exit_code, "and no episode of it is yours" in refused.stderr) == (1, True)
+    recorded_to(bob, uri)
+    own, seen = F("created_by") == "bob", F("published_in") == "global"
+    of_it = f"1 episode of {uri[:8]}"
+    assert run("publish", uri, "--dry-run") == f"would publish {of_it} in global\n"
+    assert bob.count_episodes(own & seen) == 0
+    assert run("publish", uri) == f"published {of_it} in global\n"
+    assert bob.count_episodes(own & seen) == 1
+    assert run("unpublish", uri, "--dry-run") == f"would hide {of_it} from global\n"
+    assert run("unpublish", uri) == f"hid {of_it} from global\n"
+    assert (bob.count_episodes(own & seen), bob.count_episodes(seen)) == (0, 12)
+    assert len(bob.list_benchmarks(seen)) == 1
+
+
+def test_nothing_is_hidden_from_a_group_that_sees_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = pushed(admin, tmp_path / "lab")
+    admin.create_group(Group(name="robots"))
+    for words in ([uri], ["--filter", "episode >= 0"]):
+        for group, why in (
+            ("robots", "of this, nothing that is yours is published in robots"),
+            ("robot", "there is no group 'robot' that you may see (did you mean 'robots'?)"),
+        ):
+            for dry in ([], ["--dry-run"]):
+                refused = CliRunner().invoke(app, ["unpublish", *words, "--group", group, *dry])
+                assert (refused.exit_code, why in refused.stderr) == (1, True)
+        refused = CliRunner().invoke(app, ["publish", *words, "--group", "robot", "--dry-run"])
+        assert (refused.exit_code, "there is no group 'robot'" in refused.stderr) == (1, True)
+
+
+def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClient) -> None:
+    artifact = admin.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+    admin.create_group(Group(name="robots"))
+    admin.publish_artifact(artifact, "robots")
+    Person(admin.url, "admin").ask("POST", "/v1/users", {"username": "bob", "password": "bob's password"})
+    member = GroupMembership(user="bob", roles=["contributor"])
+    admin.add_group_members(GroupMembershipQuery(group_name="robots", members=[member]))
+    admin.login("bob", "bob's password")
+    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
+    digest = benchmark_hash(BenchmarkContent(record, (artifact,)), metadata)
+    query = BenchmarkQuery(hash=digest, serialized=pack(record, (artifact,)), metadata=metadata)
+    uri = admin.store_benchmark(query).id
+    result = CliRunner().invoke(app, ["publish", uri, "--group", "robots"])
+    assert (result.exit_code, result.stderr) == (0, "")
+    dry = CliRunner().invoke(app, ["publish", uri, "--dry-run"])
+    result = CliRunner().invoke(app, ["publish", uri])
+    assert (result.exit_code, dry.stderr) == (0, result.stderr)
+    assert "not published in global: 1 artifact of others that" in result.stderr
+    assert admin.load_benchmark(uri).published_in == ["bob", "robots", "global"]
+    assert admin.list_artifacts()[0].published_in == ["admin", "robots"]

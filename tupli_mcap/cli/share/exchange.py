@@ -250,7 +250,8 @@ def publish(
     """Let others see a benchmark or episodes on a server.
 
     Of a benchmark, they also see its artifacts, and your episodes of it (with --filter, only
-    those that match). --filter alone publishes your matching episodes, of any benchmark or none.
+    those that match); if it is somebody else's, only your episodes. --filter alone publishes
+    your matching episodes, of any benchmark or none.
     """
     from tupli_mcap.storage.exchange import publish_benchmark, publish_own
 
@@ -259,8 +260,10 @@ def publish(
     with server_at(url) as client:
         uri = None if benchmark is None else full_id(client, benchmark)
         if uri is not None:
-            episodes = publish_benchmark(client, uri, group, chosen, dry_run=dry_run)
-            line = f"{verb} {uri[:8]} with {counted(episodes, 'episode')} in {group}"
+            episodes, is_own = publish_benchmark(client, uri, group, chosen, dry_run=dry_run)
+            shared = counted(episodes, "episode")
+            what = f"{uri[:8]} with {shared}" if is_own else f"{shared} of {uri[:8]}"
+            line = f"{verb} {what} in {group}"
         elif chosen is not None:
             episodes = publish_own(client, group, chosen, dry_run=dry_run)
             line = f"{verb} {counted(episodes, 'episode')} in {group}"
@@ -277,8 +280,9 @@ def unpublish(
 ) -> None:
     """Hide a benchmark or episodes on a server from others.
 
-    Of a benchmark, it also hides your episodes. Its artifacts stay visible, as other benchmarks
-    may need them. With --filter, it hides only your episodes that match.
+    Of a benchmark, it also hides your episodes; if it is somebody else's, only these. Its
+    artifacts stay visible, as other benchmarks may need them. With --filter, it hides only your
+    episodes that match.
     """
     from tupli_mcap.storage.exchange import unpublish_benchmark, unpublish_own
 
@@ -287,9 +291,9 @@ def unpublish(
     with server_at(url) as client:
         uri = None if benchmark is None else full_id(client, benchmark)
         if uri is not None:
-            episodes = unpublish_benchmark(client, uri, group, chosen, dry_run=dry_run)
+            episodes, is_whole = unpublish_benchmark(client, uri, group, chosen, dry_run=dry_run)
             hidden = counted(episodes, "episode")
-            rest = f"{uri[:8]} and {hidden} of yours" if chosen is None else f"{hidden} of {uri[:8]}"
+            rest = f"{uri[:8]} and {hidden} of yours" if is_whole else f"{hidden} of {uri[:8]}"
         elif chosen is not None:
             episodes = unpublish_own(client, group, chosen, dry_run=dry_run)
             rest = counted(episodes, "episode")
