@@ -559,3 +559,32 @@ def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClie
     assert "not published in global: 1 artifact of others that" in result.stderr
     assert admin.load_benchmark(uri).published_in == ["bob", "robots", "global"]
     assert admin.list_artifacts()[0].published_in == ["admin", "robots"]
+
+
+# --- what is not there, or no more ---
+
+
+def test_a_filter_whose_key_no_episode_has_is_an_error(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "lab" / "run.mcap"
+    path.parent.mkdir()
+    record_rollouts("CartPole-v1", path, steps=5, seed=1)
+    tupli_mcap.open(path)[0].annotate(score=1)
+    uri = fill(tmp_path / "cart", 1)
+    run("push", path.parent, tmp_path / "cart")
+    one = admin.list_episodes()[0].id
+    for words, where in (
+        (["push", path.parent, tmp_path / "cart"], "metadata has score"),
+        (["pull", "--storage", tmp_path / "new"], "metadata has score"),
+        (["pull", one, "--storage", tmp_path / "new"], "metadata has "),
+        (["pull", uri, "--storage", tmp_path / "new"], "metadata has no keys"),
+        (["publish"], "metadata has score"),
+        (["publish", uri], "metadata has no keys"),
+        (["unpublish"], "metadata has score"),
+    ):
+        for dry in ([], ["--dry-run"]):
+            refused = CliRunner().invoke(app, [*map(str, words), "--filter", "metadata.scre > 0", *dry])
+            assert (refused.exit_code, "no episode has metadata.scre" in refused.stderr) == (2, True), words
+            assert where in refused.stderr
+    assert admin.list_benchmarks(F("published_in") == "global") == []
+    assert not (tmp_path / "new").exists()
+    run("push", tmp_path / "cart", path.parent, "--filter", "metadata.score > 0")  # one of them has it

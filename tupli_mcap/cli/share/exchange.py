@@ -6,7 +6,7 @@ import os
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -21,6 +21,7 @@ from tupli_mcap.cli.options import (
     Url,
     filter_of,
     full_id,
+    open_storage,
     server_at,
 )
 from tupli_mcap.cli.output import bytes_of, counted, print_json, print_result
@@ -30,7 +31,7 @@ from tupli_mcap.remote import copied, is_url, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
-    from tupli_mcap.storage import TupliAPIClient
+    from tupli_mcap.storage import TupliAPIClient, TupliStorage
 
 __all__ = ["publish", "pull", "push", "unpublish"]
 
@@ -75,6 +76,9 @@ def push(
         if not sources:
             _push_waiting(client, dry_run=dry_run, as_json=as_json)
             return
+        if chosen is not None:
+            with ExitStack() as stack:
+                _check_keys([stack.enter_context(open_storage(Path(each))) for each in sources], chosen)
         done = []
         for source in sources:
             with _naming(source if len(sources) > 1 else ""):
@@ -176,6 +180,18 @@ def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> No
         )  # fmt: skip
 
 
+def _check_keys(
+    storages: Sequence[TupliStorage], wanted: BaseFilter, among: BaseFilter | None = None
+) -> None:
+    """Raises FilterError if a filter, which none of the episodes (of `among`) matches, names metadata or parts of runs
+    that none of them has."""
+    from tupli_mcap.dataset.keys import check_metadata
+
+    both = wanted if among is None else among & wanted
+    if not any(storage.count_episodes(both) for storage in storages):
+        check_metadata(wanted, [header for each in storages for header in each.list_episodes(among)])
+
+
 def _told(
     url: str, dry_run: bool, benchmarks: list[str], recordings: list[str], episodes: int | None
 ) -> dict[str, object]:
@@ -204,18 +220,23 @@ def pull(
     fetches matching episodes of all benchmarks. Only new episodes are fetched. Environments
     are not trusted, unless a key that you trust has signed them.
     """
+    from tupli_mcap.schema import FilterEQ
     from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes
 
     if item is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter")
-    chosen = filter_of(filter_text)
+    wanted = filter_of(filter_text)
     with server_at(url) as client, FileStorage(storage_path) as storage:
-        uri = None
+        uri = among = None
         if item is not None and _EPISODE.fullmatch(item):
-            chosen = _only(client, item, chosen)
+            among = _only(client, item)
         elif item is not None:
             uri = full_id(client, item)
+            among = FilterEQ(key="benchmark_id", value=uri)
+        if wanted is not None:
+            _check_keys([client], wanted, among)
+        chosen = wanted if among is None else among if wanted is None else among & wanted
         copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run)
     ids = list(filter(None, copied))
     artifacts, episodes = (sum(counts) for counts in zip(*copied.values(), strict=True)) if copied else (0, 0)
@@ -228,7 +249,7 @@ def pull(
     )
 
 
-def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> BaseFilter:
+def _only(client: TupliAPIClient, episode: str) -> BaseFilter:
     """A filter for one episode of a server; NotFoundError if the server has none of this id."""
     from tupli_mcap.errors import NotFoundError
     from tupli_mcap.schema import FilterEQ
@@ -236,7 +257,7 @@ def _only(client: TupliAPIClient, episode: str, chosen: BaseFilter | None) -> Ba
     it = FilterEQ(key="id", value=episode)
     if not client.count_episodes(it):
         raise NotFoundError(f"there is no episode with id {episode!r} at {client.url}")
-    return it if chosen is None else it & chosen
+    return it
 
 
 def publish(
@@ -259,6 +280,7 @@ def publish(
     verb = "would publish" if dry_run else "published"
     with server_at(url) as client:
         uri = None if benchmark is None else full_id(client, benchmark)
+        _check_own(client, uri, chosen)
         if uri is not None:
             episodes, is_own = publish_benchmark(client, uri, group, chosen, dry_run=dry_run)
             shared = counted(episodes, "episode")
@@ -290,6 +312,7 @@ def unpublish(
     verb = "would hide" if dry_run else "hid"
     with server_at(url) as client:
         uri = None if benchmark is None else full_id(client, benchmark)
+        _check_own(client, uri, chosen)
         if uri is not None:
             episodes, is_whole = unpublish_benchmark(client, uri, group, chosen, dry_run=dry_run)
             hidden = counted(episodes, "episode")
@@ -306,6 +329,15 @@ def _chosen(benchmark: str | None, filter_text: str | None) -> BaseFilter | None
     if benchmark is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID or --filter")
     return filter_of(filter_text)
+
+
+def _check_own(client: TupliAPIClient, uri: str | None, chosen: BaseFilter | None) -> None:
+    """Checks the keys of a filter of `publish` or `unpublish` among the user's own episodes."""
+    from tupli_mcap.schema import FilterEQ
+
+    if chosen is not None:
+        own = FilterEQ(key="created_by", value=client.whoami().username)
+        _check_keys([client], chosen, own if uri is None else own & FilterEQ(key="benchmark_id", value=uri))
 
 
 def _tell_published(
