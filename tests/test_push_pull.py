@@ -588,3 +588,28 @@ def test_a_filter_whose_key_no_episode_has_is_an_error(admin: TupliAPIClient, tm
     assert admin.list_benchmarks(F("published_in") == "global") == []
     assert not (tmp_path / "new").exists()
     run("push", tmp_path / "cart", path.parent, "--filter", "metadata.score > 0")  # one of them has it
+
+
+def test_what_was_deleted_here_is_not_fetched_again(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri, mine = pushed(admin, tmp_path / "lab"), tmp_path / "mine"
+    run("pull", uri, "--storage", mine)
+    run("delete", mine, "--filter", "episode = 3")
+    for dry in (["--dry-run"], []):
+        result = CliRunner().invoke(app, ["pull", uri, "--storage", str(mine), *dry])
+        assert "fetch" in result.stdout and " 0 episodes of 1 benchmark" in result.stdout
+        assert "not copied: 1 episode that had been deleted there; `tupli-mcap restore" in result.stderr
+    assert run("restore", mine) == "restored 1 episode\n"
+    assert len(list(mine.rglob("*.mcap"))) == 1
+    with FileStorage(mine) as storage:
+        assert sorted(header.episode for header in storage.list_episodes()) == list(range(12))
+
+
+@pytest.mark.filterwarnings("ignore:skipped a recording")
+def test_a_damaged_file_with_deleted_episodes_does_not_keep_others_from_being_fetched(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    uri, mine = pushed(admin, tmp_path / "lab"), tmp_path / "mine"
+    run("pull", uri, "--storage", mine)
+    run("delete", mine, "--filter", "episode = 3")
+    next(mine.rglob("*.mcap")).write_bytes(b"no recording")
+    assert run("pull", uri, "--storage", mine) == f"fetched 12 episodes of 1 benchmark into {mine}\n"

@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -115,7 +115,11 @@ def _copy(
             warnings.warn(f"not copied: {len(headers)} episodes: {err}", stacklevel=4)
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
-        new = [header for header in headers if header.id not in held]
+        absent = [header for header in headers if header.id not in held]
+        deleted = _deleted_beside(target, held.values())
+        new = [header for header in absent if header.id not in deleted]
+        if len(new) < len(absent):
+            _say_what_was_deleted(target, len(absent) - len(new))
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = [
             (name, list(of)) for name, of in itertools.groupby(new, key=lambda header: header.recording)
@@ -138,6 +142,22 @@ def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, 
         warnings.warn(
             f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}", stacklevel=5
         )
+
+
+def _deleted_beside(target: TupliStorage, held: Iterable[EpisodeHeader]) -> set[str]:
+    """The ids of deleted episodes that a directory can restore, of the recordings whose other episodes it lists: in
+    another file they would come back twice."""
+    if not isinstance(target, FileStorage):
+        return set()
+    return set(target.deleted_episodes({header.recording for header in held}))
+
+
+def _say_what_was_deleted(target: TupliStorage, episodes: int) -> None:
+    """Warns of episodes that were deleted at the target: they stay so."""
+    hint = f"; `tupli-mcap restore {target.root}` restores them" if isinstance(target, FileStorage) else ""
+    warnings.warn(
+        f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}", stacklevel=5
+    )
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
