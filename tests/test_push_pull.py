@@ -613,3 +613,25 @@ def test_a_damaged_file_with_deleted_episodes_does_not_keep_others_from_being_fe
     run("delete", mine, "--filter", "episode = 3")
     next(mine.rglob("*.mcap")).write_bytes(b"no recording")
     assert run("pull", uri, "--storage", mine) == f"fetched 12 episodes of 1 benchmark into {mine}\n"
+
+
+def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "lab" / "run.mcap"
+    path.parent.mkdir()
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        for seed in range(3):
+            env.reset(seed=seed)
+            env.step(0)
+    run("push", path.parent)
+    run("delete", admin.url, "--filter", "episode = 1")
+    told = "not copied: 1 episode that had been deleted there\n"
+    for source, line in (
+        (path.parent, f"sent 0 episodes of 0 benchmarks to {admin.url}\n"),
+        (path, f"already there: 2 episodes of {path} at {admin.url}\n"),
+    ):
+        result = CliRunner().invoke(app, ["push", str(source)])
+        assert (result.exit_code, result.stdout, told in result.stderr) == (0, line, True)
+    tupli_mcap.open(path)[0].annotate(good=True)
+    result = CliRunner().invoke(app, ["push", str(path)])
+    assert result.stdout.startswith(f"sent 2 episodes of {path} to {admin.url}\n") and told in result.stderr
+    assert [header.episode for header in admin.list_episodes()] == [0, 2]

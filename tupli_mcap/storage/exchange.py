@@ -118,19 +118,19 @@ def _copy(
         absent = [header for header in headers if header.id not in held]
         deleted = _deleted_beside(target, held.values())
         new = [header for header in absent if header.id not in deleted]
-        if len(new) < len(absent):
-            _say_what_was_deleted(target, len(absent) - len(new))
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = [
             (name, list(of)) for name, of in itertools.groupby(new, key=lambda header: header.recording)
         ]
+        brought = len(new) if dry_run else 0
         for i, (name, of) in enumerate(groups, start=1):
             if not dry_run:
                 numbers = [header.episode for header in of]
-                _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
+                brought += _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
+        _say_what_was_deleted(target, len(absent) - brought)
         if uri and isinstance(target, FileStorage) and not dry_run:
             _vouch(target, uri)
-        copied[uri] = Copied(artifacts, len(new))
+        copied[uri] = Copied(artifacts, brought)
     return copied
 
 
@@ -154,6 +154,8 @@ def _deleted_beside(target: TupliStorage, held: Iterable[EpisodeHeader]) -> set[
 
 def _say_what_was_deleted(target: TupliStorage, episodes: int) -> None:
     """Warns of episodes that were deleted at the target: they stay so."""
+    if not episodes:
+        return
     hint = f"; `tupli-mcap restore {target.root}` restores them" if isinstance(target, FileStorage) else ""
     warnings.warn(
         f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}", stacklevel=5
@@ -183,13 +185,14 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
 
 def _copy_recording(
     source: TupliStorage, target: TupliStorage, uri: str, name: str, numbers: Sequence[int], place: str
-) -> None:
-    """Copies episodes of a recording, of the benchmark `uri` if that is not empty."""
+) -> int:
+    """Copies episodes of a recording, of the benchmark `uri` if that is not empty; returns how many the target has
+    taken."""
     with _file_with(source, name, numbers, place) as path:
         if isinstance(target, TupliAPIClient):
             with progress(path.stat().st_size, f"sending {place}", in_bytes=True) as bar:
-                target.send(path, bar.advance, file_name(name))
-            return
+                sent = target.send(path, bar.advance, file_name(name))
+            return _stored(target, sent.name)
         if uri or not isinstance(target, FileStorage):
             goal = target.new_recording_path(uri)
         else:
@@ -197,6 +200,12 @@ def _copy_recording(
         with os_errors("cannot write", goal), fill(goal) as new:
             shutil.copyfile(path, new)
         target.ingest(goal)
+    return len(numbers)
+
+
+def _stored(client: TupliAPIClient, name: str) -> int:
+    """How many episodes of a recording a server has: those that were deleted there are not stored again."""
+    return client.count_episodes(FilterEQ(key="recording", value=name))
 
 
 def _unused(path: Path) -> Path:
@@ -281,7 +290,9 @@ def push_recording(
             return Pushed("", recording.benchmark_id, len(recording), False)
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
             sent = client.send(kept, bar.advance, path.name if name is None else file_name(name))
-        return Pushed(sent.name, recording.benchmark_id, len(recording), sent.was_there)
+        stored = _stored(client, sent.name)
+        _say_what_was_deleted(client, len(recording) - stored)
+        return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)
 
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:
