@@ -177,6 +177,7 @@ class TestTables:
         with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
             assert "No index" not in client.get("/episodes", params=asked).text
             monkeypatch.setattr(lists, "_MANY", 2)
+            monkeypatch.setattr(lists, "_ASKED", 2)
             (code,) = re.findall(
                 "This makes one: <code>(.*?)</code>", client.get("/episodes", params=asked).text
             )
