@@ -468,7 +468,7 @@ def test_chunks_of_one_size_are_not_swapped(tmp_path: Path) -> None:
     path.write_bytes(swapped)
     with (
         Recording(path) as recording,
-        pytest.raises(FormatError, match="the chunk is damaged, or was replaced"),
+        pytest.raises(FormatError, match="its CRC differs; the chunk is damaged"),
     ):
         recording.read()
 

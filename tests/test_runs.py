@@ -190,6 +190,7 @@ class TestRun:
             "-cart-",
         ]
 
+    @pytest.mark.filterwarnings("ignore:all episodes are on one side")  # ids of runs are random
     def test_in_filters_of_files_and_of_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")
         for i, rate in enumerate((1e-4, 1e-2)):
