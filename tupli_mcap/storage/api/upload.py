@@ -41,10 +41,8 @@ def send_file(
 ) -> Sent:
     """Sends a recording.
 
-    name: of its file here, which becomes part of its name on the server.
-
-    sent_before: episodes with lower numbers were sent before, in parts; those that the server lacks were deleted there,
-        and stay so.
+    name: of its file here, which becomes part of its name on the server. sent_before: episodes with lower numbers were
+        sent before, in parts; those that the server lacks were deleted there, and stay so.
 
     Raises:
         UnreachableError: the server does not answer, or the connection breaks again and again.
