@@ -124,10 +124,14 @@ def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str,
         .where(of_dataset(key), seen)
         .group_by(TALLY.c.created_by, TALLY.c.published_in)
     )
-    known, counts = known_audiences(connection, visit.caller), Counter[tuple[str, tuple[str, ...]]]()
-    for name, groups, count in connection.execute(query):
-        owner = unescape_text(name)
-        counts[owner, tuple(known(owner, json.loads(groups)))] += int(count)
+    found = [
+        (unescape_text(owner), json.loads(groups), count)
+        for owner, groups, count in connection.execute(query)
+    ]
+    known = known_audiences(connection, visit.caller, {name for _, groups, _ in found for name in groups})
+    counts = Counter[tuple[str, tuple[str, ...]]]()
+    for owner, groups, count in found:
+        counts[owner, tuple(known(owner, groups))] += int(count)
     return [
         {"owner": owner, "published_in": list(groups), "episodes": count}
         for (owner, groups), count in counts.items()

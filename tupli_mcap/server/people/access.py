@@ -7,7 +7,7 @@ name. An item can be read by its owner, and by users with the right to read in a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, Final, NamedTuple, TypeVar
 
 from sqlalchemy import Connection, FromClause, and_, not_, or_, select
@@ -151,15 +151,19 @@ def _seen(caller: Caller, rows: FromClause) -> ColumnElement[bool]:
     return readable(caller, Right.EPISODE_READ, rows.c.created_by, rows.c.published_in)
 
 
-def known_audiences(connection: Connection, caller: Caller) -> Callable[[str, Sequence[str]], list[str]]:
-    """A function of an item's owner and groups: those of the groups that the caller may know of. Every list of groups
-    that is sent goes through it.
+def known_audiences(
+    connection: Connection, caller: Caller, among: Set[str]
+) -> Callable[[str, Sequence[str]], list[str]]:
+    """A function of an item's owner and groups (some `among` these): those of the groups that the caller may know of.
+    Every list of groups that is sent goes through it.
 
     Nobody is told of groups that are gone. The owner knows the others; everybody else, their own and `global`, and with
     the right to read groups or users in `global`, the names of these.
     """
-    groups = set(connection.execute(select(GROUP.c.name)).scalars())
-    users = set(connection.execute(select(USER.c.name)).scalars())
+    groups, users = (
+        set(connection.execute(select(table.c.name).where(table.c.name.in_(among))).scalars())
+        for table in (GROUP, USER)
+    )
     there = {GLOBAL, *groups, *users}
     known = there & {GLOBAL, *caller.rights}
     known |= groups if caller.may(Right.GROUP_READ) else set()
@@ -174,7 +178,7 @@ def known_audiences(connection: Connection, caller: Caller) -> Callable[[str, Se
 
 def as_told(connection: Connection, caller: Caller, items: Sequence[_Item]) -> list[_Item]:
     """The same items, but published only in groups of which the caller may know."""
-    known = known_audiences(connection, caller)
+    known = known_audiences(connection, caller, {name for item in items for name in item.published_in})
     return [
         item.model_copy(update={"published_in": known(item.created_by, item.published_in)}) for item in items
     ]
