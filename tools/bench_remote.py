@@ -33,7 +33,7 @@ class Link(http.server.BaseHTTPRequestHandler):
     """Serves ranges of one file, all connections together no faster than the link."""
 
     protocol_version = "HTTP/1.1"
-    disable_nagle_algorithm = True  # as web servers do; else the end of an answer waits for an acknowledgement
+    disable_nagle_algorithm = True  # as web servers do: else the end of an answer waits for the client
     data = b""
     free_at = 0.0
     lock = threading.Lock()
