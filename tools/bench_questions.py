@@ -273,8 +273,8 @@ async def at_once(
     async def client(number: int) -> None:
         rng = random.Random(number)
         reader = list(readers.values())[number % len(readers)]
+        await asyncio.sleep(rng.random())  # whoever connects in the same moment gets the same process
         stream = await asyncio.open_connection("127.0.0.1", server.port)
-        await asyncio.sleep(rng.random())
         while (begun := time.perf_counter()) < end:
             question = rng.choice(asked)
             took = await ask(*stream, reader.asks(question, rng), question.kind)
