@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 import os
 import stat
 import struct
@@ -42,7 +41,6 @@ from tupli_mcap.mcap.records import CHUNK_HEAD, MAGIC, MESSAGE_INDEX, PROFILE, b
 
 REPEATED = ".repeated"
 """End of the name of metadata that are repeated at the end of a file: viewers warn of two records of one name."""
-Compression = str  # "zstd", "lz4" or "none"
 
 CHUNK_ROWS = np.dtype(
     [
@@ -51,6 +49,7 @@ CHUNK_ROWS = np.dtype(
     ]
 )  # fmt: skip
 COMPRESSIONS = ["none", "zstd", "lz4"]
+_NAMES = [b"", b"zstd", b"lz4"]  # as chunks name them
 _ROW = struct.Struct("<QQQQIIIHBB")  # of CHUNK_ROWS
 _TOGETHER = 64  # chunks compressed and written at once
 _PIECES = 1024  # buffers that one call of the system takes
@@ -110,15 +109,13 @@ class Container:
     Not thread-safe, but the function that `start_chunks` returns may be called from another thread.
     """
 
-    def __init__(self, fd: int, name: str, compression: Compression) -> None:
+    def __init__(self, fd: int, name: str, compression: str) -> None:
         if compression not in COMPRESSIONS:
             raise RecordingError(f"compression: expected one of {COMPRESSIONS}, found {compression!r}")
         self._fd = fd
         self._is_pipe = fd >= 0 and stat.S_ISFIFO(os.fstat(fd).st_mode)
         self._name = name
-        self._compression = compression
-        method = b"" if compression == "none" else compression.encode()
-        self._method = method, COMPRESSIONS.index(compression)
+        self.compression = compression
         self._local = threading.local()  # a compressor for each thread
         self.position = 0
         self.schemas: dict[int, Schema] = {}
@@ -134,12 +131,6 @@ class Container:
         self.codecs: Mapping[int, Encoder] = {}  # by channel; rows of other channels are written as they are
         self._announced: set[int] = set()
         self._definitions: dict[int, tuple[Channel, bytes]] = {}
-        self._entries: np.ndarray[Any, Any] = np.empty((0, 2), "<u8")  # of message indexes; used again
-
-    @property
-    def compression(self) -> Compression:
-        """How chunks are compressed."""
-        return self._compression
 
     def close(self) -> None:
         """Forgets the descriptor, whose number may soon be another file's; the caller closes it."""
@@ -249,10 +240,10 @@ class Container:
             RecordingError: there is no memory for it.
         """
         with self._memory_for(len(data)):
-            if self._compression == "zstd":
+            if self.compression == "zstd":
                 packed: bytes = self._zstd().compress(data)
                 return packed
-            if self._compression == "lz4":
+            if self.compression == "lz4":
                 framed: bytes = lz4.frame.compress(data)
                 return framed
             return bytes(data)
@@ -270,7 +261,7 @@ class Container:
     @property
     def packs_together(self) -> bool:
         """True if `pack_all` releases the interpreter lock once for all chunks, so that a thread pays."""
-        return self._compression == "zstd" and hasattr(self._zstd(), "multi_compress_to_buffer")
+        return self.compression == "zstd" and hasattr(self._zstd(), "multi_compress_to_buffer")
 
     def pack_all(self, data: Sequence[Any]) -> list[Any]:
         """`pack` of several chunks, as bytes or buffers."""
@@ -309,51 +300,26 @@ class Container:
             self._place(chunks, data)
 
     def _place(self, chunks: Sequence[Prepared], packed: Sequence[Any]) -> None:
-        name, method = self._method
+        method = COMPRESSIONS.index(self.compression)
         records, notes = [], []
         position = self.position
-        indexes = self._message_indexes(chunks)
-        for (rows, skip, data, crc), body, entries in zip(chunks, packed, indexes, strict=True):
+        for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
+            entries = np.stack([rows.times, rows.offsets + np.uint64(skip)], axis=1).tobytes()
             start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
-            head = _chunk_head(name, len(body), (start, end, size, crc))
+            head = _chunk_head(_NAMES[method], len(body), (start, end, size, crc))
             index = MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), rows.channel, len(entries))
-            length, index_length = len(head) + len(body), len(index) + len(entries)
-            found = (start, end, position, length, rows.channel, position + length, index_length)
-            entry = _chunk_index(name, found, (len(body), size))
+            length = len(head) + len(body)
             row = (position, length, size, rows.first, count, skip, crc, rows.channel, method, 0)
-            notes.append((entry, start, end, row))
+            notes.append((row, start, end))
             records += [head, body, index, entries]
-            position += length + index_length
+            position += length + len(index) + len(entries)
         self.write(*records)
         for note in notes:
-            self._note(*note)
-
-    def _message_indexes(self, chunks: Sequence[Prepared]) -> list[np.ndarray[Any, Any]]:
-        """The entries of the chunks' MessageIndex records, as arrays."""
-        ends = list(itertools.accumulate(len(chunk.rows.offsets) for chunk in chunks))
-        if ends[-1] > len(self._entries):
-            self._entries = np.empty((ends[-1], 2), "<u8")
-        entries, found, begin = self._entries, [], 0
-        data = entries.view(np.uint8).reshape(-1)
-        for (rows, skip, _, _), end in zip(chunks, ends, strict=True):
-            entries[begin:end, 0] = rows.times
-            entries[begin:end, 1] = rows.offsets
-            if skip:
-                entries[begin:end, 1] += np.uint64(skip)
-            found.append(data[16 * begin : 16 * end])
-            begin = end
-        return found
+            self.note_chunk(*note)
 
     def note_chunk(self, row: tuple[int, ...], start: int, end: int) -> None:
         """Notes a chunk that is in the file, for the summary and the index: a row of CHUNK_ROWS, its times (ns)."""
-        offset, length, size, _, rows, _, _, channel, method, _ = row
-        name = COMPRESSIONS[method].replace("none", "").encode()
-        place = (start, end, offset, length, channel, offset + length, MESSAGE_INDEX.size + 16 * rows)
-        packed = length - CHUNK_HEAD.size - len(name) - 8
-        self._note(_chunk_index(name, place, (packed, size)), start, end, row)
-
-    def _note(self, index: bytes, start: int, end: int, row: tuple[int, ...]) -> None:
-        self.chunk_indexes.append(index)
+        self.chunk_indexes.append(_chunk_index(row, start, end))
         self.chunk_rows += _ROW.pack(*row)
         channel, rows = row[7], row[4]
         self._announced.add(channel)
@@ -422,11 +388,11 @@ def _chunk_head(name: bytes, packed: int, facts: tuple[int, int, int, int]) -> b
     return CHUNK_HEAD.pack(Opcode.CHUNK, length, *facts, len(name)) + name + packed.to_bytes(8, "little")
 
 
-def _chunk_index(name: bytes, facts: tuple[int, ...], sizes: tuple[int, int]) -> bytes:
-    """A ChunkIndex record of a chunk with one message index."""
-    *place, channel, index_offset, index_length = facts
-    length = _CHUNK_INDEX.size - 9 + len(name) + _SIZES.size
-    index = 10, channel, index_offset, index_length
-    return (
-        _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *place, *index, len(name)) + name + _SIZES.pack(*sizes)
-    )
+def _chunk_index(row: tuple[int, ...], start: int, end: int) -> bytes:
+    """The ChunkIndex record of a chunk, whose message index follows it; `row` is one of CHUNK_ROWS."""
+    offset, length, size, _, rows, _, _, channel, method, _ = row
+    name = _NAMES[method]
+    index = 10, channel, offset + length, MESSAGE_INDEX.size + 16 * rows
+    whole = _CHUNK_INDEX.size - 9 + len(name) + _SIZES.size
+    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, whole, start, end, offset, length, *index, len(name))
+    return head + name + _SIZES.pack(length - CHUNK_HEAD.size - len(name) - 8, size)
