@@ -48,43 +48,23 @@ def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
     return whole, running
 
 
-def group_records(data: memoryview, *, sealed: bool = False) -> list[Rows]:
-    """The records in `data` by channel, in their order; with `sealed`, `publish_time` replaces their checksums."""
+def group_records(data: memoryview) -> list[Rows]:
+    """The records in `data`, which have no checksums, by channel, in their order."""
     whole = bytes(data)
     groups: dict[int, tuple[int, list[bytes]]] = {}
     for start, end, channel, sequence, _ in iter_records(data):
         groups.setdefault(channel, (sequence, []))[1].append(whole[start:end])
-    return [_rows_of(channel, *group, sealed=sealed) for channel, group in groups.items()]
-
-
-class EvenRecords(bytes):
-    """Several records of one channel, each of `size` bytes."""
-
-    size: int
-
-    @classmethod
-    def of(cls, table: np.ndarray[Any, Any]) -> EvenRecords:
-        """The rows of a table."""
-        records = cls(table.tobytes())
-        records.size = table.dtype.itemsize
-        return records
-
-
-def _count(records: bytes) -> int:
-    return len(records) // records.size if isinstance(records, EvenRecords) else 1
-
-
-def _rows_of(channel: int, first: int, records: list[bytes], *, sealed: bool) -> Rows:
-    """Whole records of one channel; the first has sequence `first`."""
-    sizes = np.repeat(
-        [one.size if isinstance(one, EvenRecords) else len(one) for one in records],
-        [_count(one) for one in records],
-    )
-    return as_rows(channel, first, bytearray().join(records), sizes, sealed=sealed)
+    return [
+        as_rows(channel, first, bytearray().join(records), list(map(len, records)), sealed=False)
+        for channel, (first, records) in groups.items()
+    ]
 
 
 def as_rows(channel: int, first: int, joined: bytearray, sizes: Any, *, sealed: bool) -> Rows:
-    """Whole records of one channel that lie in `joined` one after the other, each of its number of bytes in `sizes`."""
+    """Whole records of one channel that lie in `joined` one after the other; `sizes` are their numbers of bytes.
+
+    With `sealed`, `publish_time` replaces their checksums.
+    """
     offsets = np.zeros(len(sizes), dtype=np.uint64)
     np.cumsum(sizes[:-1], out=offsets[1:])
     log_times = offsets[:, None] + np.arange(_LOG_TIME, _LOG_TIME + 8, dtype=np.uint64)
@@ -190,6 +170,9 @@ class EventLog:
         whole, self._whole = self._whole, defaultdict(list)
         for channel, records in whole.items():
             if records:
-                before = sum(map(_count, records)) + (kept if channel == self._last_channel else 0)
-                self._sink(_rows_of(channel, self.sequences[channel] - before, records, sealed=True))
+                first = (
+                    self.sequences[channel] - len(records) - (kept if channel == self._last_channel else 0)
+                )
+                sizes = list(map(len, records))
+                self._sink(as_rows(channel, first, bytearray().join(records), sizes, sealed=True))
         self._behind[0] = self._file_size()

@@ -16,7 +16,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
-from tupli_mcap.journal.logs import FRONT, EvenRecords, EventLog, Sink
+from tupli_mcap.journal.logs import FRONT, EventLog, Sink
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, crc32_each
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
@@ -222,7 +222,7 @@ class EpisodeLog(EventLog):
             self.flush()
         for channel, table in tables.items():
             if len(table):
-                self._whole[channel].append(EvenRecords.of(table))
+                self._whole[channel] += table.view(f"V{table.dtype.itemsize}").tolist()
                 self.sequences[channel] += len(table)
         self._can_drop = False
         if size > self._capacity:

@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space, iterate
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
-from tupli_mcap.journal.logs import FRONT, STATE, Sink, as_rows, group_records, seal
+from tupli_mcap.journal.logs import FRONT, STATE, Sink, as_rows, seal
+from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
@@ -126,7 +127,6 @@ class StepLog:
         self._records = [buffer[h * area.half + LOG_HEADER : (h + 1) * area.half] for h in range(2)]
         self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
         self._half = self._position = self._emitted = 0
-        self._sizes: list[int] = []  # of the records that are not in the file yet
         self._write_pending(0)
 
     def begin_episode(self, episode: int) -> None:
@@ -190,7 +190,6 @@ class StepLog:
             sink.put(image)
         self._ends[self._half][0] = end
         self._position = end
-        self._sizes.append(size)
         self.total += prepared.reward
 
     def put_whole(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
@@ -213,7 +212,6 @@ class StepLog:
         records[start : start + BODY] = out[:BODY]
         self._ends[self._half][0] = end
         self._position = end
-        self._sizes.append(size)
         self.count += 1
         self._step += 1
         self.total += total
@@ -272,12 +270,10 @@ class StepLog:
         self._emit(self._records[self._half][begin : self._position])
 
     def _emit(self, records: memoryview) -> None:
-        sizes, self._sizes = self._sizes, []
-        if sum(sizes) != len(records):  # a step was interrupted: what the journal says counts
-            for rows in group_records(records, sealed=True):
-                self._sink(rows)
-        elif sizes:
+        places = message_places(records)
+        if len(places):
             (first,) = _SEQUENCE.unpack_from(records, _SEQUENCE_AT)
+            sizes = places[:, 1] - places[:, 0]
             self._sink(as_rows(self._channel, first, bytearray(records), sizes, sealed=True))
 
 
