@@ -34,7 +34,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
-from tupli_mcap.mcap.chunks import message_headers
+from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
@@ -683,11 +683,11 @@ def test_headers_of_a_chunk_are_read_once_not_for_each_episode(
     hit(path, chunks(path, "/step")[3])
     calls = []
 
-    def counted(data: memoryview) -> Any:
+    def counted(data: Any, most: int) -> Any:
         calls.append(len(data))
-        return message_headers(data)
+        return message_places(data, most)
 
-    monkeypatch.setattr("tupli_mcap.recording.recover.evidence.message_headers", counted)
+    monkeypatch.setattr("tupli_mcap.recording.columns.chunk_store.message_places", counted)
     report, recording = recovered(path)
     with recording:
         assert len(recording.episodes) > 500

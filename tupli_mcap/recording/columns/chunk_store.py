@@ -11,7 +11,7 @@ import os
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from mmap import mmap
 from typing import Any, NamedTuple, Protocol
 
@@ -102,6 +102,12 @@ class ChunkCache:
         ChunkCache.__init__(self, state["budget"])
 
 
+class Memory(Protocol):
+    """Rows that are in no chunk of the file, by their number."""
+
+    def __getitem__(self, i: int, /) -> Any: ...
+
+
 class Decoder(Protocol):
     """Turns the chunks of a channel into rows of constant size."""
 
@@ -145,7 +151,7 @@ class ChunkStore:
     """
 
     def __init__(
-        self, source: Source, table: np.ndarray[Any, Any], memory: Sequence[bytes], cache: int | ChunkCache
+        self, source: Source, table: np.ndarray[Any, Any], memory: Memory, cache: int | ChunkCache
     ) -> None:
         self._source = source
         self.table = table
@@ -404,11 +410,15 @@ class ChunkStore:
                 yield row, log_time, body
                 row += 1
 
-    def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
-        """The CDR bodies of messages of a channel of variable layout."""
-        self.fetch(span.chunk for span in self.spans(channel, first, count))
+    def messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, memoryview]]:
+        """(log_time, CDR body) of messages of a channel of variable layout."""
         for span in self.spans(channel, first, count):
             data, records = self.records(span.chunk)
             view = memoryview(data)
             for start, end in records[span.begin : span.end].tolist():
-                yield view[start + BODY : end]
+                yield int.from_bytes(view[start + 15 : start + 23], "little"), view[start + BODY : end]
+
+    def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
+        """The CDR bodies of messages of a channel of variable layout, whose chunks are fetched together."""
+        self.fetch(span.chunk for span in self.spans(channel, first, count))
+        return (body for _, body in self.messages(channel, first, count))

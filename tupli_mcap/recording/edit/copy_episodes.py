@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
@@ -215,11 +214,7 @@ class EpisodeCopier:
 
     def _messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
         """(log_time, body) of messages of a channel."""
-        for span in self._store.spans(channel, first, count):
-            loaded, records = self._store.records(span.chunk)
-            data = memoryview(loaded)
-            for start, end in records[span.begin : span.end].tolist():
-                yield int.from_bytes(data[start + 15 : start + 23], "little"), bytes(data[start + BODY : end])
+        return ((time_ns, bytes(body)) for time_ns, body in self._store.messages(channel, first, count))
 
     def _step_messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, bytes]]:
         """(log_time, body) of steps of variable size, with new values, or without some fields."""

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -19,19 +19,18 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import Chunk, chunk_records, message_headers
+from tupli_mcap.mcap.chunks import Chunk, chunk_records
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, Rows
-from tupli_mcap.mcap.records import BODY, MAGIC, PROFILE, Summary, foreign, parse_record
+from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign, parse_record
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import ChunkClaim, Damage, Found, Walk
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
-from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore, Span
+from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 
 _CACHE = 64 << 20
-_HEADERS = 16  # chunks whose headers are cached, for reading single messages
 
 
 @dataclass
@@ -87,7 +86,7 @@ class RepairedChunk(NamedTuple):
     skip: int
 
 
-class _Loaded(Sequence[bytes]):
+class _Loaded:
     """Rows that are in no good chunk: of the journal, or of a chunk with a damaged header, which is read on access."""
 
     def __init__(self, source: Source) -> None:
@@ -95,16 +94,7 @@ class _Loaded(Sequence[bytes]):
         self._walk = Walk(source)
         self.places: list[Rows | RepairedChunk] = []
 
-    def __len__(self) -> int:
-        return len(self.places)
-
-    @overload
-    def __getitem__(self, i: int) -> bytes: ...
-    @overload
-    def __getitem__(self, i: slice) -> Sequence[bytes]: ...
-    def __getitem__(self, i: int | slice) -> Any:
-        if isinstance(i, slice):
-            return [self[k] for k in range(len(self))[i]]
+    def __getitem__(self, i: int) -> Any:
         place = self.places[i]
         if isinstance(place, Rows):
             return place.data
@@ -189,7 +179,7 @@ class Evidence:
 
     def load(self, place: Rows | RepairedChunk, channel: int, first: int, rows: int, size: int) -> Piece:
         """A piece of rows that are in no good chunk, of `size` bytes, for `add`."""
-        entry = memory_entry(len(self.loaded), channel, first, rows, size)
+        entry = memory_entry(len(self.loaded.places), channel, first, rows, size)
         self.loaded.places.append(place)
         return Piece(first, rows, entry)
 
@@ -256,7 +246,6 @@ class PackedStore(ChunkStore):
                 for piece, first in zip(pieces, counts[:-1], strict=True)
             ]
         super().__init__(evidence.source, np.array(table, CHUNK_ROWS), evidence.loaded, _CACHE)
-        self._headers: dict[int, Array] = {}  # of the chunks used last
 
     def packed(self, channel: int, row: int) -> int:
         """The number that a found row has in this store."""
@@ -264,22 +253,9 @@ class PackedStore(ChunkStore):
         at = bisect.bisect_right(firsts, row) - 1
         return counts[at] + row - firsts[at]
 
-    def messages_of(self, span: Span) -> Iterator[tuple[int, memoryview]]:
-        """(log_time, body) of the messages of a span."""
-        data = memoryview(self.load(span.chunk))
-        headers = self._headers.get(span.chunk)
-        if headers is None:
-            while len(self._headers) >= _HEADERS:
-                del self._headers[next(iter(self._headers))]
-            headers = self._headers[span.chunk] = message_headers(data)
-        for header in headers[span.begin : span.end]:
-            start = int(header["#offset"])
-            yield int(header["#log_time"]), data[start + BODY : start + 9 + int(header["#length"])]
-
     def message(self, channel: int, row: int) -> bytes:
         """The body of one message."""
-        (span,) = self.spans(channel, row, 1)
-        ((_, body),) = self.messages_of(span)
+        ((_, body),) = self.messages(channel, row, 1)
         return bytes(body)
 
 

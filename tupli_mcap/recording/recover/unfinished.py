@@ -135,8 +135,8 @@ class _Made:
         """
         if channel not in self._next:
             count, latest = self._store.count(channel), 0
-            for span in self._store.spans(channel, count - 1, 1) if count else ():
-                ((latest, _),) = self._store.messages_of(span)
+            if count:
+                ((latest, _),) = self._store.messages(channel, count - 1, 1)
             self._next[channel] = count, latest
         row, latest = self._next[channel]
         time = max(time, latest)

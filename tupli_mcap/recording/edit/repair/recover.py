@@ -16,11 +16,10 @@ from tupli_mcap.mcap.records import MAGIC, OTHER_TOOLS
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import Damage, attachment_name
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.assemble import replacing, tidy
-from tupli_mcap.recording.edit.repair.write import OldCameras, RepairWriter, frames_lost
+from tupli_mcap.recording.edit.repair.write import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_tail
@@ -286,8 +285,7 @@ def _recover_ours(
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
         report.infos_lost = _infos_lost(evidence, channels)
-        vector = Topics.of_step(evidence.channels[channels.steps[0]].topic).is_vector
-        report.frames_lost = frames_lost(evidence, OldCameras.of(evidence, len(channels.steps), vector))
+        report.frames_lost = writer.frames_lost
     writer.finish()
     if evidence.metadata is None:
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")

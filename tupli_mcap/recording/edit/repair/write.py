@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Container, library
+from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
@@ -28,13 +28,13 @@ from tupli_mcap.messages.frames import (
 )
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import Topics
-from tupli_mcap.recording.channels import Channels, register_channels
-from tupli_mcap.recording.edit.assemble import Assembler
-from tupli_mcap.recording.index import EpisodeRow
+from tupli_mcap.messages.topics import Topics, parse
+from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import intersection
+from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV
 
 RECOVERED = "recovered"  # key of the episode metadata that says which steps of which old episode these are
 _METADATA = {
@@ -44,6 +44,10 @@ _METADATA = {
     "created_ns": re.compile("[0-9]{1,20}", re.ASCII),
     "benchmark_id": re.compile(".*", re.DOTALL),
 }
+_SCHEMAS = {
+    "camera": (CAMERA_NAME, CAMERA_SCHEMA.encode()),
+    "frame": (FRAME_NAME, FRAME_SCHEMA.encode()),
+}  # by kind of the channel
 _COPY = 1 << 20
 
 
@@ -56,6 +60,7 @@ class RepairWriter:
         self._evidence = evidence
         self._now = time.time_ns()
         self.metadata_lost: list[str] = []
+        self.frames_lost = 0
 
     def begin(self, next_episode: int | None) -> None:
         """Writes magic, header, metadata and the good attachments; no later episode gets a number that was lost."""
@@ -99,53 +104,47 @@ class RepairWriter:
         if old.info is not None:
             schema = self._evidence.schemas.get(channels[old.info].schema_id)
             info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
-        cameras = OldCameras.of(self._evidence, len(old.steps), vector)
-        envs = len(old.steps) if vector else None
+        places = [Topics.of(env if vector else None) for env in range(len(old.steps))]
+        cameras = _cameras(self._evidence, places)
         store.codecs = image_codecs(layout, channels)
+        envs = len(places) if vector else None
         new = register_channels(
-            self._container,
-            "the repaired recording",
-            layout,
-            envs,
-            info,
-            cameras.names,
-            png_leaves(channels),
+            self._container, "the repaired recording", layout, envs, info, list(cameras), png_leaves(channels)
         )
         self._container.define_channels()
         rows: dict[int, int] = {}  # first row of each episode in the new file
         dtype = layout.step_message.dtype if layout.constant else None
-        by_env: dict[int, list[PlannedEpisode]] = {}
+        by_env: list[list[PlannedEpisode]] = [[] for _ in places]
         for episode in plan.episodes:
-            by_env.setdefault(episode.run.env, []).append(episode)
-        for env, channel in enumerate(old.steps):
-            episodes = by_env.get(env, [])
+            by_env[episode.run.env].append(episode)
+        for env, episodes in enumerate(by_env):
             at = 0
             for episode in episodes:
                 rows[episode.number] = at
                 at += episode.run.steps
-            self._copy(store, channel, new.steps[env], episodes, dtype, patch=True)
+            self._copy(store, old.steps[env], new.steps[env], episodes, dtype)
             for leaf, ids in zip(layout.images, new.images, strict=True):
                 image = old.images[leaf.name][env]
                 if image is not None:
-                    image_type = layout.image_messages[leaf.name].dtype
-                    self._copy(store, image, ids[env], episodes, image_type, patch=False)
-        self._events(store, old, new, plan, rows)
+                    self._copy(store, image, ids[env], episodes, layout.image_messages[leaf.name].dtype)
+        self._episodes(store, old, plan, rows)
         if old.info is not None and new.info is not None:
             self._target.add_messages(new.info, self._infos(store, old.info, plan))
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
-        for name, pairs in zip(cameras.names, cameras.ids, strict=True):
-            for env, pair in enumerate(pairs):
-                place = Topics.of(env if vector else None)
+        for name, pairs in cameras.items():
+            for pair, place, episodes in zip(pairs, places, by_env, strict=True):
+                self.frames_lost += _frames_lost(self._evidence, pair)
                 new_pair = topics[place.camera(name)], topics[place.frame(name)]
-                self._frames(store, pair, new_pair, by_env.get(env, []))
+                self._frames(store, pair, new_pair, episodes)
 
     def _frames(
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
     ) -> None:
         """Writes the frames of one camera; they keep their times."""
-        frames = partial(kept_frames, self._evidence, store, old, episodes)
-        self._target.add_messages(new[0], ((frame.time_ns, frame.picture) for frame in frames()))
-        self._target.add_messages(new[1], ((frame.time_ns, frame.pair) for frame in frames()))
+        frames = partial(_kept_frames, self._evidence, store, old, episodes)
+        pictures = ((time, store.message(old[0], store.packed(old[0], row))) for time, row, _ in frames())
+        self._target.add_messages(new[0], pictures)
+        self._target.add_messages(new[1], ((time, encode_pair(*place)) for time, _, place in frames()))
 
     def finish(self) -> None:
         """Writes the index, the summary and the footer."""
@@ -160,29 +159,22 @@ class RepairWriter:
         new: int,
         episodes: list[PlannedEpisode],
         dtype: np.dtype[Any] | None,
-        *,
-        patch: bool,
     ) -> None:
-        """Copies the rows of `episodes`; with `patch` they get the episodes' numbers, and steps from 0."""
+        """Copies the rows of `episodes`; steps get the episodes' numbers, and numbers from 0."""
         if dtype is None:
             self._target.add_messages(new, self._variable(store, old, episodes))
         else:
-            self._target.add_rows(new, self._constant(store, old, episodes, dtype, patch=patch))
+            self._target.add_rows(new, self._constant(store, old, episodes, dtype))
 
     def _constant(
-        self,
-        store: PackedStore,
-        channel: int,
-        episodes: Iterable[PlannedEpisode],
-        dtype: np.dtype[Any],
-        *,
-        patch: bool,
+        self, store: PackedStore, channel: int, episodes: Iterable[PlannedEpisode], dtype: np.dtype[Any]
     ) -> Iterator[Array]:
+        numbered = "episode" in (dtype.names or ())
         for episode in episodes:
             run = episode.run
             for span in store.spans(channel, store.packed(channel, run.row), run.steps):
                 rows: Array = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
-                if patch and not (episode.head and episode.number == run.episode):
+                if numbered and not (episode.head and episode.number == run.episode):
                     rows = np.frombuffer(bytearray(rows.tobytes()), dtype)
                     rows["episode"] = episode.number
                     rows["step"] -= run.step
@@ -193,54 +185,24 @@ class RepairWriter:
     ) -> Iterator[tuple[int, bytes]]:
         for episode in episodes:
             run = episode.run
-            step = 0
-            for span in store.spans(channel, store.packed(channel, run.row), run.steps):
-                for log_time, body in store.messages_of(span):
-                    numbers = episode.number.to_bytes(4, "little") + step.to_bytes(4, "little")
-                    yield log_time, numbers + bytes(body[8:])
-                    step += 1
+            messages = store.messages(channel, store.packed(channel, run.row), run.steps)
+            for step, (log_time, body) in enumerate(messages):
+                yield log_time, EPISODE_AND_STEP.pack(episode.number, step) + bytes(body[8:])
 
     # ---- episodes
 
-    def _events(
-        self,
-        store: PackedStore,
-        old: RecordedChannels,
-        new: Channels,
-        plan: Plan,
-        rows: dict[int, int],
-    ) -> None:
-        starts = sorted(plan.episodes, key=lambda e: (e.start.time, e.number))
-        ends = sorted(plan.episodes, key=lambda e: (e.end.time, e.number))
-        counts = itertools.accumulate(len(e.resets) + 1 for e in starts)
-        start_rows = {e.number: count - 1 for e, count in zip(starts, counts, strict=True)}
-        end_rows = {e.number: i for i, e in enumerate(ends)}
-        with_final = [e for e in ends if e.final is not None]
-        final_rows = {e.number: i for i, e in enumerate(with_final)}
+    def _episodes(self, store: PackedStore, old: RecordedChannels, plan: Plan, rows: dict[int, int]) -> None:
+        """Writes starts, ends and final states; `rows` are the first ones of the new episodes."""
         last = {e.run.episode: e.number for e in plan.episodes}
-        moved = {}
-        for episode in plan.episodes:
-            first = rows[episode.number]
-            text = self._metadata(episode, last[episode.run.episode] == episode.number)
-            end = episode.end.end._replace(first_row=first, metadata=text)
-            moved[episode.number] = end
-            row = EpisodeRow(
-                first, end.length, end.episode_return, episode.start.time, episode.end.time,
-                episode.start.start.seed_number,
-                start_rows[end.episode], end_rows[end.episode], final_rows.get(end.episode, -1),
-                end.episode, end.env, end.end,
-            )  # fmt: skip
-            self._target.index.add(row, text)
-        messages = (
-            (time, start._replace(first_row=rows[e.number]).encode())
-            for e in starts
-            for time, start, _ in (*e.resets, e.start)
-        )
-        self._target.add_messages(new.start, messages)
-        self._target.add_messages(new.end, ((e.end.time, moved[e.number].encode()) for e in ends))
-        self._target.add_messages(
-            new.final_state, ((e.end.time, self._final(e, store, old)) for e in with_final)
-        )
+        episodes = []
+        for e in sorted(plan.episodes, key=lambda e: (e.start.time, e.number)):
+            first = rows[e.number]
+            starts = [(time, start._replace(first_row=first)) for time, start, _ in (*e.resets, e.start)]
+            text = self._metadata(e, last[e.run.episode] == e.number)
+            end = e.end.end._replace(first_row=first, metadata=text)
+            final = None if e.final is None else (e.end.time, partial(self._final, e, store, old))
+            episodes.append(CopiedEpisode(starts, (e.end.time, end), e.number, final))
+        self._target.add_episodes(episodes)
 
     def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
         """The metadata of the old episode if its end was found, and for a part of it the key `recovered`."""
@@ -267,85 +229,61 @@ class RepairWriter:
     def _final(self, episode: PlannedEpisode, store: PackedStore, old: RecordedChannels) -> bytes:
         if old.final is None or episode.final is None or episode.final < 0:
             return final_state(self._evidence, episode)
-        numbers = (episode.number, episode.run.env)
         body = store.message(old.final, episode.final)
-        return b"".join(n.to_bytes(4, "little") for n in numbers) + body[8:]
+        return EPISODE_AND_ENV.pack(episode.number, episode.run.env) + body[8:]
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
         """The infos of steps that are kept, with the new numbers of these."""
         pieces = NewPlaces(plan.episodes)
         for _, log_time, body in store.all_messages(channel):
-            number, step = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
-            place = pieces.find(number, step)
+            place = pieces.find(*EPISODE_AND_STEP.unpack_from(body))
             if place is not None:
-                yield log_time, b"".join(n.to_bytes(4, "little") for n in place) + bytes(body[8:])
+                yield log_time, EPISODE_AND_STEP.pack(*place) + bytes(body[8:])
 
 
 # ---- frames: kept where the step is kept, and both picture and row were found
 
 
-class KeptFrame(NamedTuple):
-    """A picture's message and its renumbered `/frame` row; `time_ns` is the time of both."""
-
-    time_ns: int
-    picture: bytes
-    pair: bytes
-
-
-class OldCameras(NamedTuple):
-    """The cameras; `ids[i]` are the ids of `/camera` and `/frame` of camera `names[i]`, by sub-environment."""
-
-    names: tuple[str, ...]
-    ids: tuple[tuple[tuple[int, int], ...], ...]
-
-    @classmethod
-    def of(cls, evidence: Evidence, num_envs: int, vector: bool) -> OldCameras:
-        """The cameras whose channels are all known and have the right schemas."""
-        topics = {channel.topic: channel for channel in evidence.channels.values()}
-        cameras: dict[str, tuple[tuple[int, int], ...]] = {}
-        for name in camera_names({topic: channel.id for topic, channel in topics.items()}):
-            places = [Topics.of(env if vector else None) for env in range(num_envs)]
-            known = [(topics.get(place.camera(name)), topics.get(place.frame(name))) for place in places]
-            ids = tuple((a.id, b.id) for a, b in known if a is not None and b is not None)
-            if len(ids) == num_envs and all(_fits(evidence, *pair) for pair in known):
-                cameras[name] = ids
-        return cls(tuple(cameras), tuple(cameras.values()))
+def _cameras(evidence: Evidence, places: Sequence[Topics]) -> dict[str, list[tuple[int, int]]]:
+    """The ids of `/camera` and `/frame` by sub-environment, of cameras whose channels are all known and have the right
+    schemas."""
+    topics = {channel.topic: channel.id for channel in evidence.channels.values() if _fits(evidence, channel)}
+    found = {}
+    for name in camera_names(topics):
+        pairs = [(place.camera(name), place.frame(name)) for place in places]
+        if all(topic in topics for pair in pairs for topic in pair):
+            found[name] = [(topics[camera], topics[frame]) for camera, frame in pairs]
+    return found
 
 
-def _fits(evidence: Evidence, camera: Channel | None, frame: Channel | None) -> bool:
-    wanted = ((camera, CAMERA_NAME, CAMERA_SCHEMA), (frame, FRAME_NAME, FRAME_SCHEMA))
-    schemas = [(evidence.schemas.get(c.schema_id), name, text) for c, name, text in wanted if c is not None]
-    return all(s is not None and (s.name, s.data) == (name, text.encode()) for s, name, text in schemas)
+def _fits(evidence: Evidence, channel: Channel) -> bool:
+    """Whether a channel of a camera has the right schema."""
+    schema, topic = evidence.schemas.get(channel.schema_id), parse(channel.topic)
+    wanted = None if topic is None else _SCHEMAS.get(topic.kind)
+    return schema is not None and wanted == (schema.name, schema.data)
 
 
-def kept_frames(
+def _kept_frames(
     evidence: Evidence, store: PackedStore, ids: tuple[int, int], episodes: Sequence[PlannedEpisode]
-) -> Iterator[KeptFrame]:
-    """The frames of a sub-environment's episodes, with the new numbers of these."""
+) -> Iterator[tuple[int, int, tuple[int, int]]]:
+    """(log_time, row, new episode and step) of the frames of a sub-environment's episodes."""
     camera, frame = ids
     pieces = NewPlaces(episodes)
     for first, stop in intersection(evidence.ranges(camera), evidence.ranges(frame)):
         for span in store.spans(frame, store.packed(frame, first), stop - first):
             rows = store.rows(span.chunk, FRAME_LAYOUT.dtype)[span.begin : span.end]
-            numbers = rows["#sequence"].tolist()
-            values = zip(
-                numbers, rows["episode"].tolist(), rows["step"].tolist(), rows["#log_time"], strict=True
-            )
-            for row, number, step, time_ns in values:
+            names = ("#log_time", "#sequence", "episode", "step")
+            for time_ns, row, number, step in zip(*(rows[name].tolist() for name in names), strict=True):
                 place = pieces.find(number, step, state=True)
                 if place is not None:
-                    picture = store.message(camera, store.packed(camera, row))
-                    yield KeptFrame(int(time_ns), picture, encode_pair(*place))
+                    yield time_ns, row, place
 
 
-def frames_lost(evidence: Evidence, cameras: OldCameras) -> int:
-    """The number of frames that are known to have been recorded and are not whole."""
-    lost = 0
-    for pair in (pair for ids in cameras.ids for pair in ids):
-        whole = intersection(*(evidence.ranges(channel) for channel in pair))
-        stops = [ranges[-1][1] for ranges in map(evidence.ranges, pair) if ranges]
-        if evidence.tail.index is not None:
-            table = evidence.tail.index.chunks
-            stops += [int(table["rows"][table["channel"] == channel].sum()) for channel in pair]
-        lost += max(stops, default=0) - sum(b - a for a, b in whole)
-    return lost
+def _frames_lost(evidence: Evidence, ids: tuple[int, int]) -> int:
+    """The number of a camera's frames that are known to have been recorded and are not whole."""
+    whole = intersection(*map(evidence.ranges, ids))
+    counts = [evidence.stop(channel) for channel in ids]
+    if evidence.tail.index is not None:
+        table = evidence.tail.index.chunks
+        counts += [int(table["rows"][table["channel"] == channel].sum()) for channel in ids]
+    return max(counts) - sum(b - a for a, b in whole)
