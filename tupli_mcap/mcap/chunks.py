@@ -17,7 +17,7 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import COMPRESSIONS
+from tupli_mcap.mcap.container import COMPRESSIONS, index_entries
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
 
 MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
@@ -102,11 +102,8 @@ class ChunkRecords(NamedTuple):
         return int(self.headers["#channel"][0])
 
     def index_entries(self) -> Array:
-        """The entries that the chunk's MessageIndex must have: log_time and offset, uint64 (messages, 2)."""
-        entries = np.empty((len(self.headers), 2), "<u8")
-        entries[:, 0] = self.headers["#log_time"]
-        entries[:, 1] = self.headers["#offset"] + np.uint64(self.skip)
-        return entries
+        """The entries that the chunk's MessageIndex must have."""
+        return index_entries(self.headers["#log_time"], self.headers["#offset"], self.skip)
 
     @property
     def first(self) -> int:

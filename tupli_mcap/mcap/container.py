@@ -304,7 +304,7 @@ class Container:
         records, notes = [], []
         position = self.position
         for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
-            entries = np.stack([rows.times, rows.offsets + np.uint64(skip)], axis=1).tobytes()
+            entries = index_entries(rows.times, rows.offsets, skip).tobytes()
             start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
             head = _chunk_head(_NAMES[method], len(body), (start, end, size, crc))
             index = MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), rows.channel, len(entries))
@@ -386,6 +386,15 @@ def _chunk_head(name: bytes, packed: int, facts: tuple[int, int, int, int]) -> b
     """A Chunk record up to its `packed` bytes; `name` is the compression."""
     length = CHUNK_HEAD.size - 9 + len(name) + 8 + packed
     return CHUNK_HEAD.pack(Opcode.CHUNK, length, *facts, len(name)) + name + packed.to_bytes(8, "little")
+
+
+def index_entries(times: Any, offsets: Any, skip: int) -> np.ndarray[Any, np.dtype[np.uint64]]:
+    """The entries of a MessageIndex: log_time and offset of each message, uint64 (messages, 2); `offsets` are those
+    behind the first `skip` bytes of the chunk."""
+    entries = np.empty((len(times), 2), "<u8")
+    entries[:, 0] = times
+    np.add(offsets, np.uint64(skip), out=entries[:, 1])
+    return entries
 
 
 def _chunk_index(row: tuple[int, ...], start: int, end: int) -> bytes:

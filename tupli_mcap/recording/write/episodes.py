@@ -1,7 +1,4 @@
-"""Puts the starts and ends of episodes into the journal.
-
-This runs once an episode, with cold processor caches: keep the chains of calls short.
-"""
+"""Puts the starts and ends of episodes into the journal."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import functools
 import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
-from zlib import crc32
 
 import numpy as np
 
@@ -17,7 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import FRONT, EventLog, Sink
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, crc32_each
+from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, crc32_each
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
     START_FIELDS,
@@ -32,8 +28,6 @@ from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
-_RECORD = BODY - len(CDR_HEADER)  # bytes of a record before its CDR header
-_LENGTH = _RECORD - 9  # of which its length counts
 EPISODE_AND_ENV = struct.Struct("<II")
 _Fields = tuple[tuple[str, str, int], ...]
 # the fields that differ between messages of plain episodes: name, format, offset in the CDR body
@@ -89,23 +83,11 @@ class EpisodeLog(EventLog):
         """Adds an `/episode_start`."""
         given, drawn, options, info, time_ns, continued = reset
         seed = drawn if given is None else given
-        texts = start_texts("" if seed is None else str(seed), options, info)
-        tail = CDR_HEADER + START_FIELDS.pack(number, env, first_row, given is not None, continued) + texts
-        channel, sequences, position = self._start, self.sequences, self._position
-        row, end = sequences[channel], position + _RECORD + len(tail)
-        if end > self._capacity:
-            self.append(time_ns, (channel, tail[len(CDR_HEADER) :]))
-        else:
-            if time_ns > self.latest_ns:
-                self.latest_ns = time_ns
-            front = FRONT.pack(5, _LENGTH + len(tail), channel, row, self.latest_ns)
-            record = front + crc32(tail, crc32(front)).to_bytes(8, "little") + tail
-            sequences[channel] = row + 1
-            self._whole[channel].append(record)
-            self._records[position:end] = record
-            self._last, self._last_channel, self._can_drop = position, channel, True
-            self._position = self._commit[0] = end
-        return _new(StartedEpisode, (number, env, first_row, self.latest_ns, seed, row))
+        body = START_FIELDS.pack(number, env, first_row, given is not None, continued)
+        body += start_texts("" if seed is None else str(seed), options, info)
+        row = self.sequences[self._start]
+        time_ns = self.append(time_ns, (self._start, body))
+        return _new(StartedEpisode, (number, env, first_row, time_ns, seed, row))
 
     def end(
         self,
@@ -124,34 +106,14 @@ class EpisodeLog(EventLog):
         """
         number, env, first_row, start_time, seed, start_row = episode
         has_final = state is not None or final_row >= 0
-        end_tail = CDR_HEADER + END_FIELDS.pack(number, env, first_row, length, total, end, has_final)
-        end_tail += end_texts(metadata)
-        final, last, sequences, position = self._final, self._end, self.sequences, self._position
-        end_row = sequences[last]
+        body = END_FIELDS.pack(number, env, first_row, length, total, end, has_final) + end_texts(metadata)
+        end_row = self.sequences[self._end]
         if state is None:
-            now = self.append(now, (last, end_tail[len(CDR_HEADER) :]))
+            now = self.append(now, (self._end, body))
         else:
-            final_row = sequences[final]
-            final_tail = CDR_HEADER + EPISODE_AND_ENV.pack(number, env) + state
-            stop = position + 2 * _RECORD + len(final_tail) + len(end_tail)
-            if stop > self._capacity:
-                header = len(CDR_HEADER)
-                now = self.append(now, (final, final_tail[header:]), (last, end_tail[header:]))
-            else:
-                if now > self.latest_ns:
-                    self.latest_ns = now
-                else:
-                    now = self.latest_ns
-                front = FRONT.pack(5, _LENGTH + len(final_tail), final, final_row, now)
-                final_record = front + crc32(final_tail, crc32(front)).to_bytes(8, "little") + final_tail
-                front = FRONT.pack(5, _LENGTH + len(end_tail), last, end_row, now)
-                end_record = front + crc32(end_tail, crc32(front)).to_bytes(8, "little") + end_tail
-                sequences[final], sequences[last] = final_row + 1, end_row + 1
-                self._whole[final].append(final_record)
-                self._whole[last].append(end_record)
-                self._records[position:stop] = final_record + end_record
-                self._can_drop = False
-                self._position = self._commit[0] = stop
+            final_row = self.sequences[self._final]
+            final = EPISODE_AND_ENV.pack(number, env) + state
+            now = self.append(now, (self._final, final), (self._end, body))
         # no EpisodeRow: to make one takes as long as to add it
         row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)
