@@ -28,10 +28,9 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.check.report import Problem, VerifyReport
     from tupli_mcap.recording.check.verify import verify_recording
     from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
-    from tupli_mcap.recording.edit.carried import say_made_of
     from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
-    from tupli_mcap.recording.edit.rewrite import rewrite_recording
+    from tupli_mcap.recording.edit.rewrite import rewrite_recording, say_made_of
     from tupli_mcap.recording.edit.split import Part, split_recording
     from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
@@ -43,10 +42,9 @@ __getattr__ = imported_on_use(
         "check.report": "Problem VerifyReport",
         "check.verify": "verify_recording",
         "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
-        "edit.carried": "say_made_of",
         "edit.merge": "MergeReport merge_recordings",
         "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
-        "edit.rewrite": "rewrite_recording",
+        "edit.rewrite": "rewrite_recording say_made_of",
         "edit.split": "Part split_recording",
         "edit.trim": "trim_recording",
         "write.from_values": "EpisodeData write_recording",

@@ -4,9 +4,8 @@ assemble                          writes or copies the chunks of the new file, i
 copy_episodes                     copies episodes of a recording into it
 merge, split                      joins several recordings into one; splits one into several
 stream                            yields the bytes of a recording of some episodes while it is made
-rewrite                           a recording with fewer episodes
+rewrite                           a recording with fewer episodes; what is carried: runs, annotations, sources
 relabel, trim                     a recording with other values of steps; with fewer steps of episodes
 attach, annotate                  adds attachments; annotates episodes, and edits the run
-carried                           runs, annotations and sources of a recording that is made of others
 repair                            a recording made of a damaged one
 """

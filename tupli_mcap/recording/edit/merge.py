@@ -27,9 +27,14 @@ from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, replacing, tidy
-from tupli_mcap.recording.edit.carried import carry_runs, say_made_of
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
-from tupli_mcap.recording.edit.rewrite import camera_channels, define, new_metadata
+from tupli_mcap.recording.edit.rewrite import (
+    camera_channels,
+    carry_runs,
+    define,
+    new_metadata,
+    say_made_of,
+)
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, common_labels

@@ -1,22 +1,32 @@
-"""Rewrites a recording with fewer episodes or other attachments. Episode numbers, times and values stay."""
+"""Rewrites a recording with fewer episodes or other attachments; episode numbers, times and values stay.
+
+Also what every recording made of others carries: metadata, channels, runs, annotations, and which ones they are.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+import json
 import os
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.described import MADE_OF_NAME, MAX_MADE_OF
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, replacing
-from tupli_mcap.recording.edit.carried import carry_runs
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
@@ -160,3 +170,78 @@ def camera_channels(
         where = (container, source.name, source.layout, vector, None, (new.camera,))
         channels[new.camera] = register_channels(*where, png_leaves(source.file.contents.channels)).cameras
     return channels
+
+
+# ---- what a recording says about those that it is made of
+
+
+def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple[str, bytes]]:
+    """The attachments `run.json` and `annotations.json` of a recording made of `parts`.
+
+    Args:
+        parts: (recording, rows of its index, shift of their episode numbers), in the order of the episodes in the new
+            recording.
+    """
+    runs: list[Run] = []
+    places: list[int] = []
+    annotations = Annotations()
+    several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
+    for recording, rows, shift in parts:
+        said_runs = recording.runs if several else recording.recorded_runs.runs
+        at = np.searchsorted(recording.index["episode"], rows["episode"]).tolist()
+        for place in (recording.run_places[i] for i in at):
+            run = said_runs[place]
+            if run not in runs:
+                runs.append(run)
+            places.append(runs.index(run))
+        kept = set(rows["episode"].tolist())
+        for said in recording.annotations.said:
+            numbers = [number + shift for number in said.episodes if number in kept]
+            if numbers:
+                annotations.said.append(said._replace(episodes=numbers))
+    spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
+    found = {}
+    if runs and runs != [Run()]:
+        carried = RecordedRuns(runs, spans if len(runs) > 1 else ())
+        found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
+    if annotations.said:
+        found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, annotations.to_json())
+    return found
+
+
+def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[str, tuple[str, bytes]]:
+    """The attachment that names the sources of a new recording.
+
+    Args:
+        how: "merge", "filter", "map", "trim".
+        facts: other facts: the query, the function's name, the steps.
+    """
+    sources = list(sources)
+    document = {
+        "how": how,
+        **facts,
+        "sources": [
+            {
+                # without the folder, or the rest of a URL, which are private
+                "name": file_name(recording.name),
+                "uuid": recording.uuid,
+                "episodes": len(recording),
+                "sha256": hashlib.sha256(
+                    bytes.fromhex(recording.uuid) + recording.index.tobytes()
+                ).hexdigest(),
+            }
+            for recording in sources
+        ],
+    }
+    earlier = [said for recording in sources if (said := _said(recording)) is not None]
+    data = json.dumps({**document, "earlier": earlier} if earlier else document).encode()
+    if len(data) > MAX_MADE_OF:
+        data = json.dumps(document).encode()
+    return {MADE_OF_NAME: ("application/json", data)}
+
+
+def _said(recording: Recording) -> dict[str, Any] | None:
+    try:
+        return recording.made_of
+    except FormatError:  # damage of this attachment does not concern the steps
+        return None

@@ -11,9 +11,8 @@ import numpy as np
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.edit.carried import say_made_of
 from tupli_mcap.recording.edit.copy_episodes import Trim
-from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, write
+from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, say_made_of, write
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
