@@ -594,7 +594,7 @@ def test_areas_of_nothing(change: tuple[str, str], tmp_path: Path) -> None:
 def test_holes_of_a_journal_take_no_memory(tmp_path: Path) -> None:
     area = RowArea("steps", 64, 1 << 24)
     path = tmp_path / "a.journal"
-    text = json.dumps({"info": {}, "areas": [area.to_json()]}).encode()
+    text = json.dumps({"info": {}, "areas": [{"kind": "rows", **area._asdict()}]}).encode()
     head = struct.pack("<8sII", b"TMCAPJ1\0", len(text), zlib.crc32(text)) + text
     with path.open("wb") as file:
         file.write(head)

@@ -99,9 +99,6 @@ class RowArea(NamedTuple):
     def size(self) -> int:
         return 2 * self.half
 
-    def to_json(self) -> dict[str, Any]:
-        return {"kind": "rows", **self._asdict()}
-
 
 class LogArea(NamedTuple):
     """`halves` x `capacity` bytes of Message records; each half starts with its committed end (u64, 64 bytes)."""
@@ -117,9 +114,6 @@ class LogArea(NamedTuple):
     @property
     def size(self) -> int:
         return self.halves * self.half
-
-    def to_json(self) -> dict[str, Any]:
-        return {"kind": "log", **self._asdict()}
 
 
 Area = RowArea | LogArea
@@ -137,7 +131,9 @@ class Journal:
         self.path = path
         self.areas = {area.name: area for area in areas}
         self.info = dict(info)
-        header, self.offsets, size = _plan(areas, self.info)
+        text = json.dumps({"info": self.info, "areas": [_described(area) for area in areas]}).encode()
+        header = _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text
+        self.offsets, size = _place(areas, len(header))
         self._temporary = temporary = path.with_name(path.name + ".tmp")
         try:
             self._map, self._status = _create(temporary, size)
@@ -245,13 +241,6 @@ def _set_aside(path: Path, uuid: Any, replaced: str) -> None:
         f"{path} {whose} and is kept as {kept.name}: if that recording was renamed, "
         "rename its journal accordingly; if it was deleted, delete this too"
     )
-
-
-def _plan(areas: list[Area], info: Mapping[str, Any]) -> tuple[bytes, dict[str, int], int]:
-    body = {"info": dict(info), "areas": [area.to_json() for area in areas]}
-    text = json.dumps(body).encode()
-    header = _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text
-    return header, *_place(areas, len(header))
 
 
 def _place(areas: list[Area], header: int) -> tuple[dict[str, int], int]:
@@ -389,6 +378,10 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area]
             left = max(0, size - offsets[area.name])
             raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {left}")
     return info, areas, length
+
+
+def _described(area: Area) -> dict[str, Any]:
+    return {"kind": "rows" if isinstance(area, RowArea) else "log", **area._asdict()}
 
 
 def _area(entry: Mapping[str, Any]) -> Area:

@@ -59,7 +59,11 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         journal = None
     elif journal is not None and not belongs(journal.info, metadata):
         if defined:
-            warn(_foreign_journal(source, metadata))
+            place = None if source.path is None else recorded_journal(source.path, metadata)
+            warn(
+                f"{source.name} was not finished, and {place} is the journal of another recording: it is left alone, "
+                "and steps not yet in a chunk cannot be recovered"
+            )
         journal = None  # stale: of another recording with this name
     if journal is not None:
         take_journal(evidence, journal)
@@ -180,13 +184,20 @@ def _index(
 
 def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedChannels) -> Iterator[str]:
     """Warnings that say how many steps and which records are missing, and why."""
-    source = evidence.source
+    name = evidence.source.name
     for channel, steps in evidence.beyond.items():
         if steps and not journal.torn:
-            yield _gap(source, evidence.channels[channel].topic, steps)
+            yield (
+                f"{name}: the last {steps} step(s) of {evidence.channels[channel].topic} are left out, because steps "
+                "before them are missing: the file is damaged, or was copied before its journal (while a recording is "
+                "made, copy the journal first)"
+            )
     missing = size_behind(journal) - evidence.good_end
     if missing > 0:
-        yield _older(source, missing)
+        yield (
+            f"{name} ends {missing} bytes before the place where its journal goes on: ends of episodes and final "
+            "states are missing; while a recording is made, copy first its journal, then the file"
+        )
     steps = sum(evidence.left_out.values())
     for env, channel in enumerate(channels.steps):
         images = (ids[env] for ids in channels.images.values())
@@ -195,7 +206,11 @@ def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedCh
         )
         steps += max(0, evidence.stop(channel) - whole)
     if steps and journal.torn:
-        yield _torn(source, steps)
+        yield (
+            f"{name}: the machine that recorded it was restarted afterwards, or this is another machine: {steps} "
+            "step(s) in its journal cannot be shown to be whole and are left out; on the machine and boot that "
+            'recorded it, they can be read: finish the recording there, with "tupli-mcap recover" or by appending to it'
+        )
 
 
 def _check_unchanged(source: Source) -> None:
@@ -219,34 +234,4 @@ def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str
     return (
         f"{source.name} was not finished and has no journal {expected.name} beside it: steps not "
         f"yet in a chunk cannot be recovered; {what}"
-    )
-
-
-def _foreign_journal(source: Source, metadata: Mapping[str, str]) -> str:
-    journal = None if source.path is None else recorded_journal(source.path, metadata)
-    return (
-        f"{source.name} was not finished, and {journal} is the journal of another recording: it is left alone, and "
-        "steps not yet in a chunk cannot be recovered"
-    )
-
-
-def _older(source: Source, missing: int) -> str:
-    return (
-        f"{source.name} ends {missing} bytes before the place where its journal goes on: ends of episodes and final "
-        "states are missing; while a recording is made, copy first its journal, then the file"
-    )
-
-
-def _gap(source: Source, topic: str, steps: int) -> str:
-    return (
-        f"{source.name}: the last {steps} step(s) of {topic} are left out, because steps before them are missing: the "
-        "file is damaged, or was copied before its journal (while a recording is made, copy the journal first)"
-    )
-
-
-def _torn(source: Source, steps: int) -> str:
-    return (
-        f"{source.name}: the machine that recorded it was restarted afterwards, or this is another machine: {steps} "
-        "step(s) in its journal cannot be shown to be whole and are left out; on the machine and boot that recorded "
-        'it, they can be read: finish the recording there, with "tupli-mcap recover" or by appending to it'
     )
