@@ -128,19 +128,15 @@ class Autoreset:
 
     def note_ends(self, *, known: bool) -> None:
         """Chooses the warning for the caller once ends are recorded. `known`: with their final states."""
-        if self._has_told:
-            return
-        if not known:
-            self._has_told = True
-            self.doubt = (
-                "same-step autoreset without final states in infos (final_obs): "
-                "episodes are recorded without them"
-            )
         if self.is_assumed:
-            self._has_told = True
-            self.doubt = (
+            self._doubt(
                 "the vector environment declares no autoreset mode, and is recorded as under next-step autoreset "
                 f'(pass autoreset_mode="NextStep" if that is right); {_OTHERWISE}'
+            )
+        elif not known:
+            self._doubt(
+                "same-step autoreset without final states in infos (final_obs): "
+                "episodes are recorded without them"
             )
 
 
