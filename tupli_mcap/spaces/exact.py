@@ -110,6 +110,22 @@ def exact_flag(value: Any, name: str) -> bool:
     raise StepError(f"{name}: expected true or false, found {shorten(value)}")
 
 
+def exact_flags(values: Any, shape: tuple[int, ...], name: str, expected: str) -> np.ndarray[Any, Any]:
+    """Flags of several steps as bools; raises StepError unless they are bools or the numbers 0 and 1, in that shape.
+
+    `expected` says so in the error.
+    """
+    try:
+        given = np.asarray(values)
+    except (ValueError, TypeError, RuntimeError) as err:
+        raise StepError(f"{name}: expected {expected}, found {shorten(values)}") from err
+    if given.shape != shape:
+        raise StepError(f"{name}: expected shape {shape}, found shape {given.shape}")
+    if given.dtype.kind not in "biufO" or not (given.dtype == np.bool_ or np.isin(given, (0, 1)).all()):
+        raise StepError(f"{name}: expected {expected}, found {given.dtype}: {shorten(values)}")
+    return given.astype(np.bool_)
+
+
 def _always_exact(source: DType, target: DType) -> bool:
     if source.kind in "iu" and target.kind == "f":
         return source.itemsize * 8 <= _MANTISSA[target.name]

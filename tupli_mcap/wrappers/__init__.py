@@ -6,7 +6,7 @@ base                      the base classes of these
 episode_writer, streams   `EpisodeWriter`; the episodes of each of its streams
 from_arrays               `write_rollout`
 rollout                   records a rollout in one call
-benchmark, run, stacks    describes the environment; the run; finds the leaves that are stacks of frames
+described                 what a recording says about the environment and the run; which leaves are stacks of frames
 """
 
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter

@@ -23,9 +23,7 @@ from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
-from tupli_mcap.wrappers.benchmark import Captured
-from tupli_mcap.wrappers.run import with_run
-from tupli_mcap.wrappers.stacks import format_version, with_stacks
+from tupli_mcap.wrappers.described import Captured, format_version, with_run, with_stacks
 
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession

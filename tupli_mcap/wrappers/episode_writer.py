@@ -27,12 +27,10 @@ from tupli_mcap.recording.write.recorders.infos import entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import shorten
+from tupli_mcap.spaces.exact import exact_flags, shorten
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.wrappers.base import Recorder
-from tupli_mcap.wrappers.benchmark import with_labels
-from tupli_mcap.wrappers.run import with_run
-from tupli_mcap.wrappers.stacks import format_version, with_stacks
+from tupli_mcap.wrappers.described import format_version, with_labels, with_run, with_stacks
 from tupli_mcap.wrappers.streams import Stream, Streams
 
 
@@ -231,7 +229,7 @@ class EpisodeWriter(Recorder):
         """
         stream = self._ready(env)
         n = len(rewards)
-        flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
+        flags = flags_of(terminals, (n,), "terminals"), flags_of(timeouts, (n,), "timeouts")
         early = np.flatnonzero((flags[0] | flags[1])[:-1])
         if len(early):
             raise StepError(f"expected no flag before the last step, {n - 1}, found one at step {early[0]}")
@@ -270,7 +268,7 @@ class EpisodeWriter(Recorder):
         """
         self._between(env)
         n = len(rewards)
-        flags = _flags(terminals, n, "terminals"), _flags(timeouts, n, "timeouts")
+        flags = flags_of(terminals, (n,), "terminals"), flags_of(timeouts, (n,), "timeouts")
         stops = np.flatnonzero(flags[0] | flags[1]) + 1
         if not n or stops[-1:] != n:
             raise StepError(
@@ -378,11 +376,10 @@ def _in(num_envs: int | None, env: int) -> str:
     return "" if num_envs is None else f" in stream {env}"
 
 
-def _flags(given: Any, n: int, name: str) -> Array:
-    flags: Array = np.zeros(n, np.bool_) if given is None else np.asarray(given)
-    if flags.shape != (n,) or not (flags.dtype == np.bool_ or np.isin(flags, (0, 1)).all()):
-        raise StepError(f"{name}: expected {n} flags, found {shorten(given)}")
-    return flags.astype(np.bool_)
+def flags_of(given: Any, shape: tuple[int, ...], name: str) -> Array:
+    """The given flags as bools, by default false; StepError if they are no flags."""
+    expected = f"flags of shape {shape}, true or false"
+    return np.zeros(shape, np.bool_) if given is None else exact_flags(given, shape, name, expected)
 
 
 def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.errors import RecordingError, StepError, did_you_mean
 from tupli_mcap.recording.write.options import Mode
 from tupli_mcap.spaces.exact import shorten
-from tupli_mcap.wrappers.episode_writer import EpisodeWriter
+from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
@@ -113,15 +113,14 @@ def write_rollout(
         _one_of("next_states", next_states, "next_observations", next_observations),
         final_states, infos, metadata,
     )  # fmt: skip
-    rollout = _rollout_of(given, autoreset, reward_space)
-    first, lead, count = rollout.first, rollout.lead, rollout.num_envs
+    parts, first, lead, count = _rollout_of(given, autoreset, reward_space)
     observations = observation_space or _space(first.states, lead, "states")
     with EpisodeWriter(
         path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **_checked_run(run or {}),
     ) as writer:  # fmt: skip
-        for part in rollout.parts:
+        for part in parts:
             _write(writer, part)
 
 
@@ -134,26 +133,20 @@ def _checked_run(run: Mapping[str, Any]) -> Mapping[str, Any]:
     return run
 
 
-class _Rollout(NamedTuple):
-    """The rollout to write; the values in `first` have `lead` axes before those of one step."""
-
-    parts: Iterable[_Part]
-    first: _Given
-    lead: int
-    num_envs: int | None
-
-
-def _rollout_of(given: _Given, autoreset: Any, reward_space: gym.Space[Any] | None) -> _Rollout:
+def _rollout_of(
+    given: _Given, autoreset: Any, reward_space: gym.Space[Any] | None
+) -> tuple[Iterable[_Part], _Given, int, int | None]:
+    """The parts to write, values for the spaces, how many axes these have before those of one step, and the number of
+    streams."""
     for name, value in zip(given._fields[:3], given, strict=False):
         if value is None:
             raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
     if isinstance(given.rewards, list | tuple) and given.rewards and _array(given.rewards[0]).ndim:
-        return _Rollout(_episodes(given), _episode(given, 0), 1, None)
+        return _episodes(given), _episode(given, 0), 1, None
     given = _Given._make([*(map_arrays(one, _array) for one in given[:-1]), given.metadata])
     lead = _lead(given.rewards, reward_space)
-    return _Rollout(
-        _streams(given, lead, _mode(autoreset)), given, lead, given.rewards.shape[1] if lead == 2 else None
-    )
+    count = given.rewards.shape[1] if lead == 2 else None
+    return _streams(given, lead, _mode(autoreset)), given, lead, count
 
 
 class _Given(NamedTuple):
@@ -243,8 +236,8 @@ def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
     for name in ("actions", "next_states", "infos"):
         _check_shape(name, getattr(given, name), shape, shape[0])
     _check_shape("states", given.states, shape, shape[0], shape[0] + 1)
-    terminals = _flags("terminals", given.terminals, shape)
-    timeouts = _flags("timeouts", given.timeouts, shape)
+    terminals = flags_of(given.terminals, shape, "terminals")
+    timeouts = flags_of(given.timeouts, shape, "timeouts")
     done = terminals | timeouts
     if not mode and done[:-1].any():
         step = np.argwhere(done[:-1])[0][0]
@@ -351,17 +344,6 @@ def _lead(rewards: Array, space: gym.Space[Any] | None) -> int:
             f"found shape {rewards.shape}"
         )
     return lead
-
-
-def _flags(name: str, given: Any, shape: tuple[int, ...]) -> Array:
-    if given is None:
-        return np.zeros(shape, np.bool_)
-    if given.shape != shape or not (given.dtype == np.bool_ or np.isin(given, (0, 1)).all()):
-        raise StepError(
-            f"{name}: expected flags of shape {shape}, as rewards, found {given.dtype} of {given.shape}"
-        )
-    flags: Array = given.astype(np.bool_)
-    return flags
 
 
 def _check_infos(infos: Any) -> None:

@@ -17,11 +17,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from tupli_mcap.errors import RecordingError, TupliError, brief
 from tupli_mcap.recording.description import spread_of
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.options import (
-    RENDER_MODE,
-    Mode,
-    RecordOptions,
-)
+from tupli_mcap.recording.write.options import RENDER_MODE, Mode, RecordOptions
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -153,7 +149,7 @@ def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator
             yield
     except BaseException:
         with contextlib.suppress(TupliError, OSError):
-            if mode == "x" and _episodes_in(env.path) == 0:
+            if mode == "x" and not len(_returns(env.path)):
                 env.path.unlink()
         raise
 
@@ -227,8 +223,3 @@ def _every(interval: int, progress: Callable[[int], None] | None) -> Callable[[i
             progress(done)
 
     return report
-
-
-def _episodes_in(path: Path) -> int:
-    with Recording(path) as recording:
-        return len(recording)

@@ -15,7 +15,6 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.write.episodes import ResetFacts
-from tupli_mcap.recording.write.work import Work
 from tupli_mcap.wrappers.base import Recorder, wrong_kind
 from tupli_mcap.wrappers.vector import RecordEpisodes
 
@@ -67,8 +66,8 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
         options.setdefault("stack_size", _stack_size(venv))
         self._shown = StableBaselinesVecEnv(venv)
         self._recorder = _Recorder(self._shown, path, **options)
-        self._shown.tells_infos = self._recorder.uses_infos
-        self.rotation, self._work = self._recorder.rotation, self._recorder.work
+        self._shown.tells_infos = self._recorder._watches
+        self.rotation, self._work = self._recorder.rotation, self._recorder._work
         self._actions: Any = None
 
     def step_async(self, actions: Any) -> None:
@@ -169,16 +168,6 @@ class _Recorder(RecordEpisodes):
     """A recorder that takes the seeds and options of a reset from the `VecEnv`."""
 
     env: StableBaselinesVecEnv
-
-    @property
-    def uses_infos(self) -> bool:
-        """True if infos of steps are recorded, or given to a callback."""
-        return self._watches
-
-    @property
-    def work(self) -> Work:
-        """The mark of unfinished work."""
-        return self._work
 
     def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
         facts = super()._facts(self._seeds, unseeded, options, infos)

@@ -31,7 +31,7 @@ from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import shorten
+from tupli_mcap.spaces.exact import exact_flags
 
 _BOOL = np.dtype(np.bool_)
 
@@ -211,17 +211,7 @@ class VectorRecorder:
         if values.__class__ is np.ndarray and values.dtype is _BOOL and values.shape == self._shape:
             flag: Array = values
             return flag
-        try:
-            given = np.asarray(values)
-        except (ValueError, TypeError, RuntimeError) as err:
-            raise StepError(f"{name}: expected {self._n} flags, found {shorten(values)}") from err
-        if given.shape != self._shape:
-            raise StepError(f"{name}: expected shape {self._shape}, found shape {given.shape}")
-        if given.dtype.kind not in "biuf" or not np.isin(given, (0, 1)).all():
-            raise StepError(
-                f"{name}: expected true or false of each sub-environment, found {shorten(values)}"
-            )
-        return given.astype(np.bool_)
+        return exact_flags(values, self._shape, name, "true or false of each sub-environment")
 
     def _plain(self, terminals: Array, timeouts: Array, done: Array, flags: bytes) -> tuple[Array, Array]:
         """The flags of a batch with bytes of 0 and 1, as those of `done`; a bool made by a view may hold any byte."""

@@ -1,0 +1,250 @@
+"""What a recorder notes before the first step: environment, labels and run as attachments, and stacks of frames.
+
+The environment is described by `benchmark.json`, and by a pickle on request; `run.json` has the user's words about the
+run, and facts about this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+
+from tupli_mcap import trust
+from tupli_mcap.environment import EnvironmentRecord, capture, documented_labels, note, reasons_for_distrust
+from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.messages.images.pictures import ImageFormat
+from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.write.options import CaptureEnv, RecordOptions
+from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.schema.times import iso_utc
+from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
+from tupli_mcap.spaces.leaves import Leaf
+
+_DOCUMENT = "benchmark.json"
+_PICKLE = "env.cloudpickle"
+_MAX_PICKLE = 16 << 20
+_PACKAGES: Final = {  # distributions, by the module that says whether one is at work
+    "tupli_mcap": "tupli-mcap", "gymnasium": "gymnasium", "numpy": "numpy", "torch": "torch", "jax": "jax",
+    "tensorflow": "tensorflow", "stable_baselines3": "stable-baselines3", "d3rlpy": "d3rlpy", "torchrl": "torchrl",
+    "ale_py": "ale-py", "mujoco": "mujoco",
+}  # fmt: skip
+_LONGEST: Final = 1000  # characters of an argument
+_PATIENCE: Final = 2.0  # seconds for git
+_SIZES: Final = (
+    "stack_size",
+    "num_stack",
+)  # attributes of FrameStackObservation, and of Gymnasium's older FrameStack
+
+
+# ---- the environment
+
+
+class Captured:
+    """The environment of a recording as attachments, unless others are `given`.
+
+    Attributes:
+        attachments: name -> (media type, bytes).
+
+    Raises:
+        RecordingError: the environment cannot be pickled into at most 16 MiB.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+        capture_env: CaptureEnv,
+        given: Mapping[str, tuple[str, bytes]] | None,
+    ) -> None:
+        self.attachments = {} if given is None else dict(given)
+        self._env, self._documented = env, capture_env is not None or given is not None
+        self._digest = ""  # of an environment that the recording would carry
+        self._began = 0
+        if given is not None or capture_env is None:
+            return
+        record = note(env) if capture_env == "spec" else capture(_single(env), pickled=True)
+        self.attachments[_DOCUMENT] = ("application/json", record.to_json())
+        if record.pickle is not None or _is_plugin(record):
+            self._digest, self._began = record.digest, time.time_ns()
+        if record.pickle is None:
+            return
+        if len(record.pickle) > _MAX_PICKLE:
+            raise RecordingError(
+                f"capture_env='pickle': expected at most {_MAX_PICKLE} bytes in a recording, found an environment of "
+                f"{len(record.pickle)}; use capture_env='spec', or TupliEnvWrapper, whose storage keeps it once"
+            )
+        self.attachments[_PICKLE] = ("application/octet-stream", record.pickle)
+
+    def with_labels(
+        self, spaces: StepLayout, given: Mapping[str, Sequence[str]] | None
+    ) -> dict[str, tuple[str, bytes]]:
+        """The captured attachments, and the labels that were given or that the environment documents, if any."""
+        if LABELS_NAME in self.attachments:
+            return self.attachments
+        documented = documented_labels(self._env) if self._documented else Labels.none()
+        return with_labels(self.attachments, spaces, given, documented)
+
+    def trust_stored(self, writer: RecordingWriter) -> None:
+        """Signs an environment that the writer has just stored as this user's own, to be rebuilt without a question.
+
+        A recording that is appended to keeps its own environment.
+        """
+        carried = [one for one in writer.container.attachment_indexes if one.name == _DOCUMENT]
+        is_new = _DOCUMENT in writer.arriving or any(one.create_time >= self._began for one in carried)
+        if self._digest and is_new:
+            with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
+                if not trust.is_trusted(self._digest):
+                    trust.trust(self._digest)
+
+
+def with_labels(
+    attachments: Mapping[str, tuple[str, bytes]],
+    spaces: StepLayout,
+    given: Mapping[str, Sequence[str]] | None,
+    documented: Labels,
+) -> dict[str, tuple[str, bytes]]:
+    """The attachments, and the labels that were given or are documented, if any."""
+    labels = chosen_labels(given or {}, spaces.leaves, documented)
+    return {**attachments, **({LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json())} if labels else {})}
+
+
+def _is_plugin(record: EnvironmentRecord) -> bool:
+    """Whether a spec needs no trust here, but would where nobody has imported the package that registers its id."""
+    spec = record.spec
+    is_own = spec is None or str(spec.get("entry_point")).startswith("gymnasium.")
+    return not is_own and not reasons_for_distrust(record)
+
+
+def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym.Env[Any, Any]:
+    """The environment, or the first sub-environment of several."""
+    if not isinstance(env, gym.vector.VectorEnv):
+        return env
+    envs = getattr(env.unwrapped, "envs", None)
+    if envs and isinstance(envs[0], gym.Env):
+        first: gym.Env[Any, Any] = envs[0]
+        return first
+    raise RecordingError(
+        "capture_env='pickle': expected sub-environments in this process, found none in "
+        f"{type(env.unwrapped).__name__}; make it with vectorization_mode='sync', or use capture_env='spec'"
+    )
+
+
+# ---- the run
+
+
+def with_run(
+    attachments: Mapping[str, tuple[str, bytes]], options: RecordOptions, environment: str
+) -> dict[str, tuple[str, bytes]]:
+    """The attachments with `run.json`; without it if the user says nothing about the run and captures nothing.
+
+    Raises:
+        RecordingError: a part of the run is no text, or JSON cannot hold it.
+    """
+    run = Run.given(options.name, options.metadata, options.tags, options.split)
+    if RUN_NAME in attachments or (run == Run() and options.capture == "none"):
+        return dict(attachments)
+    run = replace(run, id=uuid.uuid4().hex, environment=environment, started=iso_utc(time.time_ns()))
+    if options.capture != "none":
+        loaded = tuple(name for name in _PACKAGES if name in sys.modules)
+        run = replace(run, versions=_versions(loaded))
+    if options.capture == "all":
+        command = tuple(argument[:_LONGEST] for argument in sys.orig_argv[:100])
+        run = replace(run, command=command, git=_git(_program_folder()), host=os.uname().nodename)
+    return {**attachments, RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}
+
+
+@lru_cache(maxsize=8)
+def _versions(modules: tuple[str, ...]) -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in modules:
+        try:
+            found[_PACKAGES[name]] = metadata.version(_PACKAGES[name])
+        except metadata.PackageNotFoundError:  # run from its sources
+            continue
+    return found
+
+
+def _program_folder() -> str:
+    """The directory of the program's file; without a file, as in a notebook, the working directory."""
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    return str(Path(file).absolute().parent) if file else os.getcwd()  # noqa: PTH109 - gone, perhaps
+
+
+@lru_cache(maxsize=8)
+def _git(folder: str) -> dict[str, Any]:
+    """The commit of a folder, and whether files differ from it; empty if git does not know the folder."""
+    # no program of the repository's configuration is run, and nothing in it is written
+    ask = ["git", "-c", "core.fsmonitor=false", "-C", folder]
+    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+
+    def answer(*arguments: str) -> str:
+        done = subprocess.run(
+            [*ask, *arguments], capture_output=True, check=True, timeout=_PATIENCE, env=environment, text=True
+        )
+        return done.stdout.strip()
+
+    try:
+        commit = answer("rev-parse", "HEAD")
+        changed = answer("status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return {}
+    return {"commit": commit, "dirty": bool(changed)}
+
+
+# ---- stacks of frames
+
+
+def with_stacks(env: Any, spaces: StepLayout, stack_size: int | None = None) -> StepLayout:
+    """`spaces` with its stacks: leaves whose first axis, or else the last one, has the length `stack_size`, or the
+    length in the attribute `stack_size` or `num_stack` of a wrapper around `env`.
+
+    If a wrapper further out changes the frames, they are stored exactly all the same.
+    """
+    leaves = [leaf for leaf in spaces.state if any(map(can_stack, _both(leaf)))]
+    sizes = (_sizes(env) if stack_size is None else {stack_size}) if leaves else set()
+    stacks: list[Stack] = []
+    for leaf in leaves:
+        found = next((one for one in _both(leaf) if one.stored_shape[0] in sizes), None)
+        if found is not None and can_stack(found):
+            stacks.append(stack_of(found))
+    if not stacks:
+        return spaces
+    return StepLayout(spaces.observation_space, spaces.action_space, spaces.reward_space, stacks=stacks)
+
+
+def _both(leaf: Leaf) -> tuple[Leaf, Leaf]:
+    """The leaf with its frames along the first axis, and along the last one."""
+    return leaf, replace(leaf, frames_last=True)
+
+
+def _sizes(env: Any) -> set[Any]:
+    """The numbers of frames that the wrappers of an environment stack; empty for one in another process."""
+    if isinstance(env, gym.vector.VectorEnv | gym.vector.VectorWrapper):
+        base = env.unwrapped
+        if type(base).__module__ == "ale_py.vector_env":  # it stacks without a wrapper, frames first
+            return set((base.single_observation_space.shape or ())[:1])
+        inner = getattr(base, "envs", None)
+        return _sizes(inner[0]) if inner else set()
+    found = set()
+    while isinstance(env, gym.Wrapper):
+        found |= {vars(env)[name] for name in _SIZES if isinstance(vars(env).get(name), int)}
+        env = env.env
+    return found
+
+
+def format_version(spaces: StepLayout, images: ImageFormat) -> str:
+    """The lowest format version that can hold these spaces."""
+    return "2" if spaces.stacks or (images != "raw" and spaces.images) else "1"
