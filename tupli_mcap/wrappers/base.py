@@ -17,7 +17,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.recording.write.recorders.frames import FrameRecorder, VectorFrames
+from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
@@ -84,7 +84,7 @@ class EpisodeWrapper(Recorder):
     # what follows the rows of a step; not bound, for the wrapper must not hold itself
     _parts: Sequence[Callable[[Any, Any, Any], None]]
     _recorder: Any
-    _frames: FrameRecorder | VectorFrames | None
+    _frames: FrameRecorder | None
 
     def _open(
         self,
@@ -120,7 +120,8 @@ class EpisodeWrapper(Recorder):
             work.recorders.append(recorder)
             captured.trust_stored(writer)
             writer.check_spaces(spaces, sub_environments or 1, vector=sub_environments is not None)
-            self._frames = self._film_of(writer, options) if options.every else None
+            n = sub_environments or 1
+            self._frames = FrameRecorder(writer, n, options, work.ask) if options.every else None
             self._live = _live_session(writer, options.live, env)
             # must not hold the wrapper
             self._finalizer = weakref.finalize(self, _close_recordings, work, self._live)
@@ -132,10 +133,6 @@ class EpisodeWrapper(Recorder):
 
     def _recorder_of(self, writer: RecordingWriter) -> FileRecorder:
         """The recorder of the episodes in a file."""
-        raise NotImplementedError
-
-    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder | VectorFrames:
-        """The recorder of the frames in a file."""
         raise NotImplementedError
 
     def _finish_step(self, taken: Any, result: Any) -> BaseException | None:

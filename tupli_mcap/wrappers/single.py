@@ -29,7 +29,6 @@ from tupli_mcap.recording.write.options import (
     RecordOptions,
     StepCallback,
 )
-from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -103,7 +102,6 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     env: gym.Env[Any, Any]
     _recorder: SingleRecorder
-    _frames: FrameRecorder | None
 
     def __init__(
         self,
@@ -160,9 +158,6 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         recorder = SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)
         recorder.resets_itself = resets_itself(self.env)
         return recorder
-
-    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> FrameRecorder:
-        return FrameRecorder(writer, 1, options, self._work.ask)
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]

@@ -29,7 +29,6 @@ from tupli_mcap.recording.write.options import (
     StepCallback,
 )
 from tupli_mcap.recording.write.recorders.autoreset import Autoreset
-from tupli_mcap.recording.write.recorders.frames import VectorFrames
 from tupli_mcap.recording.write.recorders.infos import final_info_of, info_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
@@ -56,7 +55,6 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     env: gym.vector.VectorEnv[Any, Any, Any]
     _recorder: VectorRecorder
-    _frames: VectorFrames | None
 
     def __init__(
         self,
@@ -123,9 +121,6 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             writer, self._spaces, self.num_envs, self._autoreset, self._infos, derives_episodes=self._plain
         )
 
-    def _film_of(self, writer: RecordingWriter, options: RecordOptions) -> VectorFrames:
-        return VectorFrames(writer, self.num_envs, options, self._work.ask)
-
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         work = self._work
         if work.state:
@@ -162,7 +157,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         if self._frames is not None:
             _, _, terminals, timeouts, _ = result
             ended = np.logical_or(terminals, timeouts)
-            self._frames.step(
+            self._frames.step_batch(
                 self._recorder, taken[0], ended, self.env.render, same_step=self._autoreset.mode == "SameStep"
             )
 
@@ -202,13 +197,13 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             states, infos = result
             facts = self._facts(seed, unseeded, told, infos)
             if self._watches:
-                self._states = copy.deepcopy(list(iterate(self.env.observation_space, states)))
+                self._states = self._each_state(states)
             work.go_on()
             if mask is None and self.rotation.is_due(self._writer):
                 self._rotate(states)
             self._recorder.reset(states, facts, mask)
             if self._frames is not None:
-                self._frames.start(
+                self._frames.start_batch(
                     np.ones(self.num_envs, np.bool_) if mask is None else mask, self.env.render
                 )
             if self._watches:
@@ -268,13 +263,10 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
             step.env = i
             entries[i] = self._entries(step)
-            self._call(i, step)
+            if self._callbacks is not None:
+                reward = step.reward if np.ndim(step.reward) else float(step.reward)
+                self._texts[i] = metadata_of(self._callbacks[i], step._replace(reward=reward))
         return entries
-
-    def _call(self, i: int, step: Step) -> None:
-        if self._callbacks is not None:
-            reward = step.reward if np.ndim(step.reward) else float(step.reward)
-            self._texts[i] = metadata_of(self._callbacks[i], step._replace(reward=reward))
 
     def _forget(self, chosen: Any) -> None:
         for i in chosen:

@@ -22,7 +22,7 @@ Ask = Callable[..., Any]
 
 class FrameRecorder:
     """Records the frames of one camera: of an episode's first state, of the state after every `every`-th step, and of
-    the last state if the episode ends by a flag.
+    the last state if the episode ends by a flag. Of a vector environment, `render()` gives one a sub-environment.
 
     A frame is in the journal, or in the file, when `step` returns. `options` have the `every` and the format of frames;
     `ask` calls what renders (`Work.ask`).
@@ -68,34 +68,15 @@ class FrameRecorder:
         picture, now = render(), time.time_ns()
         return EncodedFrame(now, self._form, encode_picture(check_picture(picture, "frames"), self._form))
 
+    # ---- of a vector environment
 
-def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
-    """Records the frame of a step; its time is not before that of the last frame."""
-    camera, pairs = writer.channels.cameras[env]
-    log = writer.frames[env]
-    frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
-    log.append(frame.time_ns, (pairs, encode_pair(episode, step)), (camera, encode_frame(CAMERA, frame)))
-
-
-class VectorFrames:
-    """The frames of a vector environment's cameras, of which `render()` gives one a sub-environment."""
-
-    def __init__(self, writer: RecordingWriter, num_envs: int, options: RecordOptions, ask: Ask) -> None:
-        self._frames = FrameRecorder(writer, num_envs, options, ask)
-        self._ask = ask
-        self._n = num_envs
-
-    def go_on(self, writer: RecordingWriter) -> None:
-        """Continues in another file."""
-        self._frames.go_on(writer)
-
-    def start(self, chosen: Array, render: Callable[[], Any]) -> None:
+    def start_batch(self, chosen: Array, render: Callable[[], Any]) -> None:
         """After a reset of the `chosen` sub-environments (bool)."""
-        pictures = self._ask(self._rendered, render)
+        pictures = self._ask(self._all_rendered, render)
         for i in np.flatnonzero(chosen).tolist():
-            self._frames.start(i, partial(pictures.__getitem__, i))
+            self.start(i, partial(pictures.__getitem__, i))
 
-    def step(
+    def step_batch(
         self,
         recorder: VectorRecorder,
         stepped: Array,
@@ -110,24 +91,32 @@ class VectorFrames:
         Raises:
             RecordingError: what is rendered are no pictures.
         """
-        once = cache(lambda: self._rendered(render))
+        once = cache(lambda: self._all_rendered(render))
 
         def picture(i: int) -> Any:
             return once()[i]
 
-        for i in range(self._n):
+        for i in range(len(self._first)):
             reset = not stepped[i] or (same_step and bool(ended[i]))
             if stepped[i]:
                 number, step = recorder.running(i)
-                self._frames.step(i, number, step, bool(ended[i]), None if reset else partial(picture, i))
+                self.step(i, number, step, bool(ended[i]), None if reset else partial(picture, i))
             if reset:
-                self._frames.start(i, partial(picture, i))
+                self.start(i, partial(picture, i))
 
-    def _rendered(self, render: Callable[[], Any]) -> Sequence[Any]:
-        found = render()
-        if not isinstance(found, list | tuple | np.ndarray) or len(found) != self._n:
+    def _all_rendered(self, render: Callable[[], Any]) -> Sequence[Any]:
+        found, n = render(), len(self._first)
+        if not isinstance(found, list | tuple | np.ndarray) or len(found) != n:
             raise RecordingError(
-                f"frames: expected render() to return a picture for each of {self._n} sub-environments, "
+                f"frames: expected render() to return a picture for each of {n} sub-environments, "
                 f"found {type(found).__name__}{f' of {len(found)}' if hasattr(found, '__len__') else ''}"
             )
         return list(found)
+
+
+def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
+    """Records the frame of a step; its time is not before that of the last frame."""
+    camera, pairs = writer.channels.cameras[env]
+    log = writer.frames[env]
+    frame = frame._replace(time_ns=max(frame.time_ns, log.latest_ns))
+    log.append(frame.time_ns, (pairs, encode_pair(episode, step)), (camera, encode_frame(CAMERA, frame)))
