@@ -113,10 +113,7 @@ class Rotation:
     @property
     def paths(self) -> list[Path]:
         """The files so far; a file without steps is removed when it is closed."""
-        return [path for path in self._paths[:-1] if path.exists()] + self._last()
-
-    def _last(self) -> list[Path]:
-        return self._paths[-1:] if len(self._paths) == 1 or self._paths[-1].exists() else []
+        return [path for path in self._paths if path.exists()] or self._paths[:1]
 
     @property
     def path(self) -> Path:
@@ -162,8 +159,6 @@ class Rotation:
         if len(container.chunk_indexes) != self._counted:
             self._counted = len(container.chunk_indexes)
             self._most = max(container.counts.values(), default=0)
-        if not self._limited:
-            return self._most >= _MANY_ROWS
         is_full = (
             self._most >= _MANY_ROWS
             or (self._max_bytes is not None and container.position - self._head >= self._max_bytes)
