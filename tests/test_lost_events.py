@@ -25,7 +25,7 @@ from tupli_mcap.journal import file as journals
 from tupli_mcap.journal.committed import CommittedRows
 from tupli_mcap.journal.file import JournalContents, read_journal
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.messages.encode_rows import HOLE
+from tupli_mcap.mcap.records import HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 

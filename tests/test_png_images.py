@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
-from tupli_mcap.journal.derive import even_rows
+from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.messages.images.pictures import decode_pixels
 from tupli_mcap.messages.images.png import PngCodec

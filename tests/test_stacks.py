@@ -20,7 +20,7 @@ from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
 from tupli_mcap.dataset import open_columns
-from tupli_mcap.journal.derive import even_rows
+from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.images.stack import StackCodec
 from tupli_mcap.messages.step import StepLayout

@@ -3,8 +3,8 @@
 
 file        the mapped file, its areas, and the recording it belongs to
 logs        appends records of variable size, groups them by channel, and seals records with checksums
-committed   what a reader takes out of a journal: committed rows, running states
-derive      what a recorder derives from rows at a flush: steps and times; starts, ends, final states
+committed   what a reader takes out of a journal: committed rows, completed with steps and times; running states
+derive      what a recorder derives from rows at a flush: starts, ends, final states
 
 1. A recording is rows: each channel is append-only, its rows are numbered 0, 1, 2, … by `sequence`, across appends.
 2. A row is in one of three places: the slot that is being written, committed in the journal, or in a chunk of the file.

@@ -1,4 +1,4 @@
-"""Reads a journal: its committed rows and records, and the running states."""
+"""Reads a journal: its committed rows, which it completes for chunks, its records, and the running states."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea, RowArea
 from tupli_mcap.journal.logs import STATE, as_rows, checksum, seal_of
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import BODY, RECORD_HEADER, iter_records
+from tupli_mcap.mcap.records import BODY, HOLE, RECORD_HEADER, iter_records
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.messages.encode_rows import HOLE
 from tupli_mcap.messages.step import StepLayout
 
 Taken = TypeVar("Taken")
@@ -217,6 +216,46 @@ class CommittedRows(Committed[Array]):
         row, hole = self.rows[half, place], self.rows[half, place + 1]
         later = hole["#sequence"] == HOLE and hole["#log_time"] > row["#log_time"]
         return bool(later and hole["episode"] == row["episode"] and (row["terminal"] or row["timeout"]))
+
+
+class RowDeriver:
+    """Fills the fields that `step()` leaves out: `step`, a `log_time` that never decreases, `publish_time`.
+
+    It remembers the running episode from one batch of a channel's rows to the next.
+    """
+
+    def __init__(self, episode: int = -1, step: int = -1, time_ns: int = 0) -> None:
+        self._episode = episode
+        self._step = step
+        self._time = time_ns
+
+    def fill(self, rows: Array) -> None:
+        """Completes consecutive rows in place."""
+        n = len(rows)
+        if not n:
+            return
+        times = rows["#log_time"].astype(np.uint64)
+        times[0] = max(int(times[0]), self._time)
+        np.maximum.accumulate(times, out=times)
+        rows["#log_time"] = times
+        rows["#publish_time"] = times
+        episodes = rows["episode"].astype(np.int64)
+        index = np.arange(n)
+        starts = np.zeros(n, dtype=np.int64)
+        starts[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
+        np.maximum.accumulate(starts, out=starts)
+        steps = index - starts
+        if episodes[0] == self._episode:
+            first = int(np.searchsorted(starts, 1))
+            steps[:first] += self._step + 1
+        rows["step"] = steps
+        self._episode, self._step, self._time = int(episodes[-1]), int(steps[-1]), int(times[-1])
+
+
+def even_rows(channel: int, first: int, data: Any, rows: Array) -> Rows:
+    """`Rows` of constant size: `rows` is the structured view of `data`."""
+    offsets = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.dtype.itemsize)
+    return Rows(channel, first, data, offsets, rows["#log_time"].astype(np.uint64))
 
 
 class CommittedRecords(Committed[Rows]):

@@ -1,4 +1,4 @@
-"""Completes committed rows when they go to the file, and derives episode records from them, many at a time.
+"""Derives episode records from committed rows when they go to the file, many at a time.
 
 A plain episode (reset without seed, options and info; ended by a flag) writes only rows while it is recorded: they hold
 its number and flags, and the hole after its last row holds the final state and the time of the next reset. Its records
@@ -8,17 +8,16 @@ in `/episode_start`, `/episode_end` and `/final_state` are derived from these.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.logs import STATE
-from tupli_mcap.mcap.container import Rows
-from tupli_mcap.messages.encode_rows import HOLE
+from tupli_mcap.mcap.records import HOLE
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
 
-LAST_ROW = 2**32 - 2  # `sequence` has 32 bits, and its largest value marks a hole
+LAST_ROW = HOLE - 1  # of a channel: `sequence` has 32 bits
 
 STARTS = np.dtype([("episode", "<u4"), ("env", "<u4"), ("first_row", "<u8"), ("time", "<u8")])
 ENDS = np.dtype(
@@ -27,51 +26,6 @@ ENDS = np.dtype(
         ("end", "u1"), ("time", "<u8"),
     ]
 )  # fmt: skip
-
-
-def rows_per_half(row_size: int, chunk_size: int) -> int:
-    """Rows that make a chunk of about `chunk_size` bytes, at least one."""
-    return max(1, chunk_size // row_size)
-
-
-class RowDeriver:
-    """Fills the fields that `step()` leaves out: `step`, a `log_time` that never decreases, `publish_time`.
-
-    It remembers the running episode from one batch of a channel's rows to the next.
-    """
-
-    def __init__(self, episode: int = -1, step: int = -1, time_ns: int = 0) -> None:
-        self._episode = episode
-        self._step = step
-        self._time = time_ns
-
-    def fill(self, rows: Array) -> None:
-        """Completes consecutive rows in place."""
-        n = len(rows)
-        if not n:
-            return
-        times = rows["#log_time"].astype(np.uint64)
-        times[0] = max(int(times[0]), self._time)
-        np.maximum.accumulate(times, out=times)
-        rows["#log_time"] = times
-        rows["#publish_time"] = times
-        episodes = rows["episode"].astype(np.int64)
-        index = np.arange(n)
-        starts = np.zeros(n, dtype=np.int64)
-        starts[1:] = np.where(episodes[1:] != episodes[:-1], index[1:], 0)
-        np.maximum.accumulate(starts, out=starts)
-        steps = index - starts
-        if episodes[0] == self._episode:
-            first = int(np.searchsorted(starts, 1))
-            steps[:first] += self._step + 1
-        rows["step"] = steps
-        self._episode, self._step, self._time = int(episodes[-1]), int(steps[-1]), int(times[-1])
-
-
-def even_rows(channel: int, first: int, data: Any, rows: Array) -> Rows:
-    """`Rows` of constant size: `rows` is the structured view of `data`."""
-    offsets = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.dtype.itemsize)
-    return Rows(channel, first, data, offsets, rows["#log_time"].astype(np.uint64))
 
 
 class StartedEpisode(NamedTuple):

@@ -43,6 +43,7 @@ MESSAGE_INDEX = struct.Struct("<BQHI")  # RECORD, channel, length of the entries
 # RECORD, channel, sequence, log_time, publish_time; then the CDR header
 RECORD_HEADER = struct.Struct("<BQHIQQ")
 CDR_HEADER = b"\x00\x01\x00\x00"
+HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message, in a journal
 BODY = RECORD_HEADER.size + len(CDR_HEADER)  # offset of the CDR body in a Message record
 HEADER_FIELDS: list[tuple[str, str, int]] = [
     ("#opcode", "u1", 0),

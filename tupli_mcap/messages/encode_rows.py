@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
-from tupli_mcap.mcap.records import BODY
+from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.encode_values import (
     Packed,
     Source,
@@ -41,7 +41,6 @@ SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follo
 COMMIT = Struct("<IQ")
 EPISODE_AND_STEP = Struct("<II")
 _TIME = Struct("<Q")
-HOLE = 0xFFFFFFFF  # the `sequence` of a row without a message
 PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _MAX_LEAVES = 4096  # each takes time and memory to compile
 

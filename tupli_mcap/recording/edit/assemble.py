@@ -15,7 +15,7 @@ import numpy as np
 from tupli_mcap import files
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.journal.derive import even_rows
+from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.chunks import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows, library

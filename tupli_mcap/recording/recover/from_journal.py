@@ -17,14 +17,15 @@ from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.journal.committed import (
     Committed,
     CommittedRows,
+    RowDeriver,
     committed_records,
+    even_rows,
     rows_among,
     rows_of,
     running_record,
     size_behind,
     torn_rows,
 )
-from tupli_mcap.journal.derive import RowDeriver, even_rows
 from tupli_mcap.journal.file import (
     EVENT_AREAS,
     FRAMES_AREA,

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.journal.derive import EpisodeDeriver, RowDeriver, StartedEpisode, even_rows
+from tupli_mcap.journal.committed import RowDeriver, even_rows
+from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import STATE, Sink, seal
-from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, HOLE, ImageSink, make_row_encoder
+from tupli_mcap.mcap.records import BODY, HOLE
+from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, ImageSink, make_row_encoder
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
@@ -93,12 +94,9 @@ class SingleRows:
 
     def begin_episode(self, episode: int) -> None:
         """The rows that follow belong to `episode`."""
-        start, prefix = self._offset(), self._prefix(episode)
+        start, prefix = self._offset(), self._header + EPISODE_AND_STEP.pack(episode, 0)
         self._encoder.begin(prefix)
         self._buffer[start : start + len(prefix)] = prefix
-
-    def _prefix(self, episode: int) -> bytes:
-        return self._header + EPISODE_AND_STEP.pack(episode, 0)
 
     # ---- many steps at once
 

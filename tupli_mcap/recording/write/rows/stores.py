@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from tupli_mcap.journal.derive import RowDeriver, rows_per_half
+from tupli_mcap.journal.committed import RowDeriver
 from tupli_mcap.journal.file import FRAMES_AREA, Area, Journal, LogArea, RowArea
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.container import Container
@@ -47,7 +47,7 @@ def plan_areas(
     else:
         row = layout.step_message.record_size
         chunks = 1 if vector else CHUNKS_PER_HALF
-        areas.append(RowArea("steps", row, chunks * rows_per_half(row, size), n))
+        areas.append(RowArea("steps", row, chunks * max(1, size // row), n))
     for leaf in layout.images:
         row = layout.image_messages[leaf.name].dtype.itemsize
         # of a stack, most rows store one frame
@@ -55,8 +55,7 @@ def plan_areas(
         # some images a chunk: what is done once a chunk takes as long for few of them as for many; of many
         # sub-environments fewer, for the room that their journals take
         some, within = (32, 3 << 20) if n == 1 else (16, 2 << 20)
-        rows = rows_per_half(stored, max(size, min(some * stored, within)))
-        rows = max(1, min(rows, _HALF // row))
+        rows = max(1, min(max(size, min(some * stored, within)) // stored, _HALF // row))
         areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
     if infos:

@@ -19,8 +19,7 @@ from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import STATE, seal
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.encode_rows import HOLE
+from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.recording.write.rows.contract import StartChunks
