@@ -92,8 +92,7 @@ class CommittedRows(Committed[Array]):
     In a torn journal, a row is whole if its checksum is right. Without checksums it is whole if the disk has something
     in its last sector that was written after it; this does not hold if committed rows may be `rewritten`.
 
-    Raises:
-        FormatError: the area has rows of another size, or no block of this number.
+    FormatError if the area has rows of another size, or no block of this number.
     """
 
     def __init__(

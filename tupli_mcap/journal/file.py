@@ -62,11 +62,8 @@ def journal_in(directory: str | os.PathLike[str], path: Path, uuid: str) -> Path
 
 
 def recorded_journal(path: Path, metadata: Mapping[str, str]) -> Path:
-    """The path of a recording's journal: beside it, or where its metadata say.
-
-    Raises:
-        FormatError: the metadata name a path that no writer chooses. A stranger's recording must not name any file.
-    """
+    """The path of a recording's journal: beside it, or where its metadata say. FormatError if the metadata name a path
+    that no writer chooses. A stranger's recording must not name any file."""
     if "journal" not in metadata:
         return journal_path(path)
     place, ending = Path(metadata["journal"]), f".{metadata.get('uuid')}.journal"
@@ -152,8 +149,7 @@ class Journal:
         recording may have been renamed without it, and a warning says to what. `replaced` is the uuid of a recording
         that this one replaces; its journal needs no warning.
 
-        Raises:
-            RecordingError: the system refused.
+        RecordingError if the system refused.
         """
         if durable:
             self.sync()
@@ -182,11 +178,7 @@ class Journal:
         return area
 
     def sync(self) -> None:
-        """Waits until every mapped page that changed is on the disk.
-
-        Raises:
-            RecordingError: the disk refused.
-        """
+        """Waits until every mapped page that changed is on the disk; RecordingError if the disk refused."""
         try:
             self._map.flush()
         except OSError as err:
@@ -404,11 +396,8 @@ def boot_id() -> str:
 
 
 def sync_file(fd: int, name: str) -> None:
-    """Waits until the file's data and size are on the disk.
-
-    Raises:
-        RecordingError: the disk refused; how much it has is unknown.
-    """
+    """Waits until the file's data and size are on the disk; RecordingError if the disk refused, and how much it has
+    is unknown."""
     try:
         if hasattr(fcntl, "F_FULLFSYNC"):  # macOS: its fsync stops at the drive's cache
             fcntl.fcntl(fd, fcntl.F_FULLFSYNC)
@@ -421,11 +410,7 @@ def sync_file(fd: int, name: str) -> None:
 
 
 def sync_directory(path: Path) -> None:
-    """Waits until the names in a directory are on the disk.
-
-    Raises:
-        RecordingError: the disk refused.
-    """
+    """Waits until the names in a directory are on the disk; RecordingError if the disk refused."""
     try:
         files.sync(path)
     except OSError as err:

@@ -40,11 +40,8 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
-    """Decompresses one frame to `size` bytes; no more is produced or allocated.
-
-    Raises:
-        FormatError: the frame is damaged, has another size, or bytes follow it, which other readers would read.
-    """
+    """Decompresses one frame to `size` bytes; no more is produced or allocated. FormatError if the frame is damaged,
+    has another size, or bytes follow it, which other readers would read."""
     if size > len(data) * MAX_RATIO.get(name, size):
         raise FormatError(
             f"{where}: {len(data)} compressed bytes cannot hold the {size} bytes that the file declares"
@@ -118,11 +115,8 @@ class ChunkRecords(NamedTuple):
 
 
 def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
-    """The records of a recording's chunk, whose compressed data has `packed` bytes.
-
-    Raises:
-        FormatError: the chunk is not definitions followed by messages of one channel in the order of their rows.
-    """
+    """The records of a recording's chunk, whose compressed data has `packed` bytes; FormatError if the chunk is not
+    definitions followed by messages of one channel in the order of their rows."""
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
         opcode, length = RECORD.unpack_from(data, skip)
@@ -145,11 +139,8 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
 
 
 def message_headers(data: memoryview, most: int = sys.maxsize) -> Array:
-    """The headers of consecutive Message records, as HEADERS.
-
-    Raises:
-        FormatError: `data` is something else, or holds more than `most` messages.
-    """
+    """The headers of consecutive Message records, as HEADERS; FormatError if `data` is something else, or holds more
+    than `most` messages."""
     offsets = message_places(data, most)[:, 0]
     found = np.empty(len(offsets), HEADERS)
     for begin in range(0, len(offsets), _BLOCK):
@@ -189,11 +180,8 @@ def message_places(data: Any, most: int = sys.maxsize) -> Array:
 
 
 def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(log_time, CDR body) of consecutive Message records.
-
-    Raises:
-        FormatError: `data` is something else. It is raised before the first message.
-    """
+    """(log_time, CDR body) of consecutive Message records. FormatError if `data` is something else. It is raised before
+    the first message."""
     headers = message_headers(data)
     for begin in range(0, len(headers), _BLOCK):
         part = headers[begin : begin + _BLOCK]

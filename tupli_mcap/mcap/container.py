@@ -137,11 +137,8 @@ class Container:
         self._fd = -1
 
     def write(self, *parts: Any) -> None:
-        """Appends bytes, in one call of the system if it takes them all.
-
-        Raises:
-            RecordingError: the system refused. The file keeps its whole records.
-        """
+        """Appends bytes, in one call of the system if it takes them all. RecordingError if the system refused. The file
+        keeps its whole records."""
         start = position = self.position
         left = [memoryview(part) for part in parts]
         try:
@@ -234,11 +231,7 @@ class Container:
         return Prepared(rows, len(head), data, crc32(data))
 
     def pack(self, data: Any) -> bytes:
-        """Compresses the records of a chunk.
-
-        Raises:
-            RecordingError: there is no memory for it.
-        """
+        """Compresses the records of a chunk; RecordingError if there is no memory for it."""
         with self._memory_for(len(data)):
             if self.compression == "zstd":
                 packed: bytes = self._zstd().compress(data)

@@ -87,8 +87,7 @@ class FileLock:
     its first records. Until then the file that it will replace stays, locked too. Readers that have the replaced file
     open keep it.
 
-    Raises:
-        RecordingError: the file exists (mode "x"), is missing (mode "a"), is being written, or cannot be opened.
+    RecordingError if the file exists (mode "x"), is missing (mode "a"), is being written, or cannot be opened.
     """
 
     def __init__(self, path: Path, mode: str) -> None:
@@ -137,11 +136,7 @@ class FileLock:
         return self._old is not None
 
     def publish(self) -> None:
-        """Puts a new file at its path.
-
-        Raises:
-            RecordingError: somebody else has made one there.
-        """
+        """Puts a new file at its path; RecordingError if somebody else has made one there."""
         if self._temporary is None:
             return
         try:
@@ -171,10 +166,7 @@ class FileLock:
 
     def release(self) -> None:
         """Unlocks and closes the file, and removes it if it was not published. Does nothing in a forked child.
-
-        Raises:
-            RecordingError: a file system that writes late (NFS) lost something.
-        """
+        RecordingError if a file system that writes late (NFS) lost something."""
         if self._process != os.getpid():
             return
         if self._temporary is not None:
@@ -200,11 +192,8 @@ def _exists(path: Path) -> RecordingError:
 
 @contextlib.contextmanager
 def writers_kept_out(path: Path) -> Iterator[None]:
-    """Holds the lock of a recording, so that nobody writes to it while it is read, replaced or deleted.
-
-    Raises:
-        RecordingError: somebody is writing to it, or it is gone.
-    """
+    """Holds the lock of a recording, so that nobody writes to it while it is read, replaced or deleted; RecordingError
+    if somebody is writing to it, or it is gone."""
     file = _open_locked(path, mode="r", hint="it was deleted")
     try:
         yield
@@ -274,11 +263,8 @@ def _is_at(fd: int, path: Path) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """True if a live writer holds the recording.
-
-    Raises:
-        RecordingError: the system does not say (too many open files, for example): there may be a writer.
-    """
+    """True if a live writer holds the recording; RecordingError if the system does not say (too many open files, for
+    example): there may be a writer."""
     try:
         # does not wait for the other end of a pipe
         file = open_private(path, "r", lambda name, flags: os.open(name, flags | os.O_NONBLOCK))

@@ -141,12 +141,8 @@ def with_crc(values: Mapping[str, str]) -> dict[str, str]:
 
 
 def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> dict[str, str]:
-    """The pairs without `crc`.
-
-    Raises:
-        FormatError: `crc` differs; or it is missing, and there are other keys than the `known` ones: old recordings
-            have no `crc`, but a damaged key must not pass for a missing one.
-    """
+    """The pairs without `crc`; FormatError if `crc` differs, or if it is missing, and there are other keys than the
+    `known` ones: old recordings have no `crc`, but a damaged key must not pass for a missing one."""
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
         # A damaged length may have put the key into a value. Such a value holds the zeros of the key's length.
@@ -169,8 +165,7 @@ def _crc(pairs: Mapping[str, str]) -> str:
 def message_index(body: memoryview) -> tuple[int, np.ndarray[Any, np.dtype[np.uint64]]]:
     """The channel and the entries (log_time, offset) of a MessageIndex record.
 
-    Raises:
-        FormatError: its sizes do not add up.
+    FormatError if its sizes do not add up.
     """
     channel, size = int.from_bytes(body[:2], "little"), int.from_bytes(body[2:6], "little")
     if len(body) != 6 + size or size % 16:
@@ -183,8 +178,7 @@ def attachment_index(source: Source, offset: int, length: int) -> AttachmentInde
 
     Sizes are read before texts: a search after damage then leaves most false starts after a few bytes.
 
-    Raises:
-        FormatError: the sizes in the header do not add up to `length`.
+    FormatError if the sizes in the header do not add up to `length`.
     """
     left = 9 + length - ATTACHMENT_HEAD.size - 4 - 8 - 4  # for the texts and the data
     if left < 0:
@@ -210,10 +204,7 @@ def attachment_index(source: Source, offset: int, length: int) -> AttachmentInde
 
 def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
     """The header of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
-
-    Raises:
-        FormatError: it is damaged.
-    """
+    FormatError if it is damaged."""
     found = attachment_index(source, offset, length)
     crc, position, end = 0, offset + 9, offset + 9 + length - 4
     expected = int.from_bytes(source.read(end, 4), "little")
@@ -242,11 +233,8 @@ def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
 
 
 def iter_records(data: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
-    """(offset, end, channel, sequence, log_time) of the Message records in `data`.
-
-    Raises:
-        FormatError: bytes that are no whole Message record.
-    """
+    """(offset, end, channel, sequence, log_time) of the Message records in `data`; FormatError if there are
+    bytes that are no whole Message record."""
     start = 0
     while start < len(data):
         if start + BODY > len(data):
@@ -321,11 +309,7 @@ def has_summary(source: Source) -> bool:
 
 
 def read_summary(source: Source) -> Summary:
-    """Parses the summary section.
-
-    Raises:
-        FormatError: the footer, the summary's CRC or a record in it is wrong.
-    """
+    """Parses the summary section; FormatError if the footer, the summary's CRC or a record in it is wrong."""
     end = source.size - len(MAGIC) - FOOTER.size
     footer = source.read(end, FOOTER.size)
     _, _, start, _, crc = FOOTER.unpack(footer)

@@ -53,11 +53,8 @@ class Source(Protocol):
 
 
 def open_regular(path: Path) -> int:
-    """Opens a regular file for reading, and never waits, not even for a pipe's writer.
-
-    Raises:
-        OSError: the path cannot be opened, or is no regular file.
-    """
+    """Opens a regular file for reading, and never waits, not even for a pipe's writer; OSError if the path cannot be
+    opened, or is no regular file."""
     waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
     fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
     try:

@@ -149,10 +149,7 @@ def with_run(
     attachments: Mapping[str, tuple[str, bytes]], options: RecordOptions, environment: str
 ) -> dict[str, tuple[str, bytes]]:
     """The attachments with `run.json`; without it if the user says nothing about the run and captures nothing.
-
-    Raises:
-        RecordingError: a part of the run is no text, or JSON cannot hold it.
-    """
+    RecordingError if a part of the run is no text, or JSON cannot hold it."""
     run = Run.given(options.name, options.metadata, options.tags, options.split)
     if RUN_NAME in attachments or (run == Run() and options.capture == "none"):
         return dict(attachments)

@@ -226,11 +226,8 @@ def _episode_flags(given: Any, n: int) -> Array:
 
 
 def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
-    """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other.
-
-    Raises:
-        StepError: arrays do not fit together; at once, before anything is written.
-    """
+    """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other; StepError if arrays do not fit
+    together; at once, before anything is written."""
     shape = given.rewards.shape[:lead]
     _check_infos(given.infos)
     for name in ("actions", "next_states", "infos"):

@@ -152,11 +152,8 @@ class Stream:
             begin = stop
 
     def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
-        """Records whole episodes that need no records but rows and final states.
-
-        Raises:
-            StepError: a value cannot be stored exactly; nothing is recorded.
-        """
+        """Records whole episodes that need no records but rows and final states; StepError if a value cannot be stored
+        exactly; nothing is recorded."""
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
         numbers = np.arange(writer.next_episode, writer.next_episode + count)
         final_bytes = None if finals is None else _final_bytes(writer.laid(), finals, count)

@@ -41,8 +41,7 @@ def held(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     If a new attachment depends on the old one, read the old one within the block, then `attach` the new one.
 
-    Raises:
-        RecordingError: another writer holds the lock for longer than a moment.
+    RecordingError if another writer holds the lock for longer than a moment.
     """
     place = Path(os.path.realpath(path))  # the file that a symbolic link names is replaced, not the link
     lock = FileLock(place, "a")

@@ -124,11 +124,8 @@ def _length_at(source: Source, place: int) -> int:
 
 
 def gather(source: Source, tail: Tail) -> Evidence:
-    """Reads the whole file once, without its journal; raises nothing for damage.
-
-    Raises:
-        NewerVersionError: the recording's format is not known.
-    """
+    """Reads the whole file once, without its journal; raises nothing for damage. NewerVersionError if the recording's
+    format is not known."""
     evidence = Evidence(source, tail)
     if tail.summary is not None:
         evidence.schemas, evidence.channels = dict(tail.summary.schemas), dict(tail.summary.channels)

@@ -127,11 +127,8 @@ def final_state(evidence: Evidence, episode: PlannedEpisode) -> bytes:
 
 
 def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels) -> Plan:
-    """Decides which episode each row that is left belongs to.
-
-    Raises:
-        FormatError: with `evidence.strict`, a step, a start or an end cannot be decoded.
-    """
+    """Decides which episode each row that is left belongs to; with `evidence.strict`, FormatError if a step, a start or
+    an end cannot be decoded."""
     runs = list(step_runs(evidence, store, layout, channels))
     kept: dict[int, Ranges] = {env: [] for env in range(len(channels.steps))}
     for run in runs:

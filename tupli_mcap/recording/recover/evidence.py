@@ -268,8 +268,7 @@ def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
     The rows of a last chunk without its message index are taken, but `good_end` is before that chunk. With
     `only_metadata`, it reads only the records before the first chunk.
 
-    Raises:
-        FormatError: the chunks of a channel do not hold its rows without gaps. A damaged end raises nothing.
+    FormatError if the chunks of a channel do not hold its rows without gaps. A damaged end raises nothing.
     """
     evidence, walk = Evidence(source, Tail(), strict=True, good_end=len(MAGIC)), Walk(source)
     waiting: tuple[tuple[int, ...], Rows] | None = None  # a chunk whose message index comes next

@@ -184,8 +184,7 @@ def take_journal(evidence: Evidence, journal: JournalContents) -> None:
 
     With `evidence.strict` it takes the rows that continue those in the file (`rows_of`), else all that are missing.
 
-    Raises:
-        FormatError: the journal is damaged, or lacks an area.
+    FormatError if the journal is damaged, or lacks an area.
     """
     define(evidence, journal)
     steps = step_channels(evidence.channels, evidence.source.name)

@@ -37,10 +37,7 @@ def step_facts(
     store: ChunkStore, layout: StepLayout, channel: int, first: int, count: int, *, keep: bool = False
 ) -> Iterator[StepFacts]:
     """The facts of rows `first:first + count`, for one chunk after the other; with `keep`, chunks are cached.
-
-    Raises:
-        FormatError: a chunk is damaged, or has rows of another size, or times that the index cannot hold.
-    """
+    FormatError if a chunk is damaged, or has rows of another size, or times that the index cannot hold."""
     for span in store.spans(channel, first, count):
         if layout.constant:
             rows = store.rows(span.chunk, layout.step_message.dtype, keep=keep)[span.begin : span.end]
@@ -102,10 +99,7 @@ def step_runs(
     evidence: Evidence, store: PackedStore, layout: StepLayout, channels: RecordedChannels
 ) -> Iterator[StepRun]:
     """The runs of all sub-environments in the order of their rows; a step without all of its images is left out.
-
-    Raises:
-        FormatError: as `step_facts`; with `evidence.strict`, a row is no step of the layout.
-    """
+    FormatError as `step_facts`; with `evidence.strict`, if a row is no step of the layout."""
     for env, channel in enumerate(channels.steps):
         ranges = evidence.ranges(channel)
         for ids in channels.images.values():

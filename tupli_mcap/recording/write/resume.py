@@ -203,11 +203,8 @@ def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> Non
 
 
 def restore_container(container: Container, contents: Contents, source: Source) -> None:
-    """Lets a container go on behind what a file holds; its position is the caller's to set.
-
-    Raises:
-        FormatError: the file's channels are not numbered from 1.
-    """
+    """Lets a container go on behind what a file holds; its position is the caller's to set. FormatError if the file's
+    channels are not numbered from 1."""
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
     if list(container.channels) != list(range(1, len(container.channels) + 1)):

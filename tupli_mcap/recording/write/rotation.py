@@ -122,10 +122,7 @@ class Rotation:
 
     def open_first(self) -> RecordingWriter:
         """A writer of the first file, or of the one to append to; mode "a" makes the file if there is none.
-
-        Raises:
-            RecordingError: as `RecordingWriter`.
-        """
+        RecordingError as `RecordingWriter`."""
         while True:
             path, mode = self._paths[0], self._options.mode
             is_new = not os.path.lexists(path)
@@ -167,11 +164,8 @@ class Rotation:
         return is_full and (writer.journal is not None or writer.index.count > 0)
 
     def open_next(self) -> RecordingWriter:
-        """A writer of the next file; the caller closes the one before.
-
-        Raises:
-            RecordingError: it cannot be made; the one before can be recorded to as before.
-        """
+        """A writer of the next file; the caller closes the one before. RecordingError if it cannot be made; the one
+        before can be recorded to as before."""
         if self._base is None:
             self._base = series(self._paths[0])[0]
         base = self._base

@@ -67,21 +67,15 @@ class Work:
         return result
 
     def go_on(self) -> None:
-        """Goes on after what was asked, which may have closed the recording, or flushed it in vain.
-
-        Raises:
-            RecordingError: it has.
-        """
+        """Goes on after what was asked, which may have closed the recording, or flushed it in vain; RecordingError if
+        it has."""
         if self.state != ASKING:
             self.refuse()
         self.state = BEGUN
 
     def finish(self) -> None:
-        """The work is done; nothing is half done any more.
-
-        Raises:
-            RecordingError: a signal handler has closed the recording within it.
-        """
+        """The work is done; nothing is half done any more. RecordingError if a signal handler has closed the recording
+        within it."""
         if self.state != BEGUN:
             self.refuse()
         self.state = DONE
@@ -109,10 +103,7 @@ class Work:
 
     def close(self) -> None:
         """Finishes all files; from their journals, where the mark is set. Calling it again goes on with what is left.
-
-        Raises:
-            RecordingError: the disk refuses. The file and its journal hold everything that was recorded.
-        """
+        RecordingError if the disk refuses. The file and its journal hold everything that was recorded."""
         for recorder in self.recorders:
             writer = recorder.writer
             if self.state != DONE:

@@ -429,10 +429,7 @@ class RecordingWriter:
 
     def let_go(self) -> None:
         """Lets go of the file, its lock and the journal, as they are. Calling it again goes on with what is left.
-
-        Raises:
-            RecordingError: as `FileLock.release`.
-        """
+        RecordingError as `FileLock.release`."""
         _live.discard(self)
         self.on_close()
         self.container.close()
@@ -452,8 +449,7 @@ class RecordingWriter:
 
         What is in memory is not used. Calling it again goes on with what is left.
 
-        Raises:
-            RecordingError: the disk refuses. The file and the journal hold everything that was recorded.
+        RecordingError if the disk refuses. The file and the journal hold everything that was recorded.
         """
         if self.closed:
             return

@@ -246,11 +246,8 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
 
 
 def _layout(evidence: Evidence) -> tuple[StepLayout, RecordedChannels] | None:
-    """The layout and the channels; None if the recording has no step channel and no rows.
-
-    Raises:
-        FormatError: the spaces are lost, so that its rows cannot be understood.
-    """
+    """The layout and the channels; None if the recording has no step channel and no rows. FormatError if the spaces are
+    lost, so that its rows cannot be understood."""
     name = evidence.source.name
     advice = 'nothing can be saved as a recording ("mcap recover" copies the messages as they are)'
     try:

@@ -59,11 +59,8 @@ class Autoreset:
 
     @classmethod
     def of(cls, env: Any, given: Any) -> Autoreset:
-        """The mode that the caller gives, or the environment declares; by default next-step is assumed.
-
-        Raises:
-            StepError: the mode is none of the three.
-        """
+        """The mode that the caller gives, or the environment declares; by default next-step is assumed; StepError if
+        the mode is none of the three."""
         # those of Gymnasium 1.0 do not declare the only mode they have
         base = env.unwrapped
         known = isinstance(base, SyncVectorEnv | AsyncVectorEnv) or type(base).__module__.startswith(
@@ -84,8 +81,7 @@ class Autoreset:
 
         `changed`: the batch returned other states than these.
 
-        Raises:
-            StepError: that contradicts what was recorded, or what the caller has said.
+        StepError if that contradicts what was recorded, or what the caller has said.
         """
         if self.mode == "SameStep" or not changed:
             return False  # nothing contradicts what is said
@@ -112,8 +108,7 @@ class Autoreset:
     def check_resets(self, holes: Array, done: Array, rewards: Array) -> None:
         """Checks a batch in which the sub-environments `holes` should have been reset.
 
-        Raises:
-            StepError: they took a step.
+        StepError if they took a step.
         """
         steps = done & holes
         if self.is_assumed:

@@ -51,8 +51,7 @@ class FrameRecorder:
         """After `step` steps of an episode; `render` is called if their frame is wanted; None where the environment
         has been reset since.
 
-        Raises:
-            RecordingError: what is rendered is no picture.
+        RecordingError if what is rendered is no picture.
         """
         first, self._first[env] = self._first[env], None
         if first is not None:
@@ -88,8 +87,7 @@ class FrameRecorder:
         """After a batch, before its ends are recorded. A sub-environment that took no step was reset; with `same_step`,
         one that ended was too, so that its final state has no frame.
 
-        Raises:
-            RecordingError: what is rendered are no pictures.
+        RecordingError if what is rendered are no pictures.
         """
         once = cache(lambda: self._all_rendered(render))
 

@@ -148,8 +148,7 @@ def final_states(infos: Any, done: Any, each: Callable[[Any], list[Any]]) -> dic
 
     `each` takes a batch of states apart.
 
-    Raises:
-        StepError: there are not as many as sub-environments.
+    StepError if there are not as many as sub-environments.
     """
     ended = done.nonzero()[0].tolist()
     if not isinstance(infos, Mapping):

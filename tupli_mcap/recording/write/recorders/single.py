@@ -100,11 +100,8 @@ class SingleRecorder:
         self._over = self._rows = None  # or `begin_next` would go on
 
     def reset(self, state: Any, facts: ResetFacts) -> None:
-        """Starts an episode at `state`; a running one ends as interrupted.
-
-        Raises:
-            StepError: the state cannot be stored exactly.
-        """
+        """Starts an episode at `state`; a running one ends as interrupted. StepError if the state cannot be stored
+        exactly."""
         if self._writer.closed:
             self._closed()
         self._write_pending()
@@ -137,10 +134,7 @@ class SingleRecorder:
 
     def begin_next(self, state: Any) -> bool:
         """As `reset` without facts, where `leave_end` was the last call; False if it was not, and nothing is done.
-
-        Raises:
-            StepError: the state cannot be stored exactly.
-        """
+        StepError if the state cannot be stored exactly."""
         over, writer, rows = self._over, self._writer, self._rows
         if over is None or rows is None or writer.lost_streams:
             return False

@@ -91,11 +91,8 @@ class VectorRecorder:
     # ---- resets
 
     def reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None = None) -> None:
-        """All sub-environments, or those in `mask`, start over; running episodes end as interrupted.
-
-        Raises:
-            StepError: a state cannot be stored exactly.
-        """
+        """All sub-environments, or those in `mask`, start over; running episodes end as interrupted. StepError if a
+        state cannot be stored exactly."""
         if self._writer.closed:
             raise self._writer.why_stopped()
         self._write_pending()
@@ -129,11 +126,8 @@ class VectorRecorder:
     def put(
         self, actions: Any, states: Any, rewards: Any, terminals: Any, timeouts: Any, infos: Any
     ) -> Array:
-        """Records a batch; returns which sub-environments took a step (bool, `num_envs`).
-
-        Raises:
-            StepError: something cannot be stored exactly; nothing of this batch is recorded.
-        """
+        """Records a batch; returns which sub-environments took a step (bool, `num_envs`). StepError if something cannot
+        be stored exactly; nothing of this batch is recorded."""
         if self._writer.closed:
             raise self._writer.why_stopped()
         if not self._was_reset or self._refused:
