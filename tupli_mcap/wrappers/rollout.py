@@ -75,23 +75,14 @@ def record_rollouts(
         raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
     began = time.perf_counter()
     asked = RecordOptions(**options)
-    rollout = _Rollout(steps, seed, policy, _every(max(1, steps // _REPORTS), progress))
+    report = _every(max(1, steps // _REPORTS), progress)
     with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if asked.every else None)) as made:
         is_vector = isinstance(made, gym.vector.VectorEnv)
         wrapped: Any = (RecordVectorEpisodes if is_vector else RecordEpisodes)(made, path, **options)
         known = wrapped._writer.index.count
         with _closing(wrapped, asked.mode):
-            done = (_run_vector if is_vector else _run)(wrapped, rollout)
+            done = (_run_vector if is_vector else _run)(wrapped, steps, seed, policy, report)
     return _summary(wrapped.paths, known, done, time.perf_counter() - began)
-
-
-class _Rollout(NamedTuple):
-    """A rollout; `report` is called with the number of steps so far."""
-
-    steps: int
-    seed: int | None
-    policy: Policy | None
-    report: Callable[[int], None]
 
 
 def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> RolloutSummary:
@@ -154,8 +145,10 @@ def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator
         raise
 
 
-def _run(env: RecordEpisodes, rollout: _Rollout) -> int:
-    steps, seed, policy, report = rollout
+def _run(
+    env: RecordEpisodes, steps: int, seed: int | None, policy: Policy | None, report: Callable[[int], None]
+) -> int:
+    """Takes the steps, and calls `report` with their number so far."""
     env.action_space.seed(seed)
     ended, again = True, seed
     state: Any = None
@@ -171,8 +164,14 @@ def _run(env: RecordEpisodes, rollout: _Rollout) -> int:
     return steps
 
 
-def _run_vector(env: RecordVectorEpisodes, rollout: _Rollout) -> int:
-    steps, seed, policy, report = rollout
+def _run_vector(
+    env: RecordVectorEpisodes,
+    steps: int,
+    seed: int | None,
+    policy: Policy | None,
+    report: Callable[[int], None],
+) -> int:
+    """The same with several sub-environments; returns how many steps were taken."""
     env.action_space.seed(seed)
     done = 0
     with _failures(done, env.path):

@@ -19,7 +19,7 @@ import numpy as np
 
 from tupli_mcap.errors import RecordingError, SpaceError, StepError, TupliError, os_reason
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
-from tupli_mcap.journal.file import Area, Journal, boot_id, sync_directory, sync_file
+from tupli_mcap.journal.file import Journal, boot_id, sync_directory, sync_file
 from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.mcap.lock import FileLock
@@ -68,7 +68,7 @@ class RecordingWriter:
         self.vector: BatchStore | None = None
         self.streams: Sequence[StepStore] = ()
         self._durable = options.durability != "os"
-        self.syncs_steps = self._sealed = options.durability == "step"
+        self._sealed = options.durability == "step"
         self.images: list[list[ImageRows]] = []
         self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
@@ -156,22 +156,17 @@ class RecordingWriter:
 
         `apart`: sub-environments of a `vector` recording do not step together.
         """
-        self.layout = layout
-        self._apart = apart
-        self.num_envs = num_envs
+        self.layout, self.num_envs, self.is_vector, self._apart = layout, num_envs, vector, apart
         if self.index.count:  # of an earlier session
             self.lost_streams = set(range(num_envs))
-        self.is_vector = vector
+        png = frozenset(leaf.name for leaf in layout.images if self.options.image_format == "png")
+        if self.recorded_envs is not None:
+            png = png_leaves(self.container.channels)
         self.channels = register_channels(
-            self.container,
-            str(self.path),
-            layout,
-            num_envs if vector else None,
-            info_schema,
-            self.options.cameras,
-            self._png(layout),
-        )
-        self._make_stores(self._areas())
+            self.container, str(self.path), layout, num_envs if vector else None, info_schema,
+            self.options.cameras, png,
+        )  # fmt: skip
+        self._make_stores(layout)
         # after the journal: a file that has channels and no end has one
         self.cut()
         self._attach()
@@ -187,12 +182,6 @@ class RecordingWriter:
             self.place.remove_replaced()
             if self._durable:
                 sync_directory(self.place.file.parent)
-
-    def _png(self, layout: StepLayout) -> frozenset[str]:
-        """The image leaves stored as PNG: as the options say, on append as they are in the file."""
-        if self.recorded_envs is not None:
-            return png_leaves(self.container.channels)
-        return frozenset(leaf.name for leaf in layout.images if self.options.image_format == "png")
 
     def cut(self) -> None:
         """On append: takes index and summary off the file. Before, nothing in it has changed."""
@@ -216,13 +205,6 @@ class RecordingWriter:
         for name, (media_type, data) in arriving.items():
             container.add_attachment(name, media_type, data, time.time_ns())
 
-    def _areas(self, step_capacity: int = 0) -> list[Area]:
-        has_infos = self.channels.info is not None
-        return plan_areas(
-            self.laid(), self.num_envs, self.options.chunk_size, step_capacity,
-            vector=self.is_vector and not self._apart, infos=has_infos, frames=bool(self.channels.cameras),
-        )  # fmt: skip
-
     def laid(self) -> StepLayout:
         """The layout; RecordingError before the first step."""
         if self.layout is None:
@@ -234,13 +216,12 @@ class RecordingWriter:
             raise RecordingError(f"{self.path} has no step yet, so it has no episodes")
         return self.events
 
-    def _make_stores(self, areas: Sequence[Area]) -> None:
-        layout, channels = self.laid(), self.channels
-        self.journal = self._new_journal(areas)
+    def _make_stores(self, layout: StepLayout) -> None:
+        self.journal = self._new_journal()
         self.journal.publish(durable=self._durable, replaced=self.place.replaced)
         file = ToFile(self._chunks.add, self._chunks.start, self._grow, self._durable, self._sealed)
         self._stores = stores = Stores(
-            layout, channels, self.container, self.journal, self.index, file, vector=self.is_vector,
+            layout, self.channels, self.container, self.journal, self.index, file, vector=self.is_vector,
             apart=self._apart,
         )  # fmt: skip
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
@@ -382,15 +363,20 @@ class RecordingWriter:
     def _grow(self, size: int) -> None:
         """Makes a larger journal for steps of `size` bytes; the running states move into it."""
         self._flush(keep_last=False)
-        areas = self._areas(2 * size)
-        journal = self._new_journal(areas)
+        journal = self._new_journal(2 * size)
         if self._stores is not None:
             self._stores.move(journal)
         journal.publish(durable=self._durable)
         self.journal = journal
 
-    def _new_journal(self, areas: Sequence[Area]) -> Journal:
+    def _new_journal(self, step_capacity: int = 0) -> Journal:
+        """A journal with room for steps of variable size of at least `step_capacity` bytes."""
         channels = self.channels
+        areas = plan_areas(
+            self.laid(), self.num_envs, self.options.chunk_size, step_capacity,
+            vector=self.is_vector and not self._apart, infos=channels.info is not None,
+            frames=bool(channels.cameras),
+        )  # fmt: skip
         description = {
             **self.place.identity(),
             "boot": boot_id(),
@@ -399,7 +385,7 @@ class RecordingWriter:
             "channels": [channels.steps, channels.images, *channels[2:6]],
             "definitions": {str(c): self.container.definitions(c).hex() for c in self.container.channels},
         }
-        return Journal(self.place.journal, list(areas), description)
+        return Journal(self.place.journal, areas, description)
 
     def close(self) -> None:
         """Writes the rest, the episode index and the summary, and removes the journal.

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +12,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import MAGIC, OTHER_TOOLS
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.walk import Damage, attachment_name
+from tupli_mcap.mcap.walk import attachment_name
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
@@ -153,8 +151,8 @@ def recover_recording(
     opened = PathSource(path)
     try:
         if dry_run:
-            with _nowhere() as fd:
-                return _recover(opened, fd, compression)
+            with Path(os.devnull).open("wb") as nowhere:
+                return _recover(opened, nowhere.fileno(), compression)
         tidy(goal.parent)
         with replacing(goal) as (fd, temporary):
             report = _recover(opened, fd, compression)
@@ -189,15 +187,6 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
         raise RecordingError(
             f"{goal} exists and is not overwritten; give another file, or pass overwrite=True (--force)"
         )
-
-
-@contextlib.contextmanager
-def _nowhere() -> Iterator[int]:
-    fd = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
-    try:
-        yield fd
-    finally:
-        os.close(fd)
 
 
 def _signature_fits(path: Path) -> bool:
@@ -288,7 +277,8 @@ def _recover_ours(
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")
     elif writer.metadata_lost:
         report.notes.append(f"of the recording's metadata, {', '.join(writer.metadata_lost)} are lost")
-    report.damaged = [*_ends(evidence), *_places(evidence.damages)]
+    places = [DamagedPlace(d.offset, d.end - d.offset, d.why) for d in evidence.damages]
+    report.damaged = [*_ends(evidence), *places]
     report.messages = sum(container.counts.values())
     report.attachments = len(container.attachment_indexes) - 1
     report.attachments_lost = _attachments_lost(evidence)
@@ -337,7 +327,3 @@ def _ends(evidence: Evidence) -> list[DamagedPlace]:
     if tail.finished and tail.summary is None and not tail.why:
         places.append(DamagedPlace(source.size, 0, "the footer is damaged or cut off"))
     return places
-
-
-def _places(damages: list[Damage]) -> list[DamagedPlace]:
-    return [DamagedPlace(d.offset, d.end - d.offset, d.why) for d in damages]

@@ -121,8 +121,7 @@ class SingleRecorder:
         rows.put_state(state)
         self._episode = writer.start_episode(0, rows.count, facts)
         self.put = rows.put
-        if writer.syncs_steps:
-            writer.sync_step()
+        writer.sync_step()
 
     def leave_end(self, end: int) -> None:
         """As `end`, after a step with a flag set and without metadata; it is written later, with many others."""
