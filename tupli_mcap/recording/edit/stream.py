@@ -30,24 +30,22 @@ def stream_excerpts(
         FormatError: a recording is damaged.
     """
 
-    def write(fd: int) -> None:
+    def send(fd: int) -> None:
         with opening as excerpts:
-            _write(excerpts, fd, without)
+            source, rows, *_ = excerpts[0]
+            table = source.file.store.table
+            compression = COMPRESSIONS[
+                int(table["compression"][0])
+            ]  # so that chunks can be copied as they are
+            container = Container(fd, source.name, compression)
+            if len(excerpts) > 1 or without:
+                merge_excerpts(excerpts, container, without)
+                return
+            whole = len(rows) == len(source)
+            numbers = None if whole else rows["episode"].tolist()
+            write(source, container, kept_metadata(source), numbers, {}, signed=whole)
 
-    return _through_a_pipe(write)
-
-
-def _write(excerpts: Sequence[Excerpt], fd: int, without: Collection[str]) -> None:
-    source, rows, *_ = excerpts[0]
-    table = source.file.store.table
-    compression = COMPRESSIONS[int(table["compression"][0])]  # so that chunks can be copied as they are
-    container = Container(fd, source.name, compression)
-    if len(excerpts) > 1 or without:
-        merge_excerpts(excerpts, container, without)
-        return
-    whole = len(rows) == len(source)
-    numbers = None if whole else rows["episode"].tolist()
-    write(source, container, kept_metadata(source), numbers, {}, signed=whole)
+    return _through_a_pipe(send)
 
 
 def _through_a_pipe(write: Callable[[int], None]) -> Generator[bytes]:

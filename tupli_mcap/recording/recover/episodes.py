@@ -323,15 +323,8 @@ class _Planner:
 # ---- what is lost
 
 
-class Losses(NamedTuple):
-    """Lost steps: `steps` maps episodes to ranges of steps (None: unknown end), `rows` is their known number."""
-
-    steps: dict[int, list[tuple[int, int | None]]]
-    rows: int
-
-
-def losses(plan: Plan) -> Losses:
-    """The steps that are lost of a planned recording."""
+def losses(plan: Plan) -> tuple[dict[int, list[tuple[int, int | None]]], int]:
+    """The steps that are lost, by old episode: ranges (None: the end is not known); and their known number."""
     runs: dict[int, list[StepRun]] = {}
     for episode in plan.episodes:
         runs.setdefault(episode.run.episode, []).append(episode.run)
@@ -342,7 +335,7 @@ def losses(plan: Plan) -> Losses:
         if lost:
             steps[number] = lost
     kept = sum(stop - first for ranges in plan.kept.values() for first, stop in ranges)
-    return Losses(steps, sum(plan.totals) - kept)
+    return steps, sum(plan.totals) - kept
 
 
 def _of_episode(plan: Plan, number: int, runs: list[StepRun], *, ended: bool) -> list[tuple[int, int | None]]:

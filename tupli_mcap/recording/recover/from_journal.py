@@ -91,22 +91,15 @@ def _read(source: Source, path: Path, only: Collection[str] | None = None) -> Jo
     except FileNotFoundError as err:
         return err
     except FormatError as err:
-        raise _unreadable(source.name, err) from err
+        # of a later version, or damaged: it must not count as missing, for the user may have another version, or a copy
+        raise FormatError(
+            f"{source.name} was not finished, and its journal cannot be read ({err}): {STEPS_IN_JOURNAL}; "
+            f"{KEEP_JOURNAL}"
+        ) from err
     except OSError as err:
         raise RecordingError(
             f"{source.name} was not finished, and its journal {path.name} cannot be read: {os_reason(err)}"
         ) from err
-
-
-def _unreadable(name: str, err: FormatError) -> FormatError:
-    """The error for an unfinished recording whose journal is there and cannot be read: damaged, or of a later version.
-
-    Such a journal must not count as missing: it may hold steps that are nowhere else, and a later version of this
-    package may read it, or the user may have a copy.
-    """
-    return FormatError(
-        f"{name} was not finished, and its journal cannot be read ({err}): {STEPS_IN_JOURNAL}; {KEEP_JOURNAL}"
-    )
 
 
 def belongs(info: Mapping[str, Any], metadata: Mapping[str, str]) -> bool:

@@ -286,11 +286,11 @@ def _recover_ours(
 
 
 def _report_plan(report: RecoveryReport, plan: Plan) -> None:
-    kept, lost = {episode.run.episode for episode in plan.episodes}, losses(plan)
+    kept = {episode.run.episode for episode in plan.episodes}
+    lost, report.steps_lost = losses(plan)
     report.episodes, report.steps = len(plan.episodes), sum(e.run.steps for e in plan.episodes)
-    report.steps_lost = lost.rows
-    report.lost = [LostSteps(n, *steps) for n, ranges in sorted(lost.steps.items()) for steps in ranges]
-    report.episodes_lost = len(set(lost.steps) - kept)
+    report.lost = [LostSteps(n, *steps) for n, ranges in sorted(lost.items()) for steps in ranges]
+    report.episodes_lost = len(set(lost) - kept)
     report.cut = [
         CutEpisode(e.run.episode, e.run.step, e.run.steps, e.number) for e in plan.episodes if not e.whole
     ]
