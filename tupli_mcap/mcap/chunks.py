@@ -6,7 +6,6 @@ import struct
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import lz4.frame
@@ -18,7 +17,15 @@ from mcap.records import Channel, Schema
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import COMPRESSIONS, index_entries
-from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, MAX_ROWS_A_BYTE, RECORD, iter_records, parse_record
+from tupli_mcap.mcap.records import (
+    BODY,
+    CHUNK_HEAD,
+    HEADER_FIELDS,
+    MAX_ROWS_A_BYTE,
+    RECORD,
+    iter_records,
+    parse_record,
+)
 
 MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
 """Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
@@ -73,14 +80,26 @@ def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
     return found
 
 
+class ChunkClaim(NamedTuple):
+    """The claim of an index, or of the chunk's header: `length` bytes in the file hold `size` bytes of records."""
+
+    length: int
+    size: int
+    compression: str
+    crc: int  # 0: not said
+
+    @property
+    def packed(self) -> int:
+        """Bytes of compressed data."""
+        return self.length - CHUNK_HEAD.size - len(self.compression) - 8
+
+
 class Chunk(NamedTuple):
-    """A chunk's header and its decompressed records, `data`, whose CRC was checked."""
+    """A chunk whose claim is right, its times (ns), and its decompressed records, `data`, whose CRC was checked."""
 
     start_time: int
     end_time: int
-    crc: int
-    compression: str
-    packed: int
+    claim: ChunkClaim
     data: memoryview
 
 
@@ -107,11 +126,11 @@ class ChunkRecords(NamedTuple):
         """The row number of the first message."""
         return int(self.headers["#sequence"][0])
 
-    def row(self, offset: int, length: int, chunk: Chunk) -> tuple[int, ...]:
-        """The chunk's row in the episode index, as CHUNK_ROWS: its record is `length` bytes long, at `offset`."""
-        compression = COMPRESSIONS.index(chunk.compression or "none")
+    def row(self, offset: int, claim: ChunkClaim) -> tuple[int, ...]:
+        """The row in the episode index, as CHUNK_ROWS, of the chunk at `offset`."""
+        compression = COMPRESSIONS.index(claim.compression or "none")
         counts = self.first, len(self.headers), self.skip
-        return offset, length, len(chunk.data), *counts, chunk.crc, self.channel, compression, 0
+        return offset, claim.length, claim.size, *counts, claim.crc, self.channel, compression, 0
 
 
 def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
@@ -177,14 +196,3 @@ def message_places(data: Any, most: int = sys.maxsize) -> Array:
     if at != end or (opcodes != Opcode.MESSAGE).any() or (places[:, 1] - places[:, 0] < BODY).any():
         deque(iter_records(data), 0)  # raises, and names the wrong record
     return places
-
-
-def messages(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    """(log_time, CDR body) of consecutive Message records. FormatError if `data` is something else. It is raised before
-    the first message."""
-    headers = message_headers(data)
-    for begin in range(0, len(headers), _BLOCK):
-        part = headers[begin : begin + _BLOCK]
-        columns = (part[name].tolist() for name in ("#log_time", "#offset", "#length"))
-        for log_time, start, length in zip(*columns, strict=True):
-            yield log_time, data[start + BODY : start + 9 + length]

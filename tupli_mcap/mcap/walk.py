@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunks import MAX_RATIO, Chunk, decompress
+from tupli_mcap.mcap.chunks import MAX_RATIO, Chunk, ChunkClaim, decompress
 from tupli_mcap.mcap.records import (
     CHUNK_HEAD,
     MAGIC,
@@ -45,20 +45,6 @@ _LEAST: dict[int, int] = {
 }  # fmt: skip
 # Start of a record: its opcode, and a length below 2^40. It is a lookahead, so that matches may overlap.
 _CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
-
-
-class ChunkClaim(NamedTuple):
-    """The claim of an index, or of the chunk's header: `length` bytes in the file hold `size` bytes of records."""
-
-    length: int
-    size: int
-    compression: str
-    crc: int  # 0: not said
-
-    @property
-    def packed(self) -> int:
-        """Bytes of compressed data."""
-        return self.length - CHUNK_HEAD.size - len(self.compression) - 8
 
 
 class Found(NamedTuple):
@@ -196,7 +182,7 @@ class Walk:
         for claim, repaired in self._claims(position, head):
             data = self.unpack(position, claim)
             if not isinstance(data, str):
-                chunk = Chunk(start, end, claim.crc, claim.compression, claim.packed, memoryview(data))
+                chunk = Chunk(start, end, claim, memoryview(data))
                 return Found(Opcode.CHUNK, position, claim.length, memoryview(b""), chunk, repaired=repaired)
             why = data
         return why

@@ -229,7 +229,7 @@ class Structure:
         if record.repaired:
             self._findings.error("chunk", record.repaired, offset=record.offset)
         try:
-            content = chunk_records(chunk.data, "the chunk", chunk.packed)
+            content = chunk_records(chunk.data, "the chunk", chunk.claim.packed)
         except FormatError as err:
             self._findings.error("chunk", str(err), offset=record.offset)
             return
@@ -240,14 +240,14 @@ class Structure:
         self._waiting = _Waiting(record.offset, content)
         self._rows(record, chunk, content)
         number, headers = content.channel, content.headers
-        self._table.append(content.row(record.offset, record.length, chunk))
+        self._table.append(content.row(record.offset, chunk.claim))
         at = record.offset + record.length
         self._chunk_indexes.append(
             ChunkIndex(
                 chunk_length=record.length,
                 chunk_start_offset=record.offset,
-                compression=chunk.compression,
-                compressed_size=chunk.packed,
+                compression=chunk.claim.compression,
+                compressed_size=chunk.claim.packed,
                 message_end_time=int(headers["#log_time"][-1]),
                 message_index_length=15 + 16 * len(headers),
                 message_index_offsets={number: at},

@@ -19,13 +19,14 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunks import decompress, headers_at, message_places, messages
+from tupli_mcap.mcap.chunks import decompress, headers_at, message_places
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.recording.index import StepClaims
 from tupli_mcap.remote import RemoteSource
 
+_BLOCK = 1 << 16  # messages whose places are numbers of Python at a time
 IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory
 _U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
 _SEQUENCE_AT = 11  # in a record
@@ -404,19 +405,21 @@ class ChunkStore:
         Raises:
             FormatError: a chunk is damaged; the messages before it have been yielded.
         """
-        row = 0
-        for chunk in [] if channel is None else self.chunks(channel):
-            for log_time, body in messages(memoryview(self.load(chunk, keep=False))):
+        if channel is not None:
+            messages = self.messages(channel, 0, self.count(channel), keep=False)
+            for row, (log_time, body) in enumerate(messages):
                 yield row, log_time, body
-                row += 1
 
-    def messages(self, channel: int, first: int, count: int) -> Iterator[tuple[int, memoryview]]:
+    def messages(
+        self, channel: int, first: int, count: int, *, keep: bool = True
+    ) -> Iterator[tuple[int, memoryview]]:
         """(log_time, CDR body) of messages of a channel of variable layout."""
         for span in self.spans(channel, first, count):
-            data, records = self.records(span.chunk)
+            data, records = self.records(span.chunk, keep=keep)
             view = memoryview(data)
-            for start, end in records[span.begin : span.end].tolist():
-                yield int.from_bytes(view[start + 15 : start + 23], "little"), view[start + BODY : end]
+            for begin in range(span.begin, span.end, _BLOCK):
+                for start, end in records[begin : min(begin + _BLOCK, span.end)].tolist():
+                    yield int.from_bytes(view[start + 15 : start + 23], "little"), view[start + BODY : end]
 
     def bodies(self, channel: int, first: int, count: int) -> Iterator[memoryview]:
         """The CDR bodies of messages of a channel of variable layout, whose chunks are fetched together."""

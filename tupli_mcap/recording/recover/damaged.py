@@ -30,7 +30,7 @@ from tupli_mcap.mcap.records import (
     records,
 )
 from tupli_mcap.mcap.source import Source
-from tupli_mcap.mcap.walk import ChunkClaim, Damage, Found, Walk
+from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
@@ -211,8 +211,8 @@ def _take_chunk(
 ) -> ChunkRecords | None:
     """Adds a chunk to those of its channel; returns its records, None if they are damaged."""
     try:
-        content = chunk_records(chunk.data, "the chunk", chunk.packed)
-        if not chunk.crc:
+        content = chunk_records(chunk.data, "the chunk", chunk.claim.packed)
+        if not chunk.claim.crc:
             raise FormatError("the chunk has no CRC")
     except FormatError as err:
         _add_damage(evidence, record, str(err))
@@ -220,12 +220,11 @@ def _take_chunk(
     if evidence.tail.summary is None:  # definitions in chunks have a CRC, those outside have none
         evidence.schemas |= {schema.id: schema for schema in content.schemas}
         evidence.channels |= {channel.id: channel for channel in content.channels}
-    channel, count, size = content.channel, len(content.headers), len(chunk.data)
-    piece = Piece(content.first, count, content.row(record.offset, record.length, chunk))
+    channel, count = content.channel, len(content.headers)
+    piece = Piece(content.first, count, content.row(record.offset, chunk.claim))
     if record.repaired:
-        claim = ChunkClaim(record.length, size, chunk.compression, chunk.crc)
-        place = RepairedChunk(record.offset, claim, content.skip)
-        piece = evidence.load(place, channel, content.first, count, size - content.skip)
+        place = RepairedChunk(record.offset, chunk.claim, content.skip)
+        piece = evidence.load(place, channel, content.first, count, chunk.claim.size - content.skip)
     chunks.setdefault(channel, []).append(_FoundChunk(record.offset, record.length, piece, record.repaired))
     return content
 

@@ -19,11 +19,11 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import Chunk, chunk_records
+from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, Rows
 from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign, parse_record
 from tupli_mcap.mcap.source import PathSource, Source
-from tupli_mcap.mcap.walk import ChunkClaim, Damage, Found, Walk
+from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
@@ -339,7 +339,7 @@ def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, 
     Takes the definitions in the chunk: its CRC covers them, while those outside of chunks have none.
     """
     try:
-        content = chunk_records(chunk.data, evidence.source.name, chunk.packed)
+        content = chunk_records(chunk.data, evidence.source.name, chunk.claim.packed)
     except FormatError:
         return None
     evidence.schemas |= {schema.id: schema for schema in content.schemas}
@@ -347,7 +347,7 @@ def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, 
     headers = content.headers
     data = bytes(chunk.data[content.skip :])
     rows = Rows(content.channel, content.first, data, headers["#offset"], headers["#log_time"])
-    return content.row(record.offset, record.length, chunk), rows
+    return content.row(record.offset, chunk.claim), rows
 
 
 def head(source: Source) -> dict[str, str]:
