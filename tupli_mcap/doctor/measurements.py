@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity
-from tupli_mcap.doctor.message_text import unravel
+from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Place, Severity, unravel
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Block, blocks

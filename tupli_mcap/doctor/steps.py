@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.doctor.findings import Finding, Severity
+from tupli_mcap.doctor.findings import Finding, Severity, duration, share
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace
-from tupli_mcap.doctor.message_text import duration, share
 from tupli_mcap.errors import plural
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.spaces.leaves import Leaf

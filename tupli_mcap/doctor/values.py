@@ -10,9 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity
+from tupli_mcap.doctor.findings import MAX_PLACES, Finding, Severity, dimension_text, dimensions
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, value_bytes
-from tupli_mcap.doctor.message_text import dimension_text, dimensions
 from tupli_mcap.errors import plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
