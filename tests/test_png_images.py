@@ -22,8 +22,8 @@ from PIL import Image
 from tupli_mcap import FormatError, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.mcap.container import Rows
+from tupli_mcap.messages.images.codecs import PngCodec
 from tupli_mcap.messages.images.pictures import decode_pixels
-from tupli_mcap.messages.images.png import PngCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings

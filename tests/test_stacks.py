@@ -22,7 +22,7 @@ from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jso
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.images.stack import StackCodec
+from tupli_mcap.messages.images.codecs import StackCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings

@@ -234,7 +234,7 @@ def stacked(path: Path, axis: int = 0, **options: Any) -> list[Log]:
 def png_images(path: Path) -> list[Log]:
     env = Played(CAMERA, picture, ENDS)
     with (
-        mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png),
+        mock.patch("tupli_mcap.messages.images.codecs.encode_pixels", stored_png),
         RecordEpisodes(env, path, image_format="png", **PLAIN, chunk_size=400) as recorder,
     ):
         roll(recorder, env, [3, 4, 2], action)
@@ -242,7 +242,7 @@ def png_images(path: Path) -> list[Log]:
 
 
 def png_stacks(path: Path) -> list[Log]:
-    with mock.patch("tupli_mcap.messages.images.png.encode_pixels", stored_png):
+    with mock.patch("tupli_mcap.messages.images.codecs.encode_pixels", stored_png):
         return stacked(path, image_format="png")
 
 

@@ -1,7 +1,5 @@
 """Image leaves: stacks of frames, PNG and JPEG.
 
-codecs     chooses the codec of a channel
-stack      stacks of frames: each frame is stored once
-png        images as PNG
+codecs     the codecs of image channels: stacks of frames, each of which is stored once, and PNG
 pictures   encodes and decodes PNG and JPEG with Pillow, for rendered frames too
 """
