@@ -344,7 +344,7 @@ def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:
     raw = even_rows(1, 0, rows.tobytes(), rows)
     encoded = codec.encode(raw)
     data = bytes(encoded.data)
-    assert len(data) < len(raw.data) and bytes(codec.decode(data, 6, "here")) == raw.data
+    assert len(data) < len(raw.data) and bytes(codec.decode(data, 6)) == raw.data
     assert codec.encode(encoded) is encoded
     second = int(encoded.offsets[1])
     wrong = {
@@ -353,22 +353,22 @@ def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:
         "picture of 1 frames": data[: second + BODY + 28] + b"\x09" + data[second + BODY + 29 :],
     }
     for cut in range(0, len(data), 7):
-        with pytest.raises(FormatError, match="here: "):
-            codec.decode(data[:cut], 6, "here")
-    with pytest.raises(FormatError, match="here: row 0 expected 1 to 3 frames"):
-        codec.decode(wrong["1 to 3 frames"], 5, "here")
+        with pytest.raises(FormatError, match="expected|row"):
+            codec.decode(data[:cut], 6)
+    with pytest.raises(FormatError, match="row 0 expected 1 to 3 frames"):
+        codec.decode(wrong["1 to 3 frames"], 5)
     for count in (5, 7):
-        with pytest.raises(FormatError, match="here: expected"):
-            codec.decode(data, count, "here")
+        with pytest.raises(FormatError, match="expected"):
+            codec.decode(data, count)
     with pytest.raises(FormatError, match="at most"):
-        codec.decode(data, 1 << 40, "here")
+        codec.decode(data, 1 << 40)
     for at in range(
         second, second + int(encoded.offsets[2]) - second
     ):  # any byte of a row: an error, or that byte
         broken = bytearray(data)
         broken[at] ^= 1
         try:
-            found = np.frombuffer(codec.decode(bytes(broken), 6, "here"), image.dtype)
+            found = np.frombuffer(codec.decode(bytes(broken), 6), image.dtype)
         except FormatError:
             continue
         assert len(found) == 6

@@ -38,7 +38,7 @@ class ImageCodec(Protocol):
         """Encodes the rows of a chunk; rows that are encoded already (a killed writer's) stay as they are."""
         ...
 
-    def decode(self, data: Any, count: int, where: str) -> Any:
+    def decode(self, data: Any, count: int) -> Any:
         """The `count` rows of constant size of a chunk; raises FormatError if `data` does not hold them."""
         ...
 
@@ -150,35 +150,31 @@ class StackCodec:
         np.cumsum(lengths[:-1], out=offsets[1:])
         return rows._replace(data=b"".join(parts), offsets=offsets)
 
-    def decode(self, data: Any, count: int, where: str) -> Any:
+    def decode(self, data: Any, count: int) -> Any:
         size, start, frame = self._dtype.itemsize, self._start, self._frame_bytes
         if count * size > MAX_CHUNK:
-            raise FormatError(
-                f"{where}: expected at most {MAX_CHUNK} bytes of stacked frames, found {count * size}"
-            )
+            raise FormatError(f"expected at most {MAX_CHUNK} bytes of stacked frames, found {count * size}")
         if len(data) == count * size:
             return data
         if len(data) < count * (start + frame):  # before anything is allocated
-            raise FormatError(f"{where}: expected {count} stacks of frames, found {len(data)} bytes")
+            raise FormatError(f"expected {count} stacks of frames, found {len(data)} bytes")
         out = bytearray(count * size)
         source, windows, at = memoryview(data), self._windows(out, count), 0
         for i in range(count):
             if at + start > len(source):
-                raise FormatError(f"{where}: expected {count} stacks of frames, found {i}")
+                raise FormatError(f"expected {count} stacks of frames, found {i}")
             (length,) = _LENGTH.unpack_from(source, at + 1)
             new, rest = divmod(length + 9 - start, frame)
             end = at + start + new * frame
             least = 1 if i else self._frames  # no row comes before the first one
             if rest or not least <= new <= self._frames or end > len(source):
-                raise FormatError(
-                    f"{where}: row {i} expected 1 to {self._frames} frames, found {length} bytes"
-                )
+                raise FormatError(f"row {i} expected 1 to {self._frames} frames, found {length} bytes")
             head = memoryview(out)[i * size : i * size + start]
             head[:] = source[at : at + start]
             told = _COUNT.unpack_from(head, self._height_at)[0], _COUNT.unpack_from(head, start - 4)[0]
             if told != (new * self._height, new * frame):
                 raise FormatError(
-                    f"{where}: row {i} expected a picture of {new} frames, found one of height {told[0]}"
+                    f"row {i} expected a picture of {new} frames, found one of height {told[0]}"
                 )
             _LENGTH.pack_into(head, 1, size - 9)
             _COUNT.pack_into(head, self._height_at, self._frames * self._height)
@@ -190,9 +186,7 @@ class StackCodec:
             )
             at = end
         if at != len(source):
-            raise FormatError(
-                f"{where}: expected {count} stacks of frames in {at} bytes, found {len(source)} bytes"
-            )
+            raise FormatError(f"expected {count} stacks of frames in {at} bytes, found {len(source)} bytes")
         return out
 
 
@@ -242,18 +236,12 @@ class PngCodec:
         np.cumsum([len(record) for record in records[:-1]], out=offsets[1:])
         return rows._replace(data=b"".join(records), offsets=offsets)
 
-    def decode(self, data: Any, count: int, where: str) -> Any:
+    def decode(self, data: Any, count: int) -> Any:
         size = count * self._dtype.itemsize
         if size > MAX_CHUNK:
-            raise FormatError(f"{where}: expected at most {MAX_CHUNK} bytes of images, found {size}")
+            raise FormatError(f"expected at most {MAX_CHUNK} bytes of images, found {size}")
         if self._is_raw(data, count):
             return data
-        try:
-            return self._decode(data, count)
-        except FormatError as err:
-            raise FormatError(f"{where}: {err}") from err
-
-    def _decode(self, data: Any, count: int) -> Any:
         out = np.zeros(count, self._dtype)
         out["fixed"] = self._fixed
         view, windows, number = memoryview(data), self._windows(out), 0

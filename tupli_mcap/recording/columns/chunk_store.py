@@ -23,6 +23,7 @@ from tupli_mcap.mcap.chunks import decompress, headers_at, message_places
 from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source
+from tupli_mcap.messages.images.codecs import ImageCodec
 from tupli_mcap.recording.index import StepClaims
 from tupli_mcap.remote import RemoteSource
 
@@ -109,14 +110,6 @@ class Memory(Protocol):
     def __getitem__(self, i: int, /) -> Any: ...
 
 
-class Decoder(Protocol):
-    """Turns the chunks of a channel into rows of constant size."""
-
-    def decode(self, data: Any, count: int, where: str) -> Any:
-        """The records of `count` rows; raises FormatError if the chunk does not hold them."""
-        ...
-
-
 _numbers = itertools.count()
 
 
@@ -161,7 +154,7 @@ class ChunkStore:
         self._checked = np.zeros(len(table), np.bool_)
         self._held = np.zeros(len(table), np.bool_)  # against `claims`
         self._number = next(_numbers)  # tells stores apart that share a cache
-        self.codecs: Mapping[int, Decoder] = {}  # by channel; rows of other channels are not encoded
+        self.codecs: Mapping[int, ImageCodec] = {}  # by channel; rows of other channels are not encoded
         # By step channel, the rows that the episode index names. Unless it is None, the rows of all channels are
         # compared with it and with the chunk table before they are returned.
         self.claims: Mapping[int, StepClaims] | None = None
@@ -290,14 +283,17 @@ class ChunkStore:
         """The message records of chunk `i`; cached unless `keep` is False."""
         return self._chunk(i, None, keep=keep).data
 
-    def _chunk(self, i: int, codec: Decoder | None, *, keep: bool) -> KeptChunk:
+    def _chunk(self, i: int, codec: ImageCodec | None, *, keep: bool) -> KeptChunk:
         """A chunk and its checked views; with a codec its decoded rows, and these are cached instead of it."""
         key = self._number, i if codec is None else ~i
         kept = self._cache.get(key)
         if kept is None:
             data = self._read(i)
             if codec is not None:
-                data = codec.decode(data, int(self.table["rows"][i]), f"{self._source.name}: chunk {i}")
+                try:
+                    data = codec.decode(data, int(self.table["rows"][i]))
+                except FormatError as err:
+                    raise FormatError(f"{self._source.name}: chunk {i}: {err}") from err
             kept = KeptChunk(data)
             if keep:
                 self._cache.put(key, kept)
