@@ -88,19 +88,8 @@ class IndexBuilder:
     def add(self, row: tuple[Any, ...], metadata: str) -> None:
         """Adds an episode and its metadata as JSON; `row` is an `EpisodeRow`, or a plain tuple of its fields."""
         (
-            first_row,
-            length,
-            total,
-            start_time,
-            end_time,
-            seed,
-            start_row,
-            end_row,
-            final_row,
-            number,
-            env,
-            end,
-        ) = row
+            first_row, length, total, start_time, end_time, seed, start_row, end_row, final_row, number, env, end,
+        ) = row  # fmt: skip
         text = b"" if metadata == "{}" else metadata.encode()
         indexed, has_seed = indexed_seed(seed)
         try:
