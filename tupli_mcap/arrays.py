@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Array", "DType", "arrays_at", "map_arrays"]
-
 Array = np.ndarray[Any, Any]
 DType = np.dtype[Any]
 

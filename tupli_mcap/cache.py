@@ -10,8 +10,6 @@ from pathlib import Path
 
 import platformdirs
 
-__all__ = ["cache_dir", "delete_oldest", "make_private"]
-
 
 def cache_dir() -> Path:
     """The cache directory of this user; it need not exist yet."""

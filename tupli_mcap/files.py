@@ -23,22 +23,6 @@ import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-__all__ = [
-    "as_file_name",
-    "create",
-    "hold",
-    "is_temporary",
-    "left_below",
-    "left_in",
-    "private_directory",
-    "put",
-    "remove_left",
-    "replacing",
-    "sync",
-    "temporary_path",
-    "write_bytes",
-]
-
 _NEW = "new"  # name of the file in its directory; without a suffix it does not look like a recording
 _TEMPORARY = re.compile(r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp")
 _MOMENT = 60.0  # seconds after which a writer has surely locked its new file

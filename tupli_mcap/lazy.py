@@ -6,8 +6,6 @@ import importlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["imported_on_use"]
-
 
 def imported_on_use(door: dict[str, Any], homes: Mapping[str, str]) -> Callable[[str], Any]:
     """The `__getattr__` of a package that imports a public name from its module when it is first used.

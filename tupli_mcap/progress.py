@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any
 
-__all__ = ["Progress", "alone", "can_redraw", "progress"]
-
 _PATIENCE = 1.0  # seconds without a bar
 _shown: list[object] = []  # the bar or other display that shows at the moment: at most one
 

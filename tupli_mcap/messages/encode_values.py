@@ -15,8 +15,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Packed", "Source", "access_to", "add_fields", "add_structure_checks", "flag_check"]
-
 _BOOLS = b"\0\1"
 _LARGE = 2048  # a leaf of this many bytes or more is copied as an array, not through `bytes`
 _INT_FORMATS = {

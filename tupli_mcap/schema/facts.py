@@ -29,8 +29,6 @@ from tupli_mcap.schema.parse import key_positions, parse_filter
 from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
-__all__ = ["TIME_PATHS", "bound", "check_keys", "comparisons", "filter_keys", "path_in", "with_times"]
-
 TIME_KEY: Final = "created_at"
 TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
 _MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}

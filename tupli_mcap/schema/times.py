@@ -16,8 +16,6 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 
-__all__ = ["TimeSpan", "iso_utc", "iso_utc_each", "local_text", "span_of", "text_of", "time_ns"]
-
 EXPECTED: Final = (
     'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", '
     '"last tuesday", "this week", "last month", "7d ago" (w, d, h, min), or nanoseconds since 1970'
