@@ -43,7 +43,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.cli.output import bytes_of, number, numbers
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.recording.description import space_lines
+from tupli_mcap.recording.describe.description import space_lines
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import NameRegistry, flatten_space

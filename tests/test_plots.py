@@ -44,8 +44,8 @@ from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
 from tupli_mcap.recording import edit_run
-from tupli_mcap.recording.description import by_scale
-from tupli_mcap.recording.series import sketch
+from tupli_mcap.recording.describe.description import by_scale
+from tupli_mcap.recording.describe.series import sketch
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
 UNIT = spaces.Box(-1, 1, (3,), np.float32)
@@ -1093,7 +1093,7 @@ def test_of_a_long_recording_a_sketch_reads_a_few_chunks(
 ) -> None:
     path = record(cartpole.with_name("long.mcap"), gym.make("CartPole-v1"), 3000, chunk_size=2048)
     monkeypatch.setattr(
-        "tupli_mcap.recording.series.READ_BYTES", 16 * 77 * 10
+        "tupli_mcap.recording.describe.series.READ_BYTES", 16 * 77 * 10
     )  # ten steps at each of 16 places
     with Recording(path) as recording:
         loaded: set[int] = set()

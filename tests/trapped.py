@@ -43,7 +43,7 @@ from tupli_mcap.doctor import examine
 from tupli_mcap.messages import encode_rows as encoder
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.verify import verify_recording
-from tupli_mcap.recording.description import describe
+from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME

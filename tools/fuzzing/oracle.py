@@ -15,7 +15,7 @@ from tupli_mcap.dataset.items import FIELDS, steps_of
 from tupli_mcap.dataset.items.steps import map_arrays
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.description import describe
+from tupli_mcap.recording.describe.description import describe
 
 __all__ = ["Facts", "UnexpectedError", "judge", "observe"]
 

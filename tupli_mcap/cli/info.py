@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from typing import Any
 
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.description import RecordingDescription, Spread
-    from tupli_mcap.recording.series import Series
+    from tupli_mcap.recording.describe.description import RecordingDescription, Spread
+    from tupli_mcap.recording.describe.series import Series
     from tupli_mcap.schema import BaseFilter
 
 __all__ = ["info", "sparkline"]
@@ -51,7 +51,7 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
     from tupli_mcap import open as open_dataset
     from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.recording.about.success import success_of, success_text
-    from tupli_mcap.recording.description import spread_of
+    from tupli_mcap.recording.describe.description import spread_of
     from tupli_mcap.storage.listing import find_recordings
 
     if not is_url(source) and not find_recordings(Path(source)):
@@ -130,7 +130,7 @@ def info(
 
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.description import describe
+    from tupli_mcap.recording.describe.description import describe
 
     wanted = filter_of(filter_text)
     if is_server(source) or (is_pattern(source) if is_url(source) else Path(source).is_dir()):
@@ -262,7 +262,7 @@ def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
 def _spread_text(spread: Spread | None, episodes: int, of: str = "") -> str:
     if spread is None:
         return ""
-    from tupli_mcap.recording.description import nan_text
+    from tupli_mcap.recording.describe.description import nan_text
 
     odd = nan_text(spread.nan, episodes)
     if spread.nan == episodes:
@@ -309,7 +309,7 @@ def sparkline(values: Sequence[float], *, zero_based: bool = False, blocks: str 
 
 def _print_series(recording: Recording, positions: Any, steps: int) -> None:
     """Prints returns and lengths over episodes, and distributions of rewards, actions and states."""
-    from tupli_mcap.recording.series import sketch
+    from tupli_mcap.recording.describe.series import sketch
 
     room = (terminal_width() or _WIDEST + _OTHERS) - _OTHERS
     summary = sketch(recording, max(_NARROWEST, min(_WIDEST, room)), positions)

@@ -269,7 +269,7 @@ def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list
 
 
 def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed], empty: str) -> None:
-    from tupli_mcap.recording.description import nan_text
+    from tupli_mcap.recording.describe.description import nan_text
 
     columns, cells = [one.column for one in chosen], [one.cells(items) for one in chosen]
     notes = [nan_text(r.return_nan, r.episodes) for r in items]

@@ -206,7 +206,7 @@ def _held(output: Path, limit: float | None) -> str:
 
 def _mean_text(summary: RolloutSummary) -> list[str]:
     """The mean return, and how many NaN it leaves out; empty if no episode was recorded."""
-    from tupli_mcap.recording.description import nan_text
+    from tupli_mcap.recording.describe.description import nan_text
 
     odd = nan_text(summary.return_nan, summary.episodes)
     if summary.return_nan < summary.episodes:

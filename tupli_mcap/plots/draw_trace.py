@@ -13,7 +13,7 @@ from tupli_mcap.plots import style
 from tupli_mcap.plots.measure import Measured, Trace
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
-from tupli_mcap.recording.description import by_scale
+from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.spaces.labels import short_path
 
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel

@@ -18,7 +18,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.run import Run
 from tupli_mcap.recording.about.success import KEYS, success_of
 from tupli_mcap.recording.blocks import blocks, step_bytes
-from tupli_mcap.recording.description import RecordingDescription, describe, nan_text
+from tupli_mcap.recording.describe.description import RecordingDescription, describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory

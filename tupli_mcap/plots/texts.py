@@ -18,7 +18,7 @@ from tupli_mcap.plots import style
 from tupli_mcap.plots.groups import Group
 from tupli_mcap.plots.measure import SUCCESS, Measured
 from tupli_mcap.plots.style import Cell, Page, cut
-from tupli_mcap.recording.description import RecordingDescription, nan_text, spread_of
+from tupli_mcap.recording.describe.description import RecordingDescription, nan_text, spread_of
 
 _MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 _MOST_LISTED = 12  # recordings

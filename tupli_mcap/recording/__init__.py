@@ -4,12 +4,12 @@ recording, episode, frames    `Recording`, its episodes and frames; `verbs` are 
 opened, contents              an open file, and its contents from the summary or from recovery
 index                         the episode index, and its checks against the file
 channels                      the channels that a layout needs
-description, series           the facts that `info` shows
 blocks                        whole episodes in bounded memory
 signature_file                the attachment with a signature
 about/                        runs, annotations, success of episodes
 columns/, recover/            turns rows into columns; turns what a killed process left into episodes
 write/, edit/, check/, sign/  makes recordings; makes them of others; verifies them; signs them
+describe/                     the facts that `info` shows
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import success_of
-from tupli_mcap.recording.description import spread_of, state_of, successes
+from tupli_mcap.recording.describe.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import is_url, matching, shown_name
 from tupli_mcap.schema import EpisodeHeader
@@ -80,7 +80,7 @@ class ListedRecording(NamedTuple):
         return_mean: over its episodes, None if there are none; it leaves out the `return_nan` episodes whose return is
             NaN, and is NaN if there is no other.
         size: of the file (bytes); None if unknown.
-        state: see `tupli_mcap.recording.description.state_of`.
+        state: see `tupli_mcap.recording.describe.description.state_of`.
         name, environment, started (ISO 8601 in UTC), split, tags: of its run.
         settings: the metadata of its run; of several, what they have in common.
         success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if

@@ -13,7 +13,7 @@ import numpy as np
 from tupli_mcap.dataset.chosen import Chosen
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import success_text
-from tupli_mcap.recording.description import describe, nan_text
+from tupli_mcap.recording.describe.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import plain, title_of
 from tupli_mcap.viewer.panels import PALETTE

@@ -13,7 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.recording.description import by_scale
+from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.spaces.labels import Labels, distinct
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import dimension_names, entity_of, escaped, title_of

@@ -27,7 +27,7 @@ from tupli_mcap.page.samples import (
 from tupli_mcap.page.shelf import Shelf, python_line, seen_episodes, seen_recordings
 from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.description import describe
+from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.catalog.queries import Sort, find_episodes
 

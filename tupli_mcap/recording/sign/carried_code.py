@@ -21,7 +21,7 @@ from tupli_mcap.environment import (
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
 from tupli_mcap.recording.check.signature import verify_signature
-from tupli_mcap.recording.description import claimed_signer
+from tupli_mcap.recording.describe.description import claimed_signer
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.errors import plural
 from tupli_mcap.messages.decoder import MessageDecoder
-from tupli_mcap.recording.description import nan_text, spread_of
+from tupli_mcap.recording.describe.description import nan_text, spread_of
 from tupli_mcap.viewer.blueprints import blueprint_of
 from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps

@@ -20,8 +20,8 @@ from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.contents import Contents
+from tupli_mcap.recording.describe.series import sampled_infos
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.series import sampled_infos
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
