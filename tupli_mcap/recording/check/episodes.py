@@ -52,12 +52,9 @@ class _Checker:
         self._topics: Mapping[str, int] = file.topics
         self._channels: Mapping[int, Channel] = file.contents.channels
         self._index: EpisodeIndex = file.contents.index
-        self._findings = findings
+        self._error = findings.error
         self._rows: Array = recording.index
         self._at = {int(number): i for i, number in enumerate(self._rows["episode"])}
-
-    def _error(self, kind: str, message: str, **place: Any) -> None:
-        self._findings.error(kind, message, **place)
 
     # ---- steps
 
@@ -82,7 +79,7 @@ class _Checker:
                 self._batch(facts, row, episodes, firsts, lengths, sums, topic)
                 row += len(facts.episode)
         except FormatError as err:
-            self._error("rows", _plain(err, self._recording), channel=topic)
+            self._error("rows", str(err), channel=topic)
             return
         self._returns(episodes, sums)
 
@@ -152,7 +149,7 @@ class _Checker:
                         first = int(self._store.table["first"][chunk])
                         self._error("image", f"a header in rows from {first} on is damaged", channel=topic)
             except FormatError as err:
-                self._error("image", _plain(err, self._recording), channel=topic)
+                self._error("image", str(err), channel=topic)
 
     def bools(self, channel: int, leaves: Sequence[Leaf]) -> None:
         """Checks the bools in rows of constant size; decoding checks those of other rows."""
@@ -184,7 +181,7 @@ class _Checker:
         try:
             yield from self._store.all_messages(self._topics.get(topic))
         except FormatError as err:
-            self._error("rows", _plain(err, self._recording), channel=topic)
+            self._error("rows", str(err), channel=topic)
 
     def starts(self) -> None:
         """Checks that every episode has one start, in the row that the index names, with the facts in the index."""
@@ -198,9 +195,7 @@ class _Checker:
                     if text:
                         jsonvalue.loads(text)
             except FormatError as err:
-                self._error(
-                    "episode", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place
-                )
+                self._error("episode", f"row {row} cannot be decoded: {err}", **place)
                 continue
             i = self._at.get(start.episode)
             if i is None or int(self._rows["start_row"][i]) != row:
@@ -228,9 +223,7 @@ class _Checker:
                 if not isinstance(jsonvalue.loads(end.metadata), dict):
                     raise FormatError("expected metadata as a JSON object")
             except FormatError as err:
-                self._error(
-                    "episode", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place
-                )
+                self._error("episode", f"row {row} cannot be decoded: {err}", **place)
                 continue
             i = self._at.get(end.episode)
             if i is None:
@@ -281,9 +274,7 @@ class _Checker:
                 try:
                     decoder.final(body)
                 except FormatError as err:
-                    self._error(
-                        "final_state", f"it cannot be decoded: {_plain(err, self._recording)}", **place
-                    )
+                    self._error("final_state", f"it cannot be decoded: {err}", **place)
         for entry in rows.values():
             self._error("final_state", "it is missing", episode=int(entry["episode"]), channel=topic)
 
@@ -307,7 +298,7 @@ class _Checker:
             try:
                 number, step, _ = decoder.decode(body)
             except FormatError as err:
-                self._error("info", f"row {row} cannot be decoded: {_plain(err, self._recording)}", **place)
+                self._error("info", f"row {row} cannot be decoded: {err}", **place)
                 continue
             place.update(episode=number, step=step)
             i = self._at.get(number)
@@ -322,8 +313,3 @@ class _Checker:
 def _end_of(facts: StepFacts) -> Array:
     """How each row would end its episode, from its flags."""
     return np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
-
-
-def _plain(err: FormatError, recording: Recording) -> str:
-    """An error's text without the name of the file."""
-    return str(err).removeprefix(f"{recording.name}: ")

@@ -41,12 +41,12 @@ class _Pair:
         try:
             times = self._pairs(self._channels[1])
         except FormatError as err:
-            self._error(self._plain(err), self._pair_topic)
+            self._error(str(err), self._pair_topic)
             return
         try:
             self._pictures(self._channels[0], times)
         except FormatError as err:
-            self._error(self._plain(err), self._picture_topic)
+            self._error(str(err), self._picture_topic)
 
     def _pairs(self, channel: int) -> Array:
         """Checks the rows of `/frame`; returns their times (int64, ns)."""
@@ -100,6 +100,3 @@ class _Pair:
 
     def _error(self, message: str, topic: str) -> None:
         self._findings.error("frame", message, channel=topic)
-
-    def _plain(self, err: FormatError) -> str:
-        return str(err).removeprefix(f"{self._recording.name}: ")

@@ -94,10 +94,11 @@ class VerifyReport:
 
 
 class Findings:
-    """Adds problems to a report."""
+    """Adds problems to a report; errors that begin with the `name` of the file lose it."""
 
-    def __init__(self, report: VerifyReport) -> None:
+    def __init__(self, report: VerifyReport, name: str | None = None) -> None:
         self.report = report
+        self._prefix = f"{name or report.path}: "
         self._explained = False
 
     @contextlib.contextmanager
@@ -111,7 +112,7 @@ class Findings:
 
     def error(self, kind: str, message: str, **place: Any) -> None:
         """Adds damage; `place` are fields of `Problem`."""
-        self._add(Problem(kind, message, follows=self._explained, **place))
+        self._add(Problem(kind, message.removeprefix(self._prefix), follows=self._explained, **place))
 
     def note(self, kind: str, message: str, advice: str, **place: Any) -> None:
         """Adds something that is no damage."""

@@ -67,7 +67,7 @@ class Structure:
     def __init__(self, source: Source, tail: Tail, findings: Findings, *, journal_lost: bool = False) -> None:
         self._source = source
         self._tail = tail
-        self._findings = findings
+        self._findings, self._error = findings, findings.error
         self._journal_lost = journal_lost
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -102,7 +102,7 @@ class Structure:
             NewerVersionError: the recording's format is not known.
         """
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
-            self._findings.error("file", "expected the magic of MCAP at the start", offset=0)
+            self._error("file", "expected the magic of MCAP at the start", offset=0)
         walk = Walk(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
         for item in walk:
             self._records += 1
@@ -122,12 +122,12 @@ class Structure:
                 self._findings.note("record", what, "nothing to be done", offset=damage.offset)
                 return  # the last write of a killed writer; its journal has these rows
             self.missing = True
-            self._findings.error("record", f"{what}, and no journal holds it", offset=damage.offset)
+            self._error("record", f"{what}, and no journal holds it", offset=damage.offset)
             return
         self.missing = True
         kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
         size = damage.end - damage.offset
-        self._findings.error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
+        self._error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
 
     def _is_cut(self, damage: Damage) -> bool:
         """Whether a record extends beyond the end of the file."""
@@ -136,17 +136,13 @@ class Structure:
 
     def _take(self, record: Found) -> None:
         if self._ended:
-            self._findings.error(
-                "record", "expected the summary after the end of the data", offset=record.offset
-            )
+            self._error("record", "expected the summary after the end of the data", offset=record.offset)
         waiting, self._waiting = self._waiting, None
         behind_damage, self._behind_damage = self._behind_damage, False
         if waiting is not None and record.opcode != Opcode.MESSAGE_INDEX:
-            self._findings.error(
-                "message_index", "expected the message index of the chunk", offset=waiting.offset
-            )
+            self._error("message_index", "expected the message index of the chunk", offset=waiting.offset)
         if (self._records == 1) != (record.opcode == Opcode.HEADER):
-            self._findings.error("record", "expected one header, as the first record", offset=record.offset)
+            self._error("record", "expected one header, as the first record", offset=record.offset)
         if record.chunk is not None:
             self._chunk(record, record.chunk)
         elif record.attachment is not None:
@@ -163,17 +159,13 @@ class Structure:
             self._ended = True
             end = record.offset + record.length
             if self._tail.data_end not in (None, end):
-                self._findings.error("record", "expected the summary after the end of the data", offset=end)
+                self._error("record", "expected the summary after the end of the data", offset=end)
             if bytes(record.body) != bytes(4):
-                self._findings.error(
-                    "record", "expected 0 as the CRC of the data section", offset=record.offset
-                )
+                self._error("record", "expected 0 as the CRC of the data section", offset=record.offset)
         elif record.opcode in (Opcode.HEADER, Opcode.METADATA):
             self._named(record)
         else:
-            self._findings.error(
-                "record", f"a record with opcode {record.opcode} is unknown", offset=record.offset
-            )
+            self._error("record", f"a record with opcode {record.opcode} is unknown", offset=record.offset)
 
     def _named(self, record: Found) -> None:
         """Checks the header or a metadata record."""
@@ -181,7 +173,7 @@ class Structure:
             header = parse_record(record.opcode, record.body, record.offset, self._source.name)
             if header.profile != PROFILE:
                 why = f"expected the profile {PROFILE!r}, found {header.profile!r:.40}"
-                self._findings.error("record", why, offset=record.offset)
+                self._error("record", why, offset=record.offset)
         elif record.opcode == Opcode.METADATA:
             metadata = parse_record(record.opcode, record.body, record.offset, self._source.name)
             self._metadata.append(MetadataIndex(record.offset, record.length, metadata.name))
@@ -191,13 +183,11 @@ class Structure:
                     check_version(metadata.metadata, self._source.name)
                 self._said = self._said or metadata.metadata
                 if metadata.metadata != self._said:
-                    self._findings.error(
+                    self._error(
                         "metadata", f"expected what {RECORDING_METADATA!r} says", offset=record.offset
                     )
             if self._records == 2 and metadata.name != RECORDING_METADATA:
-                self._findings.error(
-                    "metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset
-                )
+                self._error("metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset)
 
     def _name(self, opcode: int, name: str) -> None:
         if (opcode, name) in self._names:
@@ -209,7 +199,7 @@ class Structure:
         try:
             check_crc(values, known, "the metadata")
         except FormatError as err:
-            self._findings.error(kind, str(err), offset=offset)
+            self._error(kind, str(err), offset=offset)
             return False
         return True
 
@@ -218,7 +208,7 @@ class Structure:
         kind = "schema" if isinstance(record, Schema) else "channel"
         if record.id in known:
             if known[record.id] != record:
-                self._findings.error("layout", f"{kind} {record.id} is defined in two ways", offset=offset)
+                self._error("layout", f"{kind} {record.id} is defined in two ways", offset=offset)
             return
         known[record.id] = record
         if isinstance(record, Channel) and is_ours(record.topic):
@@ -227,11 +217,11 @@ class Structure:
     def _chunk(self, record: Found, chunk: Chunk) -> None:
         self._findings.report.chunks += 1
         if record.repaired:
-            self._findings.error("chunk", record.repaired, offset=record.offset)
+            self._error("chunk", record.repaired, offset=record.offset)
         try:
             content = chunk_records(chunk.data, "the chunk", chunk.claim.packed)
         except FormatError as err:
-            self._findings.error("chunk", str(err), offset=record.offset)
+            self._error("chunk", str(err), offset=record.offset)
             return
         for schema in content.schemas:
             self._define(schema, record.offset)
@@ -263,64 +253,60 @@ class Structure:
         place = {"offset": record.offset, "channel": topic}
         expected = self._counts.get(number, 0)
         if content.first != expected and not (self.missing and content.first > expected):
-            self._findings.error("rows", f"expected row {expected}, found row {content.first}", **place)
+            self._error("rows", f"expected row {expected}, found row {content.first}", **place)
         if (number in self._started) == bool(content.skip) and not (self.missing and not content.skip):
-            self._findings.error(
-                "chunk", "expected definitions in the first chunk of a channel only", **place
-            )
+            self._error("chunk", "expected definitions in the first chunk of a channel only", **place)
         self._started.add(number)
         self._counts[number] = content.first + len(headers)
         self._findings.report.messages += len(headers)
         times = headers["#log_time"]
         if (times[1:] < times[:-1]).any() or int(times[0]) < self._latest.get(number, 0):
-            self._findings.error("rows", "expected times that do not decrease", **place)
+            self._error("rows", "expected times that do not decrease", **place)
         self._latest[number] = int(times[-1])
         if (headers["#publish_time"] != times).any():
-            self._findings.error("rows", "expected publish times equal to log times", **place)
+            self._error("rows", "expected publish times equal to log times", **place)
         if (headers["#cdr"] != _CDR).any():
-            self._findings.error("rows", "expected plain little-endian CDR", **place)
+            self._error("rows", "expected plain little-endian CDR", **place)
         if (chunk.start_time, chunk.end_time) != (int(times[0]), int(times[-1])):
-            self._findings.error("chunk", "its header has other times than its messages", **place)
+            self._error("chunk", "its header has other times than its messages", **place)
 
     def _message_index(self, record: Found, waiting: _Waiting | None) -> None:
         if waiting is None:
-            self._findings.error(
-                "message_index", "expected it behind a good chunk only", offset=record.offset
-            )
+            self._error("message_index", "expected it behind a good chunk only", offset=record.offset)
             return
         number, entries = message_index(record.body)
         content = waiting.records
         if number != content.channel or not np.array_equal(entries, content.index_entries()):
             why = "it has other times or offsets than its chunk"
-            self._findings.error("message_index", why, offset=record.offset)
+            self._error("message_index", why, offset=record.offset)
 
     # ---- the summary
 
     def _finish(self) -> None:
         for why in self._tail.why:
-            self._findings.error("summary", why)
+            self._error("summary", why)
         known = {(Schema, number) for number in self.schemas} | {
             (Channel, number) for number in self.channels
         }
         for kind, number in sorted((kind.__name__.lower(), number) for kind, number in known - self._outside):
-            self._findings.error("layout", f"{kind} {number} is not defined outside of the chunks")
+            self._error("layout", f"{kind} {number} is not defined outside of the chunks")
         if not self._tail.finished or self._findings.report.state == "unfinished":
             return  # its writer was killed, maybe while it wrote the end
         if self._waiting is not None:
             why = "expected the message index of the chunk"
-            self._findings.error("message_index", why, offset=self._waiting.offset)
+            self._error("message_index", why, offset=self._waiting.offset)
         if not self._ended:
-            self._findings.error("record", "expected the end of the data section, found none")
+            self._error("record", "expected the end of the data section, found none")
         if not self._attachments or self._attachments[-1].name != INDEX_NAME:
-            self._findings.error("index", f"expected {INDEX_NAME!r} as the last attachment")
+            self._error("index", f"expected {INDEX_NAME!r} as the last attachment")
         if self._tail.index is not None:
             table = np.array(self._table, CHUNK_ROWS)
             if not np.array_equal(table, self._tail.index.chunks):
                 with self._findings.following(self.missing):
-                    self._findings.error("index", "the episode index lists other chunks than there are")
+                    self._error("index", "the episode index lists other chunks than there are")
         if self._tail.summary is None:
             if not self._tail.why:
-                self._findings.error("summary", "the footer is damaged or cut off", offset=self._source.size)
+                self._error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
         # the bytes of a replaced one may still be there
         last = {index.name: index for index in self._attachments}
@@ -339,13 +325,11 @@ class Structure:
             parsed.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
             group = groups.setdefault(opcode, [offset, offset])
             if group[1] != offset:
-                self._findings.error(
-                    "summary", f"records with opcode {opcode} are not together", offset=offset
-                )
+                self._error("summary", f"records with opcode {opcode} are not together", offset=offset)
             group[1] = offset + 9 + len(body)
         for opcode in sorted(parsed.keys() - _SUMMARY):
             why = f"expected no record with opcode {opcode} in the summary"
-            self._findings.error("summary", why, offset=groups[opcode][0])
+            self._error("summary", why, offset=groups[opcode][0])
         for opcode, wanted in (
             (Opcode.SCHEMA, list(self.schemas.values())),
             (Opcode.CHANNEL, list(self.channels.values())),
@@ -361,16 +345,16 @@ class Structure:
                     f"its {len(listed)} {what} records differ from those of the data, which has {len(wanted)}"
                 )
                 with self._findings.following(self.missing):
-                    self._findings.error("summary", why, offset=groups.get(opcode, [start])[0])
+                    self._error("summary", why, offset=groups.get(opcode, [start])[0])
 
     def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
         if len(body) != _SUMMARY_OFFSET.size:
             why = f"a summary offset has {len(body)} bytes, not {_SUMMARY_OFFSET.size}"
-            self._findings.error("summary", why, offset=offset)
+            self._error("summary", why, offset=offset)
             return
         opcode, start, length = _SUMMARY_OFFSET.unpack(body)
         if groups.get(opcode) != [start, start + length]:
-            self._findings.error("summary", "a summary offset points elsewhere", offset=offset)
+            self._error("summary", "a summary offset points elsewhere", offset=offset)
 
     def _statistics(self) -> Statistics:
         times = [(c.message_start_time, c.message_end_time) for c in self._chunk_indexes]

@@ -47,7 +47,7 @@ def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
         RecordingError: there is no such file.
     """
     report = VerifyReport(str(path))
-    findings = Findings(report)
+    findings = Findings(report, str(Path(path)))
     try:
         source = PathSource(Path(path))
     except RecordingError:
@@ -61,7 +61,7 @@ def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
         why, _, advice = str(err).removeprefix(f"{source.name}: ").rpartition("; ")
         findings.error("file", why, advice=advice)
     except (FormatError, OSError) as err:
-        findings.error("file", str(err).removeprefix(f"{source.name}: "))
+        findings.error("file", str(err))
     finally:
         source.close()
     return report
@@ -141,7 +141,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
             recording = Recording(source.name if source.path is None else source.path)
     except (FormatError, RecordingError) as err:
         if not damaged:  # otherwise it repeats known damage, or follows from it
-            findings.error("layout", str(err).removeprefix(f"{source.name}: "))
+            findings.error("layout", str(err))
         return
     recording.file.store.claims = None  # rows that differ from the index are reported one by one
     with recording:
@@ -200,7 +200,7 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                 with findings.following(structure.missing):
                     _signature(recording, structure, findings)
         except TupliError as err:
-            findings.error("benchmark", str(err).removeprefix(f"{recording.name}: "))
+            findings.error("benchmark", str(err))
     if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
         findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
 
