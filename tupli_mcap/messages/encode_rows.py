@@ -93,28 +93,6 @@ class RowEncoder:
     move: Callable[[int, int, int], None]
     begin: Callable[[bytes], None]
     state_end: int  # bytes of a row up to the end of its state
-    source: str
-
-
-@dataclass
-class _Code:
-    """The lines of one layout that go into `_ENCODER`, and the objects that they name."""
-
-    put: list[str]
-    put_state: list[str]
-    put_next: list[str]
-    put_whole: list[str]
-    advance: list[str]
-    amount: str
-    names: dict[str, Any]
-
-
-def _check_leaves(layout: StepLayout) -> None:
-    if len(layout.leaves) > _MAX_LEAVES:
-        raise SpaceError(
-            f"expected at most {_MAX_LEAVES:,} leaves in the spaces of a step, found {len(layout.leaves):,}; "
-            "join some into arrays"
-        )
 
 
 def make_row_encoder(
@@ -142,11 +120,14 @@ def make_row_encoder(
     Raises:
         SpaceError: the layout has more than 4,096 leaves.
     """
-    _check_leaves(layout)
-    code = _code(layout, images)
-    text = _render(code, layout.step_message.record_size, is_sealed=seal is not None)
+    if len(layout.leaves) > _MAX_LEAVES:
+        raise SpaceError(
+            f"expected at most {_MAX_LEAVES:,} leaves in the spaces of a step, found {len(layout.leaves):,}; "
+            "join some into arrays"
+        )
+    text, names = _code(layout, images, is_sealed=seal is not None)
     namespace = dict(
-        code.names,
+        names,
         buffer=buffer,
         first=first,
         header=layout.step_message.header(channel),
@@ -164,7 +145,7 @@ def make_row_encoder(
     exec(_compiled(text), namespace)
     # a function in its own globals is a cycle, which would keep the buffer until the garbage collector runs
     encoder = namespace.pop("encoder")
-    return RowEncoder(**encoder(), state_end=layout.state_end, source=text)
+    return RowEncoder(**encoder(), state_end=layout.state_end)
 
 
 @functools.lru_cache(maxsize=8)
@@ -173,7 +154,8 @@ def _compiled(text: str) -> CodeType:
     return compile(text, "<tupli_mcap row encoder>", "exec")
 
 
-def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
+def _code(layout: StepLayout, images: Sequence[ImageSink], *, is_sealed: bool) -> tuple[str, dict[str, Any]]:
+    """The source of the encoder of a layout, and the objects that it names."""
     size, source = layout.step_message.record_size, Source()
     tail = _tail(source, layout)
     state = Source(source.names)
@@ -214,7 +196,19 @@ def _code(layout: StepLayout, images: Sequence[ImageSink]) -> _Code:
         pack_values=Struct(f"<{head.format}").pack_into,
         pack_end=Struct(f"<{tail.format}").pack_into,
     )
-    return _Code(put, put_state, put_next, put_whole, advance, amount, names)
+    blocks = {"lines": put, "first_lines": put_state, "next_lines": put_next, "whole_lines": put_whole}
+    text = _ENCODER.format(
+        **{name: _block(lines) for name, lines in blocks.items()},
+        committed="        seal(offset)\n" if is_sealed else "",
+        committed_alone="        seal(offset, alone=True)\n" if is_sealed else "",
+        advance=_block(advance, 8),
+        amount=amount,
+        size=size,
+        sequence=SEQUENCE_OFFSET,
+        log_time=SEQUENCE_OFFSET + 4,
+        hole=HOLE,
+    )
+    return text, names
 
 
 def _tail(source: Source, layout: StepLayout) -> Packed:
@@ -322,26 +316,8 @@ def encoder():
 """
 
 
-def _render(code: _Code, size: int, *, is_sealed: bool) -> str:
-    """The source of the encoder."""
-
-    def block(lines: Sequence[str], indent: int = 12) -> str:
-        return "".join(f"{' ' * indent}{line}\n" for line in lines)
-
-    return _ENCODER.format(
-        lines=block(code.put),
-        committed="        seal(offset)\n" if is_sealed else "",
-        amount=code.amount,
-        first_lines=block(code.put_state),
-        next_lines=block(code.put_next),
-        whole_lines=block(code.put_whole),
-        committed_alone="        seal(offset, alone=True)\n" if is_sealed else "",
-        advance=block(code.advance, 8),
-        size=size,
-        sequence=SEQUENCE_OFFSET,
-        log_time=SEQUENCE_OFFSET + 4,
-        hole=HOLE,
-    )
+def _block(lines: Sequence[str], indent: int = 12) -> str:
+    return "".join(f"{' ' * indent}{line}\n" for line in lines)
 
 
 def _diagnose(layout: StepLayout, action: Any, state: Any, reward: Any, err: Exception) -> StepError:
