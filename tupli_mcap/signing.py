@@ -135,9 +135,7 @@ def find_key(text: str) -> trust.TrustedKey:
 
 
 def _is_path(text: str) -> bool:
-    return not _FINGERPRINT.match(text) and (
-        text.endswith(".pub") or os.sep in text or (os.altsep or os.sep) in text
-    )
+    return not _FINGERPRINT.match(text) and (text.endswith(".pub") or os.sep in text)
 
 
 def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:

@@ -58,7 +58,7 @@ def sign(digest: str) -> str:
         users.
     """
     _check_digest(digest)
-    return _signed(_key(create=True), _PURPOSE + digest.encode("ascii"))
+    return _signed(_key(), _PURPOSE + digest.encode("ascii"))
 
 
 def trust(digest: str) -> None:
@@ -116,7 +116,7 @@ def trust_key(public_key: str, name: str) -> None:
     """
     _check_digest(public_key)
     text = " ".join(name.split())[:200]
-    signature = _signed(_key(create=True), _PURPOSE_OF_KEYS + public_key.encode("ascii") + text.encode())
+    signature = _signed(_key(), _PURPOSE_OF_KEYS + public_key.encode("ascii") + text.encode())
     _store(f"keys/{public_key}", f"{signature} {text}")
 
 
@@ -155,7 +155,7 @@ def vouch(digest: str, public_key: str) -> None:
     """
     _check_digest(digest)
     _check_digest(public_key)
-    _store(f"vouched/{digest}.{public_key}", _signed(_key(create=True), _voucher(digest, public_key)))
+    _store(f"vouched/{digest}.{public_key}", _signed(_key(), _voucher(digest, public_key)))
 
 
 def _voucher(digest: str, public_key: str) -> bytes:
@@ -191,7 +191,7 @@ def _fits(path: Path, message: bytes) -> bool:
 def _is_signature(text: str, message: bytes) -> bool:
     if not text:
         return False
-    key = _key(create=False)
+    key = _known_key()
     return key is not None and hmac.compare_digest(text.encode(), _signed(key, message).encode("ascii"))
 
 
@@ -217,21 +217,25 @@ def _check_digest(digest: str) -> None:
         raise TupliError(f"expected a digest of 64 hex digits, found {str(digest)[:80]!r}")
 
 
-def _signed(key: bytes | None, message: bytes) -> str:
-    if key is None:
-        raise TupliError(f"there is no key in {str(config_dir())!r}")
+def _signed(key: bytes, message: bytes) -> str:
     return hmac.new(key, message, hashlib.sha256).hexdigest()
 
 
-def _key(*, create: bool) -> bytes | None:
+def _known_key() -> bytes | None:
     path = config_dir() / "key"
     try:
         return _read_key(path)
     except FileNotFoundError:
-        if not create:
-            return None
+        return None
     except OSError as err:
         raise TupliError(f"the key {str(path)!r} cannot be read: {os_reason(err)}") from err
+
+
+def _key() -> bytes:
+    """This user's key, which is made on first use."""
+    key, path = _known_key(), config_dir() / "key"
+    if key is not None:
+        return key
     try:
         _make_private_dir(path.parent)
         # The first process to link wins; the others read its key.
@@ -245,9 +249,9 @@ def _key(*, create: bool) -> bytes | None:
 def _read_key(path: Path) -> bytes:
     _check_private(path.parent)
     # A link could lead to a file whose content somebody else knows.
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | getattr(os, "O_NOFOLLOW", 0)), "rb") as file:
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW), "rb") as file:
         status = os.fstat(file.fileno())
-        if os.name == "posix" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077):
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise TupliError(
                 f"the key {str(path)!r} must belong to you alone: expected mode 0600, found "
                 f"{stat.S_IMODE(status.st_mode):04o} of user {status.st_uid}; chmod it, or delete it"
@@ -263,7 +267,7 @@ def _read_key(path: Path) -> bytes:
 def _check_private(directory: Path) -> None:
     """Who may write into the directory could put a key of their own there."""
     status = directory.stat()
-    if os.name == "posix" and (status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o022):
+    if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o022:
         raise TupliError(
             f"the directory {str(directory)!r} must be writable by you alone: found mode "
             f"{stat.S_IMODE(status.st_mode):04o} of user {status.st_uid}; chmod it to 0700, or set "
