@@ -8,7 +8,8 @@ from typing import Any
 
 from tupli_mcap.journal import logs
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.messages.encode_rows import COMMIT, SEQUENCE_OFFSET
+from tupli_mcap.messages.encode_rows import COMMIT
+from tupli_mcap.messages.layout import SEQUENCE_OFFSET
 from tupli_mcap.recording.write.rows import single as rows
 
 __all__ = ["BREAKAGES"]

@@ -33,15 +33,14 @@ from tupli_mcap.messages.encode_values import (
     add_structure_checks,
     flag_check,
 )
+from tupli_mcap.messages.layout import PREFIX, SEQUENCE_OFFSET
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
 COMMIT = Struct("<IQ")
 EPISODE_AND_STEP = Struct("<II")
 _TIME = Struct("<Q")
-PREFIX = BODY + 8  # record header, CDR header, episode, step: the same for a whole episode
 _MAX_LEAVES = 4096  # each takes time and memory to compile
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import struct
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +10,6 @@ import numpy as np
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
-from tupli_mcap.messages.topics import parse
 
 CAMERA_NAME = "sensor_msgs/msg/CompressedImage"
 CAMERA_SCHEMA = (
@@ -25,13 +22,6 @@ FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", 
 
 _STAMP = struct.Struct("<iI")
 _PAIR = struct.Struct("<II")
-_NAME = re.compile("[a-z](?:_?[a-z0-9]+)*")  # of a camera
-
-
-def camera_names(topics: Mapping[str, int]) -> tuple[str, ...]:
-    """The cameras of a recording, by its topics."""
-    frames = [topic for topic in map(parse, topics) if topic is not None and topic.kind == "frame"]
-    return tuple(sorted(topic.name for topic in frames if topic.env == 0 and _NAME.fullmatch(topic.name)))
 
 
 class EncodedFrame(NamedTuple):

@@ -19,6 +19,8 @@ from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEAD
 from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.leaves import Leaf, ros_type
 
+SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
+PREFIX = BODY + 8  # bytes of a step's record that are the same for a whole episode: headers, episode, step
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 _SEPARATOR = "=" * 80 + "\n"
 IMAGE_NAME = "sensor_msgs/msg/Image"

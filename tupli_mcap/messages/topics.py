@@ -7,6 +7,7 @@ vector environment has its own below `/env_<i>`; all share the topics of episode
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from typing import NamedTuple
 
 EPISODE_START = "/episode_start"
@@ -15,6 +16,7 @@ FINAL_STATE = "/final_state"
 INFO = "/info"
 
 _TOPIC = re.compile("((?:/env_(0|[1-9][0-9]*))?)/(?:(step)|(image|camera|frame)/(.+))", re.DOTALL)
+_CAMERA = re.compile("[a-z](?:_?[a-z0-9]+)*")
 
 
 class Topics(NamedTuple):
@@ -69,3 +71,9 @@ def parse(topic: str) -> Topic | None:
     if match is None:
         return None
     return Topic(Topics(match[1]), int(match[2] or 0), match[3] or match[4], match[5] or "")
+
+
+def camera_names(topics: Iterable[str]) -> tuple[str, ...]:
+    """The cameras of a recording with these topics."""
+    frames = [topic for topic in map(parse, topics) if topic is not None and topic.kind == "frame"]
+    return tuple(sorted(topic.name for topic in frames if topic.env == 0 and _CAMERA.fullmatch(topic.name)))

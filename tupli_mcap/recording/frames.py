@@ -17,11 +17,10 @@ from tupli_mcap.messages.frames import (
     FRAME_NAME,
     FRAME_SCHEMA,
     EncodedFrame,
-    camera_names,
     decode_frame,
 )
 from tupli_mcap.messages.images.pictures import Picture, decode_picture
-from tupli_mcap.messages.topics import Topics
+from tupli_mcap.messages.topics import Topics, camera_names
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents
 
@@ -51,7 +50,7 @@ class Cameras:
         self._store = store
         self._where = name
         topics = {channel.topic: channel for channel in contents.channels.values()}
-        self.names = camera_names({topic: channel.id for topic, channel in topics.items()})
+        self.names = camera_names(topics)
         self._channels: dict[tuple[str, int], tuple[int, int]] = {}
         self._tables: dict[tuple[str, int], _Table] = {}
         for camera in self.names:

@@ -24,14 +24,14 @@ from tupli_mcap.mcap.container import COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.images.codecs import ImageCodec
+from tupli_mcap.messages.layout import PREFIX, SEQUENCE_OFFSET
 from tupli_mcap.recording.index import StepClaims
 from tupli_mcap.remote import RemoteSource
 
 _BLOCK = 1 << 16  # messages whose places are numbers of Python at a time
 IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory
 _U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
-_SEQUENCE_AT = 11  # in a record
-_LEAST_STEP = BODY + 8 + 2  # bytes of a step's record: episode and step, terminal and timeout
+_LEAST_STEP = PREFIX + 2  # bytes of a step's record: after its episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
 # bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
 _HEAD, _REST = np.dtype("V8"), np.dtype("V4")
@@ -350,7 +350,7 @@ class ChunkStore:
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(channel)
         if claims is None or not n:
-            _check_sequence(np.ndarray(n, _U4, data, _SEQUENCE_AT, (size,)), first, where)
+            _check_sequence(np.ndarray(n, _U4, data, SEQUENCE_OFFSET, (size,)), first, where)
         else:
             claims.check(first, n, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
         self._held[i] = True  # once is enough: the CRC shows later changes

@@ -33,11 +33,19 @@ from tupli_mcap.mcap.records import (
 )
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import Walk
-from tupli_mcap.messages.frames import EncodedFrame, camera_names, decode_frame
+from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics, parse
+from tupli_mcap.messages.topics import (
+    EPISODE_END,
+    EPISODE_START,
+    FINAL_STATE,
+    INFO,
+    Topics,
+    camera_names,
+    parse,
+)
 from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recover.evidence import Evidence, Piece, RecordedChannels, Tail, prefix

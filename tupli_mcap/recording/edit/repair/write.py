@@ -23,12 +23,11 @@ from tupli_mcap.messages.frames import (
     FRAME_LAYOUT,
     FRAME_NAME,
     FRAME_SCHEMA,
-    camera_names,
     encode_pair,
 )
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import Topics, parse
+from tupli_mcap.messages.topics import Topics, camera_names, parse
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state

@@ -14,8 +14,7 @@ from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import Sink, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import CDR_HEADER, HOLE, RECORD_HEADER
-from tupli_mcap.messages.encode_rows import SEQUENCE_OFFSET
-from tupli_mcap.messages.layout import ImageLayout
+from tupli_mcap.messages.layout import SEQUENCE_OFFSET, ImageLayout
 from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
