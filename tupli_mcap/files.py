@@ -35,11 +35,8 @@ def temporary_path(directory: Path) -> Path:
 
 
 def create(path: Path, permissions: int = 0o666) -> int:
-    """A descriptor of a new, empty file; a file at its path is removed first.
-
-    Raises:
-        OSError: the system refuses, or somebody else makes a file there at the same time.
-    """
+    """A descriptor of a new, empty file; a file at its path is removed first. Raises OSError if the system refuses, or
+    somebody else makes a file there at the same time."""
     path.unlink(missing_ok=True)  # also a link that somebody has prepared
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, permissions)
 
@@ -127,11 +124,7 @@ def put(new: Path, goal: Path, *, overwrite: bool) -> None:
 
 
 def sync(path: Path) -> None:
-    """Waits until a file, or the names in a directory, are on the disk.
-
-    Raises:
-        OSError: the disk refuses.
-    """
+    """Waits until a file, or the names in a directory, are on the disk; raises OSError if the disk refuses."""
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
@@ -151,11 +144,8 @@ def is_temporary(name: str) -> bool:
 
 
 def left_in(directory: Path) -> list[Path]:
-    """The temporary files of killed processes in a directory, without its subdirectories.
-
-    Raises:
-        OSError: the directory cannot be read.
-    """
+    """The temporary files of killed processes in a directory, without its subdirectories; raises OSError if the
+    directory cannot be read."""
     found = sorted(name for name in os.listdir(directory) if is_temporary(name))  # noqa: PTH208 - names only
     return [path for path in map(directory.joinpath, found) if _is_left(path)]
 

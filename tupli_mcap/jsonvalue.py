@@ -143,11 +143,8 @@ def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH) -> str:
 
 
 def loads(text: str | bytes) -> Any:
-    """Return the value of a text that `dumps` or `dumps_plain` wrote; nothing in the text is executed.
-
-    Raises:
-        FormatError: the text is something else.
-    """
+    """Return the value of a text that `dumps` or `dumps_plain` wrote; nothing in the text is executed. Raises
+    FormatError if the text is something else."""
     try:
         if isinstance(text, bytes):
             text = text.decode()

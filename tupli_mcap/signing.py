@@ -56,11 +56,8 @@ class SigningKey:
 
 
 def is_signed(public_key: str, signature: bytes, message: bytes) -> bool:
-    """Whether a signature of a message was made with the private half of a key.
-
-    Raises:
-        MissingExtraError: the extra `sign` is not installed.
-    """
+    """Whether a signature of a message was made with the private half of a key; raises MissingExtraError if the extra
+    `sign` is not installed."""
     library = _cryptography()
     try:
         library.ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(public_key)).verify(
@@ -78,11 +75,8 @@ def fingerprint(public_key: str) -> str:
 
 
 def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
-    """A public key, as OpenSSH (`ssh-ed25519 AAAA... alice@host`, whose comment is its name) or PEM writes it.
-
-    Raises:
-        SignatureError: it is something else.
-    """
+    """A public key, as OpenSSH (`ssh-ed25519 AAAA... alice@host`, whose comment is its name) or PEM writes it. Raises
+    SignatureError if it is something else."""
     line = _SSH_LINE.match(text.strip())
     if line is not None:
         try:

@@ -55,11 +55,8 @@ class Measurements:
         return self.recording.layout
 
     def measure(self, kinds: Iterable[type[Statistic]]) -> None:
-        """Read the steps once for statistics of these kinds; reads nothing if there are no kinds or no steps.
-
-        Raises:
-            FormatError: the recording is damaged.
-        """
+        """Read the steps once for statistics of these kinds; reads nothing if there are no kinds or no steps. Raises
+        FormatError if the recording is damaged."""
         if self.steps:
             self._statistics = [statistic for kind in kinds for statistic in kind.start(self)]
         if self._statistics:

@@ -42,11 +42,8 @@ def encode_frame(camera: str, frame: EncodedFrame) -> bytes:
 
 
 def decode_frame(body: memoryview) -> tuple[EncodedFrame, str]:
-    """The picture in a `sensor_msgs/msg/CompressedImage`, and its `frame_id`.
-
-    Raises:
-        FormatError: lengths do not add up to the message.
-    """
+    """The picture in a `sensor_msgs/msg/CompressedImage`, and its `frame_id`; raises FormatError if lengths do not add
+    up to the message."""
     if len(body) < _STAMP.size:
         raise FormatError(f"expected a compressed image, found {len(body)} bytes")
     sec, nanosec = _STAMP.unpack_from(body)

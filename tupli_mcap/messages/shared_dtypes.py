@@ -24,11 +24,8 @@ def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
 
 
 def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:
-    """Checks that one array can hold the columns of two recordings.
-
-    Raises:
-        SpaceError: it cannot; the message names the first leaf that differs, and both recordings.
-    """
+    """Raises SpaceError unless one array can hold the columns of two recordings; it names the first leaf that differs,
+    and both recordings."""
     for root, ours, theirs in (
         ("state", first.state, other.state),
         ("action", first.action, other.action),

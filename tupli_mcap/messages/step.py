@@ -215,11 +215,8 @@ class StepLayout:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, str]) -> StepLayout:
-        """Rebuilds a layout from a channel's metadata.
-
-        Raises:
-            FormatError: the metadata are incomplete or describe no layout.
-        """
+        """Rebuilds a layout from a channel's metadata; raises FormatError if the metadata are incomplete or describe no
+        layout."""
         reward_text = _entry(metadata, "reward_space")
         reward = space_from_json(jsonvalue.loads(reward_text)) if reward_text else None
         names = jsonvalue.loads(_entry(metadata, "dtypes"))

@@ -92,11 +92,8 @@ class Measured:
 
 
 def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES) -> Measured:
-    """Reads the episodes at some positions; if they have more than `read_bytes`, a random choice of them.
-
-    Raises:
-        FormatError: the recording is damaged.
-    """
+    """Reads the episodes at some positions; if they have more than `read_bytes`, a random choice of them. Raises
+    FormatError if the recording is damaged."""
     layout = recording.layout if recording.num_envs else None
     rows = recording.index[positions]
     measured = Measured(
@@ -230,10 +227,7 @@ class Trace(NamedTuple):
 
 def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     """The episode at a position of a recording that was measured; of one of more than `READ_BYTES`, the first steps.
-
-    Raises:
-        FormatError: the recording is damaged.
-    """
+    Raises FormatError if the recording is damaged."""
     row = recording.index[position]
     length = int(row["length"])
     width = 1 if length <= MAX_POINTS else -(-length // (MAX_POINTS // 2))

@@ -37,11 +37,8 @@ _RC: dict[str, Any] = {
 
 @contextlib.contextmanager
 def styled() -> Iterator[None]:
-    """Uses matplotlib's defaults with `_RC` instead of the user's settings, which it restores at the end.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """Uses matplotlib's defaults with `_RC` instead of the user's settings, which it restores at the end; raises
+    MissingExtraError if matplotlib is not installed."""
     try:
         import matplotlib.style as mpl_style
     except ImportError as err:

@@ -83,11 +83,8 @@ class Contents:
 
 
 def step_channels(channels: dict[int, Channel], name: str) -> list[Channel]:
-    """The step channels in the order of their sub-environments.
-
-    Raises:
-        FormatError: they are not numbered from 0, or the metadata of a channel is damaged.
-    """
+    """The step channels in the order of their sub-environments; raises FormatError if they are not numbered from 0, or
+    the metadata of a channel is damaged."""
     found = []
     for channel in channels.values():
         if is_ours(channel.topic):

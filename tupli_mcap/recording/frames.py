@@ -40,11 +40,8 @@ class _Table(NamedTuple):
 
 
 class Cameras:
-    """The cameras of a recording. Frames are read on access.
-
-    Raises:
-        FormatError: a camera's channel is missing or has another schema.
-    """
+    """The cameras of a recording. Frames are read on access. Raises FormatError if a camera's channel is missing or has
+    another schema."""
 
     def __init__(self, contents: Contents, store: ChunkStore, vector: bool, num_envs: int, name: str) -> None:
         self._store = store
@@ -70,11 +67,8 @@ class Cameras:
         return channel.id
 
     def channels(self, camera: str, env: int) -> tuple[int, int]:
-        """The ids of `/camera/<name>` and `/frame/<name>` of a sub-environment.
-
-        Raises:
-            RecordingError: there is no such camera.
-        """
+        """The ids of `/camera/<name>` and `/frame/<name>` of a sub-environment; raises RecordingError if there is no
+        such camera."""
         if (camera, env) not in self._channels:
             known = ", ".join(self.names) or "none: `tupli-mcap render` makes frames of a recording"
             raise RecordingError(

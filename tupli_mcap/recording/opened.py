@@ -354,10 +354,7 @@ def _absolute(source: str | os.PathLike[str]) -> str:
 
 def read_contents(source: Source) -> Contents:
     """Reads the contents from the summary of a finished file, or by recovery; again if a writer changes it meanwhile.
-
-    Raises:
-        FormatError: the file is no MCAP file, is no recording, or is damaged.
-    """
+    Raises FormatError if the file is no MCAP file, is no recording, or is damaged."""
     for _ in range(_ATTEMPTS):
         size = source.size
         try:

@@ -70,10 +70,7 @@ def _has_float(value: Sequence[Any]) -> bool:
 
 def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> np.ndarray[Any, Any]:
     """`value` as an array of `dtype` and `shape`, equal to it in every element; bools are 0 or 1, as in messages.
-
-    Raises:
-        StepError: another shape, no numbers, or a value that `dtype` cannot hold exactly.
-    """
+    Raises StepError for another shape, no numbers, or a value that `dtype` cannot hold exactly."""
     if isinstance(value, np.ma.MaskedArray):
         raise StepError(f"{path}: expected an array, found a masked array, whose mask cannot be recorded")
     try:

@@ -52,11 +52,8 @@ class Labels(NamedTuple):
 
     @classmethod
     def from_json(cls, data: bytes, leaves: Sequence[Leaf], where: str) -> Labels:
-        """Parses `labels.json`; labels of other leaves than `leaves` are ignored.
-
-        Raises:
-            FormatError: `data` is something else, or a leaf has another number of labels than dimensions or values.
-        """
+        """Parses `labels.json`; labels of other leaves than `leaves` are ignored. Raises FormatError if `data` is
+        something else, or a leaf has another number of labels than dimensions or values."""
         expected = f"{where}: expected labels as schemas/labels.schema.json has them"
         if len(data) > MAX_LABELS:
             raise FormatError(f"{expected}, of at most {MAX_LABELS} bytes, found {len(data)}")

@@ -74,10 +74,7 @@ def space_to_json(space: gym.Space[Any]) -> Json:
 
 def space_from_json(obj: Any) -> gym.Space[Any]:
     """Return the space that an object of `space_to_json` describes; sizes are checked before anything is allocated.
-
-    Raises:
-        FormatError: the object has a defect; the message has its path.
-    """
+    Raises FormatError, with the path, for a defect."""
     return _read(obj, "space", 0, 1, _Budget())
 
 

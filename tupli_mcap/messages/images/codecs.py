@@ -44,11 +44,8 @@ class ImageCodec(Protocol):
 
 
 def image_codecs(layout: StepLayout, channels: Mapping[int, Channel]) -> dict[int, ImageCodec]:
-    """The codecs of the channels that have one, by channel id.
-
-    Raises:
-        FormatError: a channel names a codec that this version does not know.
-    """
+    """The codecs of the channels that have one, by channel id; raises FormatError if a channel names a codec that this
+    version does not know."""
     codecs: dict[int, ImageCodec] = {}
     leaves = {leaf.name: leaf for leaf in layout.images}
     for number, channel in channels.items():

@@ -55,11 +55,8 @@ def pillow() -> Any:
 
 
 def check_picture(value: Any, where: str) -> Picture:
-    """The picture that an environment rendered, checked.
-
-    Raises:
-        RecordingError: it is no uint8 array of shape (height, width, 3).
-    """
+    """The picture that an environment rendered, checked; raises RecordingError if it is no uint8 array of shape
+    (height, width, 3)."""
     if isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.shape[2:] == (3,) and value.size:
         return value
     found = f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__

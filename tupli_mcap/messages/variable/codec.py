@@ -102,11 +102,8 @@ class VariableField:
         self._decode = codec.decode
 
     def encode(self, value: Any, out: bytearray, origin: int) -> None:
-        """Append `value` to `out`, aligned from `origin`.
-
-        Raises:
-            StepError: another structure, or a leaf that cannot be stored exactly; `out` is unchanged.
-        """
+        """Append `value` to `out`, aligned from `origin`; raises StepError, and leaves `out` as it is, for another
+        structure or a leaf that cannot be stored exactly."""
         start = len(out)
         try:
             self._encode(value, out, origin)
@@ -115,11 +112,8 @@ class VariableField:
             raise StepError(f"{self.path}{err}") from err.__cause__
 
     def decode(self, data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
-        """Return the value at `offset`, with the types of the space's samples, and the offset after it.
-
-        Raises:
-            FormatError: the bytes are no value of the space.
-        """
+        """Return the value at `offset`, with the types of the space's samples, and the offset after it; raises
+        FormatError if the bytes are no value of the space."""
         try:
             return self._decode(data, offset, origin)
         except FormatError as err:

@@ -27,11 +27,7 @@ class Annotation(NamedTuple):
 
 
 class Annotations:
-    """The annotations of a recording, in their order.
-
-    Raises:
-        FormatError: `data` is something else.
-    """
+    """The annotations of a recording, in their order; raises FormatError if `data` is something else."""
 
     def __init__(self, data: bytes | None = None, where: str = "") -> None:
         self.said: list[Annotation] = [] if data is None else _read(data, where)
@@ -56,11 +52,8 @@ class Annotations:
         return found
 
     def to_json(self) -> bytes:
-        """The content of `annotations.json`.
-
-        Raises:
-            RecordingError: JSON cannot hold a value, or they are too many.
-        """
+        """The content of `annotations.json`; raises RecordingError if JSON cannot hold a value, or they are too
+        many."""
         try:
             data = jsonvalue.dumps_plain([annotation._asdict() for annotation in self.said]).encode()
         except (TypeError, ValueError) as err:

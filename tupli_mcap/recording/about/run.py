@@ -86,11 +86,7 @@ class Run(SaysWhatIsMeant):
 
     @classmethod
     def of_document(cls, document: object, where: str) -> Self:
-        """A run from the JSON value in `run.json`; unknown keys are ignored.
-
-        Raises:
-            FormatError: it is no run.
-        """
+        """A run from the JSON value in `run.json`; unknown keys are ignored. Raises FormatError if it is no run."""
         if not isinstance(document, dict):
             raise FormatError(f"{where}: expected a run as a JSON object, found {document!r:.80}")
         said = {key: document[key] for key in cls.__dataclass_fields__ if key in document}
@@ -166,11 +162,8 @@ class RecordedRuns(NamedTuple):
         return self._replace(runs=[*self.runs, run], spans=spans)
 
     def to_json(self) -> bytes:
-        """The content of `run.json`: all parts that are not empty, without `ended`, which follows from the episodes.
-
-        Raises:
-            RecordingError: JSON cannot hold the metadata, or they are too large.
-        """
+        """The content of `run.json`: all parts that are not empty, without `ended`, which follows from the episodes;
+        raises RecordingError if JSON cannot hold the metadata, or they are too large."""
         document: dict[str, Any] = {"runs": [_document(run) for run in self.runs]}
         if self.spans:
             document["spans"] = [list(span) for span in self.spans]

@@ -96,11 +96,8 @@ class Structure:
     # ---- the data section
 
     def run(self) -> None:
-        """Checks everything that does not depend on the layout.
-
-        Raises:
-            NewerVersionError: the recording's format is not known.
-        """
+        """Checks everything that does not depend on the layout; raises NewerVersionError if the recording's format is
+        not known."""
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
             self._error("file", "expected the magic of MCAP at the start", offset=0)
         walk = Walk(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)

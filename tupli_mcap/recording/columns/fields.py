@@ -26,11 +26,8 @@ OTHER_NAMES = MappingProxyType(
 def field_names(
     fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
 ) -> list[str]:
-    """The fields under this package's names, each once; Gymnasium's names are understood.
-
-    Raises:
-        error: a name is unknown, or is no text.
-    """
+    """The fields under this package's names, each once; Gymnasium's names are understood. Raises `error` for an unknown
+    name."""
     try:
         given = [fields] if isinstance(fields, str) else list(fields)
         names = [OTHER_NAMES.get(name, name) for name in given]

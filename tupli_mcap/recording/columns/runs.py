@@ -104,11 +104,7 @@ def _joined(channels: Array, first: Array, steps: Array) -> Runs:
 
 
 def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
-    """The parts of some runs, one for each chunk.
-
-    Raises:
-        FormatError: the recording has no such rows.
-    """
+    """The parts of some runs, one for each chunk; raises FormatError if the recording has no such rows."""
     if len(runs.first) <= _FEW:  # a window or an episode: array operations take longer
         return _of_few(runs, store)
     channels, first, steps = map(np.asarray, runs)
