@@ -73,16 +73,7 @@ class StepLayout:
             raise SpaceError(
                 f"dtypes are given for {sorted(given)}, which are not leaves of constant size in these spaces"
             )
-        # viewers show no image whose values are not uint8: it is stored as an array
-        self.state = [
-            replace(leaf, kind="array")
-            if leaf.kind == "image" and self.dtypes[leaf.name] != np.uint8
-            else leaf
-            for leaf in self.state
-        ]
-        self.state = [
-            _as_stack(leaf, stacks) if self.dtypes.get(leaf.name) == np.uint8 else leaf for leaf in self.state
-        ]
+        self.state = [_as_stored(leaf, self.dtypes.get(leaf.name), stacks) for leaf in self.state]
         self.stacks = [stack_of(leaf) for leaf in self.state if leaf.kind == "stack"]
         self.nest_state = structure(observation_space)
         self.nest_action = structure(action_space)
@@ -273,8 +264,10 @@ def _is_stack(entry: Any) -> bool:
     return isinstance(entry, str)
 
 
-def _as_stack(leaf: Leaf, stacks: Collection[Stack]) -> Leaf:
+def _as_stored(leaf: Leaf, dtype: DType | None, stacks: Collection[Stack]) -> Leaf:
     """The leaf as a stack if `stacks` has it, else as it is."""
+    if dtype != np.uint8:  # viewers show no image of other values: it is stored as an array
+        return replace(leaf, kind="array") if leaf.kind == "image" else leaf
     stack = replace(leaf, kind="stack", frames_last=leaf.name not in stacks)
     if stack_of(stack) not in stacks:
         return leaf
