@@ -13,7 +13,7 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import exact_array, exact_flag
-from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.leaves import Leaf, subspaces
 
 _BOOLS = b"\0\1"
 _LARGE = 2048  # a leaf of this many bytes or more is copied as an array, not through `bytes`
@@ -62,16 +62,9 @@ def add_structure_checks(source: Source, space: Any, expression: str) -> None:
     """Lines that raise TypeError unless tuples and dicts are those of the space."""
     if type(space) not in (spaces.Dict, spaces.Tuple):
         return
-    n = len(space.spaces)
-    if type(space) is spaces.Tuple:
-        source.lines.append(
-            f"if not isinstance({expression}, tuple) or len({expression}) != {n}: raise TypeError"
-        )
-        children = list(enumerate(space.spaces))
-    else:
-        source.lines.append(f"if len({expression}) != {n}: raise TypeError")
-        children = list(space.spaces.items())
-    for key, sub in children:
+    of_tuple = f"not isinstance({expression}, tuple) or " if type(space) is spaces.Tuple else ""
+    source.lines.append(f"if {of_tuple}len({expression}) != {len(space.spaces)}: raise TypeError")
+    for key, sub in subspaces(space):
         if type(sub) in (spaces.Dict, spaces.Tuple):
             add_structure_checks(source, sub, access_to(source, expression, (key,)))
 

@@ -51,9 +51,10 @@ def decide_dtype(leaf: Leaf, values: Sequence[Any]) -> DType:
 def _widen(dtype: DType, value: Any) -> DType:
     if isinstance(value, float) and not isinstance(value, np.generic):
         return np.result_type(dtype, np.float64)
+    if isinstance(value, list | tuple):
+        array = np.asarray(value)
+        return _widen(dtype, array) if array.dtype.kind == "f" else dtype
     if not isinstance(value, np.ndarray | np.generic):
-        if isinstance(value, list | tuple):
-            return _widen(dtype, np.asarray(value)) if _has_float(value) else dtype
         return dtype
     if value.dtype.kind not in "biuf":
         return dtype  # storing the value refuses it, and names its path
@@ -62,10 +63,6 @@ def _widen(dtype: DType, value: Any) -> DType:
         # int64 and uint64 have no common integer dtype: take that of the values
         wide = value.dtype
     return np.dtype(wide.name)
-
-
-def _has_float(value: Sequence[Any]) -> bool:
-    return np.asarray(value).dtype.kind == "f"
 
 
 def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> np.ndarray[Any, Any]:

@@ -138,41 +138,33 @@ def flatten_space(
     Raises:
         SpaceError: a space of another class, or a dtype no message can hold, with the leaf's path.
     """
-    return list(_walk(space, (), root, root, names, images, 0))
+
+    def walk(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str) -> Iterator[Leaf]:
+        if len(keys) > _MAX_DEPTH:
+            raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
+        if type(space) in (spaces.Dict, spaces.Tuple):
+            for key, sub in subspaces(space):
+                yield from walk(sub, (*keys, key), f"{path}[{key!r}]", f"{name}_{key}")
+        elif type(space) in _VARIABLE:
+            yield Leaf(keys, path, names.take(name), space, "variable", None, ())
+        elif type(space) in _CONSTANT:
+            yield _constant_leaf(space, keys, path, names.take(name), images)
+        else:
+            raise SpaceError(
+                f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
+                "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction) with a function "
+                "that makes a value of Gymnasium's own of it, and the space of such values"
+            )
+
+    return list(walk(space, (), root, root))
 
 
-def _walk(
-    space: gym.Space[Any],
-    keys: tuple[Any, ...],
-    path: str,
-    name: str,
-    names: NameRegistry,
-    images: bool,
-    depth: int,
-) -> Iterator[Leaf]:
-    if depth > _MAX_DEPTH:
-        raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
-    if type(space) is spaces.Dict:
-        for key, sub in space.spaces.items():
-            yield from _walk(sub, (*keys, key), f"{path}[{key!r}]", f"{name}_{key}", names, images, depth + 1)
-    elif type(space) is spaces.Tuple:
-        for i, sub in enumerate(space.spaces):
-            yield from _walk(sub, (*keys, i), f"{path}[{i}]", f"{name}_{i}", names, images, depth + 1)
-    elif type(space) in _VARIABLE:
-        yield Leaf(keys, path, names.take(name), space, "variable", None, ())
-    elif type(space) in _CONSTANT:
-        yield _constant_leaf(space, keys, path, names.take(name), images)
-    else:
-        raise SpaceError(
-            f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
-            "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction) with a function that "
-            "makes a value of Gymnasium's own of it, and the space of such values"
-        )
+def subspaces(space: Any) -> list[tuple[Any, gym.Space[Any]]]:
+    """The keys, or the indexes, of a Dict or a Tuple, and their spaces."""
+    return list(space.spaces.items() if type(space) is spaces.Dict else enumerate(space.spaces))
 
 
-def _constant_leaf(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str, images: bool) -> Leaf:
-    if space.dtype is None or space.shape is None:
-        raise SpaceError(f"{path}: expected a space with a shape and a dtype, found {space!r}")
+def _constant_leaf(space: Any, keys: tuple[Any, ...], path: str, name: str, images: bool) -> Leaf:
     dtype = np.dtype(space.dtype)
     if dtype.name not in ROS_TYPES:
         raise SpaceError(
@@ -190,14 +182,12 @@ def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
 
     Such a space may allow anything: its Text has the printable ASCII characters, and up to 4,096 of them.
     """
-    if type(space) is spaces.Dict:
-        named = {key: own_space(sub) for key, sub in space.spaces.items()}
-        changed = any(named[key] is not sub for key, sub in space.spaces.items())
-        return spaces.Dict(list(named.items())) if changed else space
-    if type(space) is spaces.Tuple:
-        listed = [own_space(sub) for sub in space.spaces]
-        changed = any(one is not sub for one, sub in zip(listed, space.spaces, strict=True))
-        return spaces.Tuple(listed) if changed else space
+    if type(space) in (spaces.Dict, spaces.Tuple):
+        parts = subspaces(space)
+        own = [(key, own_space(sub)) for key, sub in parts]
+        if all(one is sub for (_, one), (_, sub) in zip(own, parts, strict=True)):
+            return space
+        return spaces.Dict(own) if type(space) is spaces.Dict else spaces.Tuple([sub for _, sub in own])
     if type(space) in _VARIABLE or space.shape is not None or space.dtype is None or space.dtype.kind != "U":
         return space
     return spaces.Text(4096, min_length=0, charset=string.printable)
@@ -205,27 +195,15 @@ def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
 
 def structure(space: gym.Space[Any]) -> Callable[[Sequence[Any]], Any]:
     """A function that nests a sequence of leaf values (in `flatten_space` order) as `space` is nested."""
-    build, count = _structure(space, 0)
-
-    def nest(values: Sequence[Any]) -> Any:
-        if len(values) != count:
-            raise SpaceError(f"expected {count} leaf values for {space!r}, found {len(values)}")
-        return build(values)
-
-    return nest
+    build = _builder(space)
+    return lambda values: build(iter(values))
 
 
-def _structure(space: gym.Space[Any], start: int) -> tuple[Callable[[Sequence[Any]], Any], int]:
+def _builder(space: gym.Space[Any]) -> Callable[[Iterator[Any]], Any]:
     if type(space) is spaces.Dict:
-        parts: list[tuple[Any, Callable[[Sequence[Any]], Any]]] = []
-        for key, sub in space.spaces.items():
-            build, start = _structure(sub, start)
-            parts.append((key, build))
-        return (lambda values: {key: build(values) for key, build in parts}), start
+        parts = {key: _builder(sub) for key, sub in space.spaces.items()}
+        return lambda left: {key: build(left) for key, build in parts.items()}
     if type(space) is spaces.Tuple:
-        builds: list[Callable[[Sequence[Any]], Any]] = []
-        for sub in space.spaces:
-            build, start = _structure(sub, start)
-            builds.append(build)
-        return (lambda values: tuple(build(values) for build in builds)), start
-    return (lambda values, i=start: values[i]), start + 1
+        builds = [_builder(sub) for sub in space.spaces]
+        return lambda left: tuple([build(left) for build in builds])
+    return next

@@ -49,7 +49,7 @@ from tupli_mcap.messages.variable.nested_codecs import (
     with_dummy,
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
-from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel
+from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel, subspaces
 
 _MAX_DEPTH = 64
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -176,7 +176,7 @@ class _Builder:
         """A Dict or Tuple, its entries made by `make`."""
         _check_depth(path, depth)
         is_dict = type(space) is spaces.Dict
-        entries = list(space.spaces.items() if is_dict else enumerate(space.spaces))
+        entries = subspaces(space)
         names = NameRegistry(tuple(ROS_TYPES))
         fields: list[tuple[str, str]] = []
         steps: list[Step] = []
