@@ -174,11 +174,12 @@ class RecordedSteps:
     def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
         """The plan to read some fields, whose columns then share the budget."""
         names = checked_fields(fields)
-        plan = Plan.of([field for field in names if field != "next_states"], layout, self._rows[:-1])
+        kinds = [rows.columns for rows in self._rows[:-1]]
+        plan = Plan.of([field for field in names if field != "next_states"], layout, kinds)
         for i, leaves in plan.sources:
             self._used[i].update(leaves)
         if "next_states" in names:
-            states = self._plans[_STATES] = Plan.of(["states"], layout, self._rows[:-1])
+            states = self._plans[_STATES] = Plan.of(["states"], layout, kinds)
             for i, leaves in states.sources:
                 self._used[i].update(leaves)
             self._used[-1].update(leaf.name for leaf in layout.state)

@@ -10,10 +10,10 @@ import itertools
 import math
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -254,13 +254,6 @@ def _own_names(files: Files, layout: StepLayout) -> dict[str, str]:
 # ---- fields
 
 
-class Kind(Protocol):
-    """Rows of one kind, with any way to read them."""
-
-    @property
-    def columns(self) -> Mapping[str, Column]: ...
-
-
 class Plan(NamedTuple):
     """How to read some fields: the columns of each kind of rows, and how they become fields."""
 
@@ -268,8 +261,8 @@ class Plan(NamedTuple):
     fields: list[tuple[str, Callable[[list[Any]], Any], list[str]]]
 
     @classmethod
-    def of(cls, fields: Sequence[str], layout: StepLayout, kinds: Sequence[Kind]) -> Plan:
-        """The plan for some fields; "next_states" must not be among them."""
+    def of(cls, fields: Sequence[str], layout: StepLayout, kinds: Iterable[Mapping[str, Column]]) -> Plan:
+        """The plan for some fields, by the columns of each kind; "next_states" must not be among them."""
         nests: dict[str, Callable[[list[Any]], Any]] = {
             "states": layout.nest_state, "actions": layout.nest_action, "rewards": layout.nest_reward,
             "times": _times,
@@ -280,8 +273,8 @@ class Plan(NamedTuple):
             names = [_PLAIN[field]] if leaves is None else [leaf.name for leaf in leaves]
             plan.fields.append((field, nests.get(field, _only), names))
         needed = dict.fromkeys(name for _, _, names in plan.fields for name in names)
-        for i, rows in enumerate(kinds):
-            if names := [name for name in needed if name in rows.columns]:
+        for i, columns in enumerate(kinds):
+            if names := [name for name in needed if name in columns]:
                 plan.sources.append((i, names))
         return plan
 

@@ -88,7 +88,10 @@ class ColumnReader:
 
         Without `images`, the columns of image leaves are empty.
         """
-        plan = self._plans.get(tuple(fields)) or self._plan(fields)
+        plan = self._plans.get(tuple(fields))
+        if plan is None:
+            kinds = (rows.columns for rows in self._kinds)
+            plan = self._plans[tuple(fields)] = Plan.of(fields, self._layout, kinds)
         columns: dict[str, Any] = {}
         tasks, checks, chunks = [], [], []
         for i, names in plan.sources:
@@ -110,11 +113,6 @@ class ColumnReader:
             check()
         return plan.nest(columns)
 
-    def _plan(self, fields: Sequence[str]) -> Plan:
-        made = Plan.of(fields, self._layout, self._kinds)
-        self._plans[tuple(fields)] = made
-        return made
-
     @cached_property
     def _leaves(self) -> list[str | None]:
         """The image leaf of each kind of rows; None for steps."""
@@ -132,10 +130,8 @@ class ColumnReader:
 
     def _image_channels(self, name: str, channels: Array | Sequence[int]) -> Array:
         found, places = np.unique(channels, return_inverse=True)
-        images: Array = np.array([self._images[name][channel] for channel in found.tolist()], np.int64)[
-            places
-        ]
-        return images
+        images = [self._images[name][channel] for channel in found.tolist()]
+        return np.array(images, np.int64)[places]
 
     def final_columns(self, channel: int, episodes: Array) -> list[Any]:
         """Final states of episodes (index rows that all have one): a column for each leaf of the state."""
