@@ -12,7 +12,7 @@ import hashlib
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from tupli_mcap import trust
 from tupli_mcap.errors import NotFoundError, SignatureError, missing_extra, os_reason
@@ -58,12 +58,10 @@ class SigningKey:
 def is_signed(public_key: str, signature: bytes, message: bytes) -> bool:
     """Whether a signature of a message was made with the private half of a key; raises MissingExtraError if the extra
     `sign` is not installed."""
-    library = _cryptography()
+    exceptions, _, ed25519 = _cryptography()
     try:
-        library.ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(public_key)).verify(
-            signature, message
-        )
-    except (ValueError, library.InvalidSignature):
+        ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(public_key)).verify(signature, message)
+    except (ValueError, exceptions.InvalidSignature):
         return False
     return True
 
@@ -86,12 +84,12 @@ def read_public_key(text: str, where: str = "the key") -> trust.TrustedKey:
         if blob.startswith(_SSH_HEAD) and len(blob) == len(_SSH_HEAD) + 32:
             return trust.TrustedKey(blob[len(_SSH_HEAD) :].hex(), (line[2] or "").strip())
     elif "-----BEGIN PUBLIC KEY-----" in text:
-        library = _cryptography()
+        exceptions, serialization, ed25519 = _cryptography()
         try:
-            key = library.serialization.load_pem_public_key(text.encode())
-        except (ValueError, library.UnsupportedAlgorithm):
+            key = serialization.load_pem_public_key(text.encode())
+        except (ValueError, exceptions.UnsupportedAlgorithm):
             key = None
-        if isinstance(key, library.ed25519.Ed25519PublicKey):
+        if isinstance(key, ed25519.Ed25519PublicKey):
             return trust.TrustedKey(key.public_bytes_raw().hex(), "")
     if "PRIVATE KEY" in text:
         raise SignatureError(f"{where}: expected a public key, found a private one; give its .pub file")
@@ -133,12 +131,12 @@ def _is_path(text: str) -> bool:
 
 
 def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
-    library = _cryptography()
+    exceptions, serialization, ed25519 = _cryptography()
     data = _read(path)
     secret = None if passphrase is None else passphrase.encode()
-    load = library.serialization.load_pem_private_key
+    load = serialization.load_pem_private_key
     if b"BEGIN OPENSSH PRIVATE KEY" in data:
-        load = library.serialization.load_ssh_private_key
+        load = serialization.load_ssh_private_key
     try:
         try:
             key = load(data, password=secret)
@@ -148,14 +146,14 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
             key = load(data, password=None)  # the key has no passphrase
     except TypeError as err:
         raise PassphraseNeededError(f"{path}: the key is encrypted, and needs a passphrase") from err
-    except (ValueError, library.UnsupportedAlgorithm) as err:
+    except (ValueError, exceptions.UnsupportedAlgorithm) as err:
         if secret is not None:
             raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from err
         raise SignatureError(
             f"{path}: expected a private Ed25519 key of OpenSSH or in PEM, found something else ({err}); "
             "`ssh-keygen -t ed25519` makes one"
         ) from err
-    if not isinstance(key, library.ed25519.Ed25519PrivateKey):
+    if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise SignatureError(
             f"{path}: expected an Ed25519 key, found {type(key).__name__}; `ssh-keygen -t ed25519` makes one"
         )
@@ -174,20 +172,12 @@ def _read(path: Path) -> bytes:
         raise SignatureError(f"the key {str(path)!r} cannot be read: {os_reason(err)}") from err
 
 
-class _Library(NamedTuple):
-    """The parts of `cryptography` that are used."""
-
-    InvalidSignature: Any
-    UnsupportedAlgorithm: Any
-    serialization: Any
-    ed25519: Any
-
-
-def _cryptography() -> _Library:
+def _cryptography() -> tuple[Any, Any, Any]:
+    """The modules of `cryptography` that are used."""
     try:
-        from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+        from cryptography import exceptions
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
     except ImportError as err:
         raise missing_extra("signatures of bundles need the package cryptography", "sign") from err
-    return _Library(InvalidSignature, UnsupportedAlgorithm, serialization, ed25519)
+    return exceptions, serialization, ed25519
