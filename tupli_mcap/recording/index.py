@@ -259,9 +259,9 @@ def check_episodes(
 def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], name: str) -> None:
     if not len(rows):
         return
-    env, first, length, start, end, final, how, numbers = (
+    env, first, length, start, end, final, numbers = (
         np.ascontiguousarray(rows[name])  # each is used several times
-        for name in ("env", "first_row", "length", "start_row", "end_row", "final_row", "end", "episode")
+        for name in ("env", "first_row", "length", "start_row", "end_row", "final_row", "episode")
     )
     good = env < len(steps)
     env = np.minimum(env, len(steps))
@@ -269,7 +269,7 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
     good &= (length >= 1) & (length <= limit) & (first <= limit)
     good &= length <= limit - np.minimum(first, limit)
     good &= (start < others[EPISODE_START]) & (end < others[EPISODE_END])
-    good &= (final >= -1) & (final < others[FINAL_STATE]) & (how <= 2)
+    good &= (final >= -1) & (final < others[FINAL_STATE])
     if not good.all():
         row = rows[int(np.argmin(good))]
         raise FormatError(

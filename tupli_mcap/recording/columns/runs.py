@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 
 _FEW = 4  # up to this many pieces are copied one by one
@@ -74,19 +73,12 @@ class Runs(NamedTuple):
 
 
 def runs_of(episodes: Array, channels: Sequence[int]) -> Runs:
-    """The runs of episodes (index rows) in their order; runs that follow each other in the file are joined.
+    """The runs of episodes (index rows, checked) in their order; runs that follow each other in the file are joined.
 
-    Args:
-        channels: of the sub-environments.
-
-    Raises:
-        FormatError: an episode names another sub-environment.
+    `channels` are those of the sub-environments.
     """
-    env = episodes["env"].astype(np.int64)
-    if len(env) and env.max() >= len(channels):
-        raise FormatError(f"an episode names sub-environment {env.max()}, but there are {len(channels)}")
-    lengths = episodes["length"].astype(np.int64)
-    return _joined(np.array(channels, np.int64)[env], episodes["first_row"].astype(np.int64), lengths)
+    env, first, lengths = (episodes[name].astype(np.int64) for name in ("env", "first_row", "length"))
+    return _joined(np.array(channels, np.int64)[env], first, lengths)
 
 
 def final_runs(episodes: Array, channel: int) -> Runs:
