@@ -142,13 +142,14 @@ class _Examination:
         self._checks = checks
         self._thresholds = thresholds
         self._needs = dict.fromkeys(check.needs for check in checks if check.needs is not None)
-        self._findings: list[tuple[int, int, Finding]] = []  # number of the recording, number of the check
+        self._findings: list[
+            Finding
+        ] = []  # in the order of the recordings, of each in the order of the checks
         self._kept: list[Statistic] = []
         self._files = self._episodes = self._steps = 0
 
     def add(self, subject: Subject) -> None:
         """Examine one recording."""
-        number = self._files
         self._files += 1
         try:
             if subject.error is not None:
@@ -156,11 +157,11 @@ class _Examination:
             with subject.open() as recording:
                 measured = Measurements(recording, subject.choose(recording))
                 measured.measure(self._needs)
-                findings = self._run(number, measured, across=False)
+                findings = self._run(measured, across=False)
         except FilterError:
             raise
         except (TupliError, OSError) as err:
-            self._findings.append((number, -1, _unreadable(subject.name, err)))
+            self._findings.append(_unreadable(subject.name, err))
             return
         self._findings += findings
         self._episodes += len(measured.rows)
@@ -170,19 +171,14 @@ class _Examination:
                 self._kept += measured.statistics(check.needs)
 
     def diagnosis(self) -> Diagnosis:
-        self._findings += self._run(-1, self._kept, across=True)
-        # Sorting is stable: findings of one check and recording stay in the order of the leaves.
-        ordered = sorted(self._findings, key=lambda item: (-item[2].severity, item[0], item[1]))
-        findings = tuple(finding for _, _, finding in ordered)
-        return Diagnosis(findings, self._files, self._episodes, self._steps)
+        found = [*self._run(self._kept, across=True), *self._findings]
+        # sorting is stable: findings of one severity stay in their order
+        findings = sorted(found, key=lambda finding: -finding.severity)
+        return Diagnosis(tuple(findings), self._files, self._episodes, self._steps)
 
-    def _run(self, number: int, data: Any, *, across: bool) -> list[tuple[int, int, Finding]]:
-        return [
-            (number, i, finding)
-            for i, check in enumerate(self._checks)
-            if check.across == across
-            for finding in check.run(data, **self._thresholds.get(check.id, {}))
-        ]
+    def _run(self, data: Any, *, across: bool) -> list[Finding]:
+        chosen = [check for check in self._checks if check.across == across]
+        return [one for check in chosen for one in check.run(data, **self._thresholds.get(check.id, {}))]
 
 
 def _unreadable(name: str, err: TupliError | OSError) -> Finding:
