@@ -190,21 +190,10 @@ def _fits(space: gym.Space[Any]) -> Callable[[Any], bool] | None:
 
 def leaf_value(value: Any, leaf: Leaf) -> Any:
     """A leaf's value inside `value`; raises a StepError that names the place where the structure differs."""
-    found = value
-    try:
-        for key in leaf.keys:
-            found = found[key]
-    except (KeyError, IndexError, TypeError) as err:
-        raise _misplaced(value, leaf) from err
-    return found
-
-
-def _misplaced(value: Any, leaf: Leaf) -> StepError:
-    path = leaf.path.split("[", 1)[0]
-    for key in leaf.keys:
+    for i, key in enumerate(leaf.keys):
         try:
             value = value[key]
-        except (KeyError, IndexError, TypeError):
-            break
-        path += f"[{key!r}]"
-    return StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}")
+        except (KeyError, IndexError, TypeError) as err:
+            path = leaf.path.split("[", 1)[0] + "".join(f"[{before!r}]" for before in leaf.keys[:i])
+            raise StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}") from err
+    return value
