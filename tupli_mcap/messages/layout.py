@@ -17,18 +17,18 @@ from mcap.opcode import Opcode
 from tupli_mcap.arrays import DType
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, HEADER_FIELDS, RECORD_HEADER
 from tupli_mcap.messages import cdr
-from tupli_mcap.spaces.leaves import Leaf, ros_type
+from tupli_mcap.spaces.leaves import Leaf
 
 SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
 PREFIX = BODY + 8  # bytes of a step's record that are the same for a whole episode: headers, episode, step
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
-_SEPARATOR = "=" * 80 + "\n"
+SEPARATOR = "=" * 80 + "\n"  # before a nested message in a ros2msg text
 IMAGE_NAME = "sensor_msgs/msg/Image"
 IMAGE_SCHEMA = (
     "std_msgs/Header header\nuint32 height\nuint32 width\n"
     "string encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
-    f"{_SEPARATOR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    f"{_SEPARATOR}MSG: builtin_interfaces/Time\n{_TIME_MSG}"
+    f"{SEPARATOR}MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{SEPARATOR}MSG: builtin_interfaces/Time\n{_TIME_MSG}"
 )
 
 
@@ -90,18 +90,6 @@ def record_dtype(fields: Sequence[Field], body_size: int) -> DType:
     spec: Any = {"names": names, "formats": formats, "offsets": offsets, "itemsize": BODY + body_size}
     dtype: DType = np.dtype(spec)
     return dtype
-
-
-def field_line(leaf: Leaf, dtype: DType) -> str:
-    """The ros2msg line of a constant leaf; more than one dimension is flattened (C order)."""
-    count = "" if leaf.shape == () else f"[{leaf.size}]"
-    return f"{ros_type(dtype)}{count} {leaf.name}\n"
-
-
-def message_text(lines: Sequence[str], definitions: Sequence[tuple[str, str]]) -> str:
-    """A ros2msg definition with its nested messages."""
-    parts = "".join(f"{_SEPARATOR}MSG: {name}\n{text}" for name, text in definitions)
-    return "".join(lines) + parts
 
 
 class ImageLayout(NamedTuple):

@@ -18,7 +18,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import DType
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.layout import ImageLayout, MessageLayout, field_line, image_layout, message_text
+from tupli_mcap.messages.layout import SEPARATOR, ImageLayout, MessageLayout, image_layout
 from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, own_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
@@ -189,8 +189,10 @@ class StepLayout:
                 lines.append(f"{codec.field_type} {leaf.name}\n")
                 definitions += codec.definitions
             elif 0 not in leaf.shape:
-                lines.append(field_line(leaf, self.dtypes[leaf.name]))
-        return message_text(lines + tail, definitions)
+                count = "" if leaf.shape == () else f"[{leaf.size}]"  # dimensions are flattened (C order)
+                lines.append(f"{ROS_TYPES[self.dtypes[leaf.name].name]}{count} {leaf.name}\n")
+        nested = [f"{SEPARATOR}MSG: {name}\n{text}" for name, text in definitions]
+        return "".join([*lines, *tail, *nested])
 
     def to_metadata(self) -> dict[str, str]:
         """The layout as channel metadata; `from_metadata` rebuilds it."""
