@@ -200,10 +200,7 @@ def _annotations(recording: Recording, rows: Array) -> list[dict[str, Any]]:
 def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
     every = recording.all_metadata()
     texts = {every[i] for i in positions.tolist()} - {"{}"}
-    found: dict[str, None] = {}
-    for text in texts:
-        found.update(dict.fromkeys(jsonvalue.loads(text)))
-    return sorted(found)
+    return sorted({key for text in texts for key in jsonvalue.loads(text)})
 
 
 def _info_keys(recording: Recording, positions: Array) -> list[str]:
