@@ -72,10 +72,7 @@ def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
 def private_directory(parent: Path, *, shown: Path) -> Iterator[Path]:
     """A directory that only this user may enter, and that goes with what is in it when the block ends.
 
-    shown: what the system's errors name instead of it.
-
-    Raises:
-        OSError: the system refuses.
+    `shown` is what the system's errors name instead of it.
     """
     directory, fd = temporary_path(parent), -1
     try:
@@ -101,12 +98,7 @@ def write_bytes(goal: Path, data: bytes, *, overwrite: bool = True, permissions:
 
 
 def put(new: Path, goal: Path, *, overwrite: bool) -> None:
-    """Gives a file its path; with `overwrite` it replaces the file there.
-
-    Raises:
-        FileExistsError: there is a file, without `overwrite`.
-        OSError: the system refuses.
-    """
+    """Gives a file its path; with `overwrite` it replaces the file there, else a FileExistsError is raised."""
     if overwrite:
         new.replace(goal)
         return

@@ -8,11 +8,9 @@ from typing import Any
 
 
 def imported_on_use(door: dict[str, Any], homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package that imports a public name from its module when it is first used.
+    """The `__getattr__` of a package (`door`: its `globals()`) that imports a public name from its module on first use.
 
-    Args:
-        door: `globals()` of the package.
-        homes: by module, relative to the package, its names as one text: `{"columns.saved": "SavedColumns open"}`.
+    `homes` has the names of each module, relative to the package: `{"columns.saved": "SavedColumns open"}`.
     """
     package = door["__name__"]
     home_of = {name: home for home, names in homes.items() for name in names.split()}

@@ -96,10 +96,8 @@ class BatchDecoder:
     def steps(self, data: Any, records: Array, names: Collection[str]) -> dict[str, Any]:
         """Columns of steps: an array for a leaf of constant size, a list for one of variable size.
 
-        Args:
-            data: the buffer.
-            records: where each record begins and ends in `data`, int64 (messages, 2).
-            names: the columns to return: of leaves that have elements, `terminal`, `timeout` and `LOG_TIME`.
+        Each record begins and ends in `data` where `records` says, int64 (messages, 2). `names` are the columns to
+        return: of leaves that have elements, `terminal`, `timeout` and `LOG_TIME`.
         """
         if set(names) == {LOG_TIME}:  # it is not in the message bodies
             return {LOG_TIME: _log_times(data, records)}

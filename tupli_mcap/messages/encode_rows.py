@@ -105,19 +105,10 @@ def make_row_encoder(
 ) -> RowEncoder:
     """Generates the encoder that writes messages of `channel` into `buffer`, from sequence `first` on.
 
-    The caller has to call `move` and `begin` before the first step.
-
-    Args:
-        layout: a constant one.
-        buffer: of the journal.
-        channel: id of the step channel.
-        first: sequence of the next step.
-        images: a sink for each image leaf.
-        switch: called when the row after the last one of a half has been started.
-        seal: if given, called with the offset of each committed row, and `alone=True` if no state follows it.
-
-    Raises:
-        SpaceError: the layout has more than 4,096 leaves.
+    The caller has to call `move` and `begin` before the first step. The layout is a constant one; there is a sink for
+    each image leaf. `switch` is called when the row after the last one of a half has been started; `seal`, if given,
+    with the offset of each committed row, and `alone=True` if no state follows it. Raises SpaceError if the layout has
+    more than 4,096 leaves.
     """
     if len(layout.leaves) > _MAX_LEAVES:
         raise SpaceError(

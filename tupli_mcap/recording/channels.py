@@ -36,19 +36,11 @@ def register_channels(
     cameras: Sequence[str],
     png: Collection[str],
 ) -> Channels:
-    """Adds the channels a layout needs, or finds them in a recording that is appended to.
+    """Adds the channels a layout needs to a file, or finds them in a recording that is appended to.
 
-    Args:
-        container: of the file.
-        name: of the recording, for errors.
-        layout: of its messages.
-        sub_environments: how many; None for a single environment.
-        info: schema and metadata of `/info`; None without infos.
-        cameras: names. The returned ids are those of the last one.
-        png: names of image leaves that are stored as PNG.
-
-    Raises:
-        RecordingError: a channel with one of the topics has another schema.
+    `name` is that of the recording, `sub_environments` is None for a single environment, `info` has schema and metadata
+    of `/info`; `png` names the image leaves that are stored as PNG. The returned ids of cameras are those of the last
+    one. Raises RecordingError if a channel with one of the topics has another schema.
     """
     channel, description = _Registrar(container, name).channel, layout.to_metadata()
     environments = [Topics.of(i) for i in ([None] if sub_environments is None else range(sub_environments))]

@@ -122,12 +122,8 @@ def is_ours(topic: str) -> bool:
 
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
-    """The metadata of a recording without `crc`.
-
-    Raises:
-        FormatError: they are damaged or incomplete.
-        NewerVersionError: this version of the package does not know the format.
-    """
+    """The metadata of a recording without `crc`. Raises FormatError if they are damaged or incomplete,
+    NewerVersionError if this version of the package does not know the format."""
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     check_version(metadata, source.name)
     for key, what, pattern in _VALUES:

@@ -174,12 +174,8 @@ class Frames(Sequence[Picture]):
 def gathered(parts: Iterable[tuple[Frames, Array, Array]], total: int) -> Array:
     """The frames of some steps as one column: uint8 (total, height, width, 3).
 
-    Args:
-        parts: for each episode its frames, the wanted steps as in `of_step`, and their places in the column.
-        total: length of the column.
-
-    Raises:
-        RecordingError: a frame was not recorded, or frames differ in size.
+    `parts` are, for each episode, its frames, the wanted steps as in `of_step`, and their places in the column. Raises
+    RecordingError if a frame was not recorded, or frames differ in size.
     """
     column: Array = np.empty((0, 0, 0, 3), np.uint8)
     for frames, steps, places in parts:

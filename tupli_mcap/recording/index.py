@@ -74,11 +74,7 @@ def indexed_seed(seed: int | None) -> tuple[int, int]:
 
 
 class IndexBuilder:
-    """Collects rows while recording: 96 bytes for each episode, plus its metadata text.
-
-    Args:
-        index: the episodes that there are already.
-    """
+    """Collects rows while recording, after those of `index`: 96 bytes for each episode, plus its metadata text."""
 
     def __init__(self, index: EpisodeIndex | None = None) -> None:
         self.rows = bytearray() if index is None else bytearray(index.episodes.tobytes())
@@ -219,10 +215,8 @@ def check_chunks(table: Array, end: int, name: str) -> None:
 def check_rows(table: Array, sizes: Mapping[int, tuple[int, bool]], name: str) -> None:
     """Raises FormatError unless the chunks of a file have the bytes that their rows take.
 
-    Args:
-        table: CHUNK_ROWS that `check_chunks` has checked.
-        sizes: by channel, bytes of a row, and whether this is exact or the least.
-        name: of the file.
+    `table` is one that `check_chunks` has checked; `sizes` has, by channel, the bytes of a row, and whether this is
+    exact or the least.
     """
     room = table["uncompressed"] - table["skip"]
     for channel, (size, exact) in sizes.items():
@@ -239,14 +233,10 @@ def check_rows(table: Array, sizes: Mapping[int, tuple[int, bool]], name: str) -
 def check_episodes(
     rows: Array, steps: Sequence[int], others: Mapping[str, int], name: str, *, whole: bool
 ) -> None:
-    """Raises FormatError unless the episodes lie in the rows there are, apart from each other.
+    """Raises FormatError unless the episodes (EPISODE_ROWS) lie in the rows there are, apart from each other.
 
-    Args:
-        rows: EPISODE_ROWS.
-        steps: rows of the step channel of each sub-environment.
-        others: rows of each of EPISODE_TOPICS.
-        name: of the file.
-        whole: whether each row of the step channels must belong to an episode.
+    `steps` are the rows of the step channel of each sub-environment, `others` those of each of EPISODE_TOPICS. If
+    `whole`, each row of the step channels must belong to an episode.
     """
     _check_places(rows, steps, others, name)
     held = int(rows["length"].sum())
@@ -292,14 +282,10 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
 
 
 class StepClaims:
-    """Compares the rows of a step channel with the episode index. Thread-safe.
+    """Compares the rows of the step channel of sub-environment `env` with the episode index. Thread-safe.
 
     The last rows of episodes and of chunks are compared. Such a row says how many steps of its episode came before it,
-    so this finds every wrong boundary.
-
-    Args:
-        index: EPISODE_ROWS; no two episodes share a row.
-        env: the sub-environment whose channel it is.
+    so this finds every wrong boundary. No two episodes may share a row.
     """
 
     def __init__(self, index: Array, env: int) -> None:
@@ -322,16 +308,11 @@ class StepClaims:
         return firsts, firsts + lengths - 1, numbers
 
     def check(self, first: int, count: int, numbers_at: Callable[[Array], Array], where: str) -> None:
-        """Compares the rows of a chunk with the index.
+        """Raises FormatError unless the rows of a chunk, at least one, are of the episodes and steps that the index
+        says.
 
-        Args:
-            first: the number of its first row.
-            count: how many rows it has, at least 1.
-            numbers_at: returns `episode` and `step` of some of its rows as one number (`<u8`); row 0 is the first one.
-            where: the file and the channel, for errors.
-
-        Raises:
-            FormatError: a row belongs to another episode or step.
+        `first` is the number of its first row. `numbers_at` returns `episode` and `step` of some of its rows as one
+        number (`<u8`); row 0 is the first one.
         """
         firsts, lasts, numbers = self._episodes
         begin, end = int(lasts.searchsorted(first)), int(lasts.searchsorted(first + count))

@@ -93,13 +93,8 @@ class Signed(NamedTuple):
 def voucher(signature: bytes, digest: str, where: str) -> trust.TrustedKey | None:
     """The trusted key that signed an environment; None if there is none. Only the manifest is checked.
 
-    Args:
-        signature: the attachment's bytes.
-        digest: computed from the environment that would be rebuilt.
-        where: the file, for errors.
-
-    Raises:
-        MissingExtraError: a trusted key would have to be checked, and the extra `sign` is not installed.
+    `signature` is the attachment, `digest` computed from the environment that would be rebuilt. Raises
+    MissingExtraError if a trusted key would have to be checked, and the extra `sign` is not installed.
     """
     try:
         signed = Signed.decode(signature, where)

@@ -133,10 +133,8 @@ def flatten_space(
 ) -> list[Leaf]:
     """The leaves of `space` in its own order; `root` is "state", "action" or "reward".
 
-    With `images`, uint8 leaves of shape H x W x 1|3|4 become image leaves.
-
-    Raises:
-        SpaceError: a space of another class, or a dtype no message can hold, with the leaf's path.
+    With `images`, uint8 leaves of shape H x W x 1|3|4 become image leaves. Raises SpaceError, with the leaf's path, for
+    a space of another class, or a dtype no message can hold.
     """
 
     def walk(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str) -> Iterator[Leaf]:

@@ -20,12 +20,8 @@ _QUALITY: Final = 90
 
 
 def check_format(name: str) -> FrameFormat:
-    """The name of a format of frames, checked.
-
-    Raises:
-        RecordingError: it is neither "png" nor "jpeg".
-        MissingExtraError: Pillow is not installed.
-    """
+    """The name of a format of frames. Raises RecordingError if it is neither "png" nor "jpeg", MissingExtraError if
+    Pillow is not installed."""
     if name not in ("png", "jpeg"):
         raise RecordingError(f"frame_format: expected 'png' or 'jpeg', found {name!r:.40}")
     pillow()
@@ -33,12 +29,8 @@ def check_format(name: str) -> FrameFormat:
 
 
 def check_image_format(name: str) -> None:
-    """Checks the name of a format for images of states.
-
-    Raises:
-        RecordingError: it is neither "raw" nor "png".
-        MissingExtraError: Pillow is not installed.
-    """
+    """Raises RecordingError if a format for images of states is neither "raw" nor "png", MissingExtraError if it needs
+    Pillow, which is not installed."""
     if name not in ("raw", "png"):
         raise RecordingError(f"image_format: expected 'raw' or 'png', found {name!r:.40}")
     if name == "png":
@@ -77,12 +69,8 @@ def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
 
 
 def decode_picture(data: bytes | memoryview, where: str) -> Picture:
-    """The picture in the bytes of a PNG or a JPEG.
-
-    Raises:
-        FormatError: they are neither, or claim more than 2^26 pixels.
-        MissingExtraError: Pillow is not installed.
-    """
+    """The picture in the bytes of a PNG or a JPEG. Raises FormatError if they are neither, or claim more than 2^26
+    pixels, MissingExtraError if Pillow is not installed."""
     image_module = pillow()
     try:
         with image_module.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
@@ -106,11 +94,8 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
 
 def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np.ndarray[Any, Any]:
     """The pixels of a PNG that holds 1 to `most` pictures of shape (height, width, channels), one below the other.
-
-    Raises:
-        FormatError: it is no PNG, or has another size, depth or kind.
-        MissingExtraError: Pillow is not installed.
-    """
+    Raises FormatError if it is no PNG, or has another size, depth or kind, MissingExtraError if Pillow is not
+    installed."""
     image_module = pillow()
     height, width, channels = shape
     sizes = {(width, n * height) for n in range(1, most + 1)}

@@ -25,10 +25,7 @@ def variable_dtypes(space: gym.Space[Any], values: Sequence[Any], path: str) -> 
     """Return path and dtype name of the leaves that `values` (a recording's first) need wider than declared.
 
     Each such leaf gets a warning, in which `path` names the value. Values of another structure are ignored here and
-    refused when they are stored.
-
-    Raises:
-        StepError: a leaf has values of a dtype no message can hold.
+    refused when they are stored. Raises StepError if a leaf has values of a dtype no message can hold.
     """
     declared: dict[str, DType] = {}
     found: dict[str, list[Any]] = {}

@@ -58,11 +58,8 @@ class Run(SaysWhatIsMeant):
     def given(
         cls, name: str | None, metadata: Mapping[str, Any] | None, tags: Sequence[str], split: str
     ) -> Self:
-        """A run with the parts that a user gives; paths in the metadata become texts.
-
-        Raises:
-            RecordingError: a part has another type, or JSON cannot hold it.
-        """
+        """A run with the parts that a user gives; paths in the metadata become texts. Raises RecordingError if a part
+        has another type, or JSON cannot hold it."""
         if isinstance(tags, str) or not all(isinstance(tag, str) and tag for tag in tags):
             raise RecordingError(f"tags: expected a list of words, found {tags!r:.80}")
         for what, text in (("name", name or ""), ("split", split)):

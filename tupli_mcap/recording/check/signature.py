@@ -50,11 +50,9 @@ class Signature(NamedTuple):
 
 
 def verify_signature(recording: Recording, walk: Structure | None = None) -> Signature:
-    """Checks the signature of a recording against everything it covers; reads all chunks.
+    """Checks the signature of a finished recording against everything it covers; reads all chunks.
 
-    Args:
-        recording: a finished one.
-        walk: a `Structure` of the file that has run; None to make one.
+    `walk` is a `Structure` of the file that has run, if there is one.
 
     Raises:
         SignatureError: there is none, or it does not fit; the message says what was changed.
@@ -131,11 +129,10 @@ def _channel(file: OpenFile, number: int) -> dict[str, Any]:
 
 
 def check_readers(recording: Recording, covered: Container[str], walk: Structure | None) -> None:
-    """Checks that other readers see what was hashed: they use the definitions in the chunks, the summary's indexes, or
-    the order of the file. So all of these must agree, and nothing `covered` may be there twice.
+    """Raises SignatureError unless other readers see what was hashed.
 
-    Raises:
-        SignatureError: they do not.
+    They use the definitions in the chunks, the summary's indexes, or the order of the file. So all of these must agree,
+    and nothing `covered` may be there twice.
     """
     if walk is None:
         source = recording.file.source

@@ -60,8 +60,7 @@ class _Waiting(NamedTuple):
 class Structure:
     """Walks the data section of a recording, then compares the summary and the index with it.
 
-    Args:
-        journal_lost: there is no journal with the rows that a killed writer was about to write.
+    `journal_lost`: there is no journal with the rows that a killed writer was about to write.
     """
 
     def __init__(self, source: Source, tail: Tail, findings: Findings, *, journal_lost: bool = False) -> None:

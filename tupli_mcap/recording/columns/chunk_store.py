@@ -57,11 +57,8 @@ class KeptChunk:
 
 
 class ChunkCache:
-    """The decompressed chunks of one or several stores that were used last. Thread-safe, also after a fork.
-
-    Args:
-        budget: bytes to keep; one chunk is kept even if it is larger.
-    """
+    """The decompressed chunks of one or several stores that were used last, in `budget` bytes; one chunk is kept even
+    if it is larger. Thread-safe, also after a fork."""
 
     def __init__(self, budget: int) -> None:
         self.budget = budget
@@ -135,13 +132,10 @@ def _check_sequence(sequences: Array, first: int, where: str) -> None:
 
 
 class ChunkStore:
-    """The chunks of a recording. Thread-safe. An unpickled copy (if the source can be copied) has an empty cache.
+    """The chunks of a recording (CHUNK_ROWS), and rows in memory that are in no chunk. Thread-safe.
 
-    Args:
-        source: the file.
-        table: the chunks, as CHUNK_ROWS.
-        memory: rows that are in no chunk of the file.
-        cache: the budget (bytes) of a cache of its own, or a cache that is shared with other stores.
+    `cache` is the budget (bytes) of a cache of its own, or a cache that is shared with other stores. An unpickled copy
+    (if the source can be copied) has an empty one.
     """
 
     def __init__(
@@ -225,14 +219,9 @@ class ChunkStore:
         self._held = np.zeros(len(self.table), np.bool_)
 
     def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
-        """The places of the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64), in their order.
-
-        Returns:
-            Chunks, the first row within each, and numbers of rows (int64).
-
-        Raises:
-            FormatError: the recording has no such rows.
-        """
+        """The places of the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64), in their order:
+        chunks, the first row within each, and numbers of rows (int64). Raises FormatError if the recording has no such
+        rows."""
         runs, found = [], []
         for channel in np.unique(channels).tolist():
             chosen = np.flatnonzero((channels == channel) & (counts > 0))

@@ -239,10 +239,8 @@ def describe_space(space: gym.Space[Any]) -> str:
 def space_lines(leaves: Sequence[Leaf], labels: Labels, stored: Mapping[str, DType]) -> list[str]:
     """A space in lines: one for each leaf, and below it one for each dimension if their bounds differ.
 
-    For example `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`.
-
-    Args:
-        stored: dtypes of leaves by their names, which may differ from the declared ones.
+    For example `2 numbers (float32)`, `Cart Position  -4.8 … 4.8`, `Pole Angle     -0.4189 … 0.4189`. `stored` has
+    dtypes of leaves by their names, which may differ from the declared ones.
     """
     return [line for leaf in leaves for line in _leaf_lines(leaf, labels, stored.get(leaf.name))]
 
@@ -347,11 +345,8 @@ def _channels(contents: Contents) -> list[ChannelFacts]:
 
 
 def claimed_signer(recording: Recording) -> str | None:
-    """The fingerprint of the key that a recording's signature names, unchecked; None if it is not signed.
-
-    Raises:
-        FormatError: the signature cannot be decoded.
-    """
+    """The fingerprint of the key that a recording's signature names, unchecked; None if it is not signed. Raises
+    FormatError if the signature cannot be decoded."""
     if SIGNATURE_NAME not in recording.attachments:
         return None
     signed = Signed.decode(recording.read_attachment(SIGNATURE_NAME), recording.name)

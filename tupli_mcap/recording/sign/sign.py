@@ -48,11 +48,8 @@ def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Sig
 def episodes_alike(first: Recording, second: Recording, numbers: Sequence[int], directory: Path) -> bool:
     """Whether the episodes with these numbers are equal in two recordings: steps, records, images, frames, times.
 
-    `directory` is for temporary files: the episodes are written anew, since other episodes may lie between them.
-
-    Raises:
-        FormatError: one of the recordings is damaged.
-        RecordingError: the directory cannot be written to.
+    `directory` is for temporary files: the episodes are written anew, since other episodes may lie between them. Raises
+    FormatError for a damaged recording, RecordingError if the directory cannot be written to.
     """
     manifests = []
     for recording in (first, second):
