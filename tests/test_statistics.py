@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from tupli_mcap.recording.columns.statistics import ElementStatistics, columns_of, element_bounds
 from tupli_mcap.spaces.leaves import Leaf, NameRegistry, flatten_space
+from tupli_mcap.spaces.statistics import ElementStatistics, columns_of, element_bounds
 
 
 def leaf_of(space: gym.Space[Any]) -> Leaf:

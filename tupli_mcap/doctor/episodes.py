@@ -16,9 +16,9 @@ from tupli_mcap.errors import plural
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
-from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.describe.description import state_of
 from tupli_mcap.recording.index import HAS_SEED
+from tupli_mcap.spaces.statistics import element_bounds
 
 _STARTS = 4096  # episode starts that are decoded at a time
 _DIGEST_BYTES = 16

@@ -15,8 +15,8 @@ from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, v
 from tupli_mcap.errors import plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
-from tupli_mcap.recording.columns.statistics import ElementStatistics, columns_of
 from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.statistics import ElementStatistics, columns_of
 
 Locate = Callable[[int], StepPlace]
 Role = Literal["state", "action", "reward"]

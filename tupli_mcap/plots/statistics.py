@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.recording.columns.statistics import ElementStatistics
 from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.statistics import ElementStatistics
 
 LARGEST = 1e150  # values of larger size are not drawn: their differences are too large for a float
 _TINY = 1e-300  # a part of a smaller value may be 0

@@ -12,8 +12,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.messages.shared_dtypes import field_leaves
-from tupli_mcap.recording.columns.statistics import ElementStatistics
 from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.statistics import ElementStatistics
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset

@@ -5,5 +5,4 @@ runs           finds the chunks that hold rows
 gather         copies rows of chunks into columns, from one file or many, on a few threads
 read           columns of one recording; a handle to its step chunks
 fields         the names of columns; columns that are found by name
-statistics     statistics of a leaf's values
 """

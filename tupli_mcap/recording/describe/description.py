@@ -18,13 +18,13 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
-from tupli_mcap.recording.columns.statistics import element_bounds
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.describe.series import sampled_infos
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.spaces.labels import Labels, element_names, short_path
 from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.statistics import element_bounds
 
 _MOST_BOUNDS = 16  # dimensions of a leaf whose bounds get a line each
 
