@@ -118,16 +118,13 @@ def find_key(text: str) -> trust.TrustedKey:
     if text.startswith("ssh-") or "-----BEGIN" in text:
         return read_public_key(text)
     path = Path(text)
-    if not _is_path(text) or not path.is_file():
+    is_path = not _FINGERPRINT.match(text) and (text.endswith(".pub") or os.sep in text)
+    if not is_path or not path.is_file():
         raise NotFoundError(
             f"there is no trusted key {text!r} and no file of that name; `tupli-mcap trust --key FILE.pub --name NAME` "
             "adds one (a file is given as FILE.pub or ./FILE)"
         )
     return read_public_key(_read(path).decode("utf-8", "replace"), str(path))
-
-
-def _is_path(text: str) -> bool:
-    return not _FINGERPRINT.match(text) and (text.endswith(".pub") or os.sep in text)
 
 
 def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def add_fields(source: Source, layout: StepLayout, leaves: Sequence[Leaf], root:
 def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: Packed) -> None:
     nbytes = leaf.size * dtype.itemsize
     if leaf.kind == "scalar" and dtype.kind in "iu":
-        exact = source.bind("exact", _exact_int(leaf, dtype))
+        exact = source.bind("exact", lambda value: int(exact_array(value, dtype, leaf.shape, leaf.path)))
         kind = source.bind("kind", dtype.type)
         source.lines.append(
             f"if {value}.__class__ is not {kind} and {value}.__class__ is not int: {value} = {exact}({value})"
@@ -112,8 +113,9 @@ def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, pac
     else:
         kind, shape = source.bind("dtype", dtype), source.bind("shape", leaf.shape)
         raw = f"{value}b"
+        plainly = partial(exact_array, dtype=dtype, shape=leaf.shape, path=leaf.path)
         large, is_bool = nbytes >= _LARGE, dtype.kind == "b"
-        exact = source.bind("exact", _exact_plain(leaf, dtype) if large else _exact_bytes(leaf, dtype))
+        exact = source.bind("exact", plainly if large else _exact_bytes(leaf, dtype))
         fast = value if large else f"{value}.tobytes()"
         # exactly this class: the bytes of a subclass may mean something else, as those of a masked array do
         plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
@@ -148,10 +150,6 @@ def flag_check(source: Source, name: str) -> str:
     )
 
 
-def _exact_int(leaf: Leaf, dtype: DType) -> Callable[[Any], int]:
-    return lambda value: int(exact_array(value, dtype, leaf.shape, leaf.path))
-
-
 def _exact_float(leaf: Leaf) -> Callable[[Any], float]:
     dtype = np.dtype(np.float64)
 
@@ -167,7 +165,3 @@ def _exact_float(leaf: Leaf) -> Callable[[Any], float]:
 
 def _exact_bytes(leaf: Leaf, dtype: DType) -> Callable[[Any], bytes]:
     return lambda value: exact_array(value, dtype, leaf.shape, leaf.path).tobytes()
-
-
-def _exact_plain(leaf: Leaf, dtype: DType) -> Callable[[Any], np.ndarray[Any, Any]]:
-    return lambda value: exact_array(value, dtype, leaf.shape, leaf.path)

@@ -104,10 +104,11 @@ def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES
         return measured
     _add_infos(recording, measured)
     labels = recording.labels
-    measured.seeds, measured.step_seconds = _seeds(recording, positions), labels.step_seconds
+    seeds, measured.step_seconds = recording.seeds, labels.step_seconds
+    measured.seeds = sorted({seed for i in positions.tolist() if (seed := seeds[i]) is not None})
     most = read_bytes // step_bytes(layout, images=False)
     chosen = _random_episodes(positions, rows["length"].astype(np.int64), most)
-    measured.read_episodes = int((recording.index["length"][chosen] > 0).sum())
+    measured.read_episodes = len(chosen)
     columns, measured.read_steps = _read(recording, chosen, most)
     measured.states, measured.actions, measured.rewards = (
         [LeafValues(leaf, labels, columns.pop(leaf.name, None)) for leaf in leaves]
@@ -188,12 +189,6 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     measured.info_steps, measured.read_infos = channel.messages, each * places
     with np.errstate(invalid="ignore"):
         measured.numbers |= {key: total / count for key, (total, count) in sums.items()}
-
-
-def _seeds(recording: Recording, positions: Array) -> list[int]:
-    """The different seeds."""
-    seeds = recording.seeds
-    return sorted({seed for i in positions.tolist() if (seed := seeds[i]) is not None})
 
 
 def _random_episodes(positions: Array, lengths: Array, most: int) -> Array:

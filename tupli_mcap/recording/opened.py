@@ -51,7 +51,6 @@ from tupli_mcap.recording.index import (
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, voucher
 from tupli_mcap.remote import is_url
 from tupli_mcap.spaces.labels import LABELS_NAME, MAX_LABELS, Labels
-from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.trust import TrustedKey, is_trusted
 
 CACHE_BYTES = 512 << 20
@@ -195,7 +194,11 @@ class OpenedRecording:
         if layout.constant:
             size = layout.step_message.record_size
         else:  # at least
-            size = BODY + 10 + sum(_stored_bytes(layout, leaf) for leaf in layout.step_leaves)
+            least = (
+                1 if leaf.kind == "variable" else leaf.size * layout.dtypes[leaf.name].itemsize
+                for leaf in layout.step_leaves
+            )
+            size = BODY + 10 + sum(least)
         sizes = dict.fromkeys(self._step_channels, (size, layout.constant))
         if layout.constant and FINAL_STATE in self._topics:
             sizes[self._topics[FINAL_STATE]] = (layout.final_message.record_size, True)
@@ -333,11 +336,6 @@ class OpenedRecording:
     def close(self) -> None:
         """Closes the file; what was read stays valid."""
         self._source.close()
-
-
-def _stored_bytes(layout: StepLayout, leaf: Leaf) -> int:
-    """Bytes that a leaf takes at least in a message."""
-    return 1 if leaf.kind == "variable" else leaf.size * layout.dtypes[leaf.name].itemsize
 
 
 def _spaces_of(channel: Channel) -> dict[str, str]:

@@ -373,15 +373,11 @@ def _expression(filter: BaseFilter, outer: bool = True) -> str:
         return text if outer else f"({text})"
     name = f"F({json.dumps(filter.key, ensure_ascii=False)})"
     if filter.type is FilterType.IN:
-        return f"{name}.isin({_values(filter.value)})"
+        return f"{name}.isin([{', '.join(map(_value, filter.value))}])"
     if filter.type is FilterType.CONTAINS:
         return f"{name}.contains({_value(filter.value)})"
     text = f"{name} {_SYMBOL[filter.type]} {_value(filter.value)}"
     return text if outer else f"({text})"
-
-
-def _values(values: Sequence[Any]) -> str:
-    return "[" + ", ".join(_value(item) for item in values) + "]"
 
 
 def _value(value: Any) -> str:

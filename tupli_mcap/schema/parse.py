@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import ast
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
@@ -43,7 +42,6 @@ from tupli_mcap.schema.filters import (
     FilterType,
     path_of,
 )
-from tupli_mcap.schema.values import tag_float
 
 _MAX_PARENTHESES: Final = 64
 _TOKEN: Final = re.compile(
@@ -279,10 +277,4 @@ def format_key(path: Sequence[str]) -> str:
 
 
 def _format_value(value: Any) -> str:
-    if isinstance(value, float):
-        return repr(value) if isinstance(tag_float(value), float) else _spell(value)
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _spell(value: float) -> str:
-    return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

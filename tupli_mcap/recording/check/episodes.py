@@ -101,6 +101,7 @@ class _Checker:
             known[i] = False
         steps = rows - np.where(known, firsts[at] if len(firsts) else 0, 0)
         last = known & (steps == (lengths[at] if len(firsts) else 0) - 1)
+        ends = np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
         checks = {
             "has the number of another episode": known
             & (facts.episode != (episodes["episode"][at] if len(episodes) else 0)),
@@ -108,7 +109,7 @@ class _Checker:
             "has a flag that is neither 0 nor 1": (facts.terminal > 1) | (facts.timeout > 1),
             "ends its episode before its last step": known & ~last & ((facts.terminal | facts.timeout) != 0),
             "has flags that differ from the end of its episode": last
-            & (_end_of(facts) != (episodes["end"][at] if len(episodes) else 0)),
+            & (ends != (episodes["end"][at] if len(episodes) else 0)),
         }
         for what, wrong in checks.items():
             for i in np.flatnonzero(wrong)[:3].tolist():
@@ -308,8 +309,3 @@ class _Checker:
             elif step <= last.get(number, -1):
                 self._error("info", f"row {row} is the second info of its step, or out of order", **place)
             last[number] = step
-
-
-def _end_of(facts: StepFacts) -> Array:
-    """How each row would end its episode, from its flags."""
-    return np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))

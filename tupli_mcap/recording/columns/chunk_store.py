@@ -157,16 +157,13 @@ class ChunkStore:
         for channel in np.unique(table["channel"]):
             chosen = np.flatnonzero(table["channel"] == channel)
             chosen = chosen[np.argsort(table["first"][chosen], kind="stable")]
-            self._check_chain(chosen, int(channel))
+            ends = np.cumsum(table["rows"][chosen], dtype=np.uint64)
+            if (table["first"][chosen] != ends - table["rows"][chosen]).any():
+                raise FormatError(
+                    f"{self.name}: the chunks of channel {channel} do not hold its rows without gaps"
+                )
             self._by_channel[int(channel)] = (chosen, table["first"][chosen].astype(np.int64))
             self._counts[int(channel)] = int(table["rows"][chosen].sum())
-
-    def _check_chain(self, chosen: np.ndarray[Any, Any], channel: int) -> None:
-        ends = np.cumsum(self.table["rows"][chosen], dtype=np.uint64)
-        if (self.table["first"][chosen] != ends - self.table["rows"][chosen]).any():
-            raise FormatError(
-                f"{self._source.name}: the chunks of channel {channel} do not hold its rows without gaps"
-            )
 
     @property
     def name(self) -> str:

@@ -354,19 +354,15 @@ def put(column: Any, places: slice | Array, values: Any) -> None:
 
 def _items_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     """A dtype of the same row in which a field of several numbers is one item of bytes, which NumPy copies faster."""
-    fields = [(name, *found[:2]) for name, found in (dtype.fields or {}).items()]
+    fields: Mapping[str, Any] = dtype.fields or {}
     spec: Any = {
-        "names": [name for name, _, _ in fields],
-        "formats": [_item_format(field) for _, field, _ in fields],
-        "offsets": [offset for _, _, offset in fields],
+        "names": list(fields),
+        "formats": [f"V{of.itemsize}" if of.shape and _LITTLE else of for of, *_ in fields.values()],
+        "offsets": [offset for _, offset, *_ in fields.values()],
         "itemsize": dtype.itemsize,
     }
     made: np.dtype[Any] = np.dtype(spec)
     return made
-
-
-def _item_format(field: np.dtype[Any]) -> Any:
-    return np.dtype(f"V{field.itemsize}") if field.shape and _LITTLE else field
 
 
 def _as_items(column: Array) -> Array:
