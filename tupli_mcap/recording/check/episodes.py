@@ -70,7 +70,7 @@ class _Checker:
         for i in np.flatnonzero(begins != expected).tolist():
             where, until = int(expected[i]), int(begins[i])
             self._error("rows", f"rows {where} to {until} belong to no episode", channel=topic)
-        if (firsts != expected[:-1]).any():
+        if (firsts != expected[:-1]).any() or not len(episodes):
             return  # otherwise every later episode would be reported
         sums = np.zeros(len(episodes))
         row = 0
@@ -95,21 +95,19 @@ class _Checker:
     ) -> None:
         rows = row + np.arange(len(facts.episode))
         at = np.searchsorted(firsts, rows, side="right") - 1
-        known = (at >= 0) & (rows < firsts[at] + lengths[at]) if len(firsts) else np.zeros(len(rows), bool)
+        known = (at >= 0) & (rows < firsts[at] + lengths[at])
         for i, why in facts.bad.items():
             self._error("rows", f"row {row + i} cannot be decoded: {why}", channel=topic)
             known[i] = False
-        steps = rows - np.where(known, firsts[at] if len(firsts) else 0, 0)
-        last = known & (steps == (lengths[at] if len(firsts) else 0) - 1)
+        steps = rows - np.where(known, firsts[at], 0)
+        last = known & (steps == lengths[at] - 1)
         ends = np.where(facts.terminal != 0, TERMINAL, np.where(facts.timeout != 0, TIMEOUT, INTERRUPTED))
         checks = {
-            "has the number of another episode": known
-            & (facts.episode != (episodes["episode"][at] if len(episodes) else 0)),
+            "has the number of another episode": known & (facts.episode != episodes["episode"][at]),
             "has a step that does not follow the one before": known & (facts.step != steps),
             "has a flag that is neither 0 nor 1": (facts.terminal > 1) | (facts.timeout > 1),
             "ends its episode before its last step": known & ~last & ((facts.terminal | facts.timeout) != 0),
-            "has flags that differ from the end of its episode": last
-            & (ends != (episodes["end"][at] if len(episodes) else 0)),
+            "has flags that differ from the end of its episode": last & (ends != episodes["end"][at]),
         }
         for what, wrong in checks.items():
             for i in np.flatnonzero(wrong)[:3].tolist():
