@@ -28,13 +28,6 @@ __all__ = [
     "StorageError",
     "TupliError",
     "UntrustedError",
-    "brief",
-    "install_line",
-    "memory_for",
-    "missing_extra",
-    "os_reason",
-    "plural",
-    "warn",
 ]
 
 _SPACE = "free some space there, or choose another disk"
