@@ -55,15 +55,13 @@ class StepLayout:
         inner_dtypes: Mapping[str, Mapping[str, str]] | None = None,
         stacks: Collection[Stack] = (),
     ) -> None:
-        observation_space, action_space = own_space(observation_space), own_space(action_space)
+        self.observation_space, self.action_space = own_space(observation_space), own_space(action_space)
         self.inner_dtypes = {name: dict(found) for name, found in (inner_dtypes or {}).items() if found}
-        self.observation_space = observation_space
-        self.action_space = action_space
         self.reward_space = reward_space
         names = NameRegistry(_RESERVED)
         reward = reward_space if reward_space is not None else gym.spaces.Box(-np.inf, np.inf, (), np.float64)
-        self.state = flatten_space(observation_space, "state", names, images=True)
-        self.action = flatten_space(action_space, "action", names)
+        self.state = flatten_space(self.observation_space, "state", names, images=True)
+        self.action = flatten_space(self.action_space, "action", names)
         self.reward = flatten_space(reward, "reward", names)
         given = dict(dtypes or {})
         self.dtypes: dict[str, DType] = {
@@ -75,8 +73,8 @@ class StepLayout:
             )
         self.state = [_as_stored(leaf, self.dtypes.get(leaf.name), stacks) for leaf in self.state]
         self.stacks = [stack_of(leaf) for leaf in self.state if leaf.kind == "stack"]
-        self.nest_state = structure(observation_space)
-        self.nest_action = structure(action_space)
+        self.nest_state = structure(self.observation_space)
+        self.nest_action = structure(self.action_space)
         self.nest_reward = structure(reward)
 
     def without(self, fields: Collection[str]) -> StepLayout:
