@@ -15,12 +15,9 @@ A filter is true or false for an item (nested mappings of JSON values), never un
   none of them. GT, GEQ, LT and LEQ are false for lists.
 - A mapping, also one in a list, is EQ to nothing, and so NE to everything. A filter cannot compare with a mapping or a
   list.
-- **CONTAINS** is true for a text that contains its value, a text; A to Z equal a to z there. It is true for a list if
-it
-  is true for one of its elements, and false for anything else.
-- **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is
-  false.
-
+- **CONTAINS** is true for a text that contains its value, a text; A to Z equal a to z there. It is true for a list
+  if it is true for one of its elements, and false for anything else.
+- **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is false.
 - **Times** (`created_at`, and an episode's `ended`, which is the same) compare as times of any zone: see
   `tupli_mcap.schema.times`.
 
