@@ -17,7 +17,8 @@ from sample_spaces import COMPOSITE_SPACES, FUNDAMENTAL_SPACES, SPACES, space_id
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.spaces.space_json import MAX_DEPTH, space_from_json, space_to_json
+from tupli_mcap.spaces.leaves import MAX_DEPTH
+from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 # Those of Gymnasium 1.0 sample in the order in which a set happens to be.
 TEXTS_ARE_ORDERED = list(spaces.Text(1).character_list) == sorted(spaces.Text(1).character_set)

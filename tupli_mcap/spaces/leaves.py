@@ -38,7 +38,7 @@ ROS_TYPES: dict[str, str] = {
 
 _CONSTANT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _VARIABLE = (spaces.Text, spaces.Sequence, spaces.Graph, spaces.OneOf)
-_MAX_DEPTH = 64
+MAX_DEPTH = 64  # of nested spaces
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ def flatten_space(
     """
 
     def walk(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str) -> Iterator[Leaf]:
-        if len(keys) > _MAX_DEPTH:
-            raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
+        if len(keys) > MAX_DEPTH:
+            raise SpaceError(f"{path}: a space nested more than {MAX_DEPTH} deep cannot be recorded")
         if type(space) in (spaces.Dict, spaces.Tuple):
             for key, sub in subspaces(space):
                 yield from walk(sub, (*keys, key), f"{path}[{key!r}]", f"{name}_{key}")

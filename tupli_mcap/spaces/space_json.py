@@ -17,12 +17,9 @@ from gymnasium import spaces
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, SpaceError
-from tupli_mcap.spaces.leaves import ROS_TYPES
+from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES
 
 Json = dict[str, Any]
-
-MAX_DEPTH = 64
-"""Deepest nesting of spaces."""
 
 # of all leaves together: a space holds its bounds in memory, and a file only claims its size
 _MAX_ELEMENTS = 2**26

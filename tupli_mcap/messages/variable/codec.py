@@ -49,9 +49,8 @@ from tupli_mcap.messages.variable.nested_codecs import (
     with_dummy,
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
-from tupli_mcap.spaces.leaves import ROS_TYPES, NameRegistry, camel, subspaces
+from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES, NameRegistry, camel, subspaces
 
-_MAX_DEPTH = 64
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _DUMMY = "structure_needs_at_least_one_member"  # ROS 2's own name for this field
 
@@ -231,5 +230,5 @@ class _Builder:
 
 
 def _check_depth(path: str, depth: int) -> None:
-    if depth > _MAX_DEPTH:
-        raise SpaceError(f"{path}: a space nested more than {_MAX_DEPTH} deep cannot be recorded")
+    if depth > MAX_DEPTH:
+        raise SpaceError(f"{path}: a space nested more than {MAX_DEPTH} deep cannot be recorded")
