@@ -38,15 +38,13 @@ class _Pair:
         pictures, pairs = (self._store.count(channel) for channel in self._channels)
         if pictures != pairs and self._recording.complete:
             self._error(f"expected {pairs} frames, found {pictures}", self._picture_topic)
+        topic = self._pair_topic
         try:
             times = self._pairs(self._channels[1])
-        except FormatError as err:
-            self._error(str(err), self._pair_topic)
-            return
-        try:
+            topic = self._picture_topic
             self._pictures(self._channels[0], times)
         except FormatError as err:
-            self._error(str(err), self._picture_topic)
+            self._error(str(err), topic)
 
     def _pairs(self, channel: int) -> Array:
         """Checks the rows of `/frame`; returns their times (int64, ns)."""
