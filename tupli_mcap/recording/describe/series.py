@@ -71,8 +71,8 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
     rows = recording.index[positions]
     courses = tuple(
         found
-        for name, column in (("return", "return"), ("length", "length"))
-        if (found := _course(name, rows[column].astype(np.float64), points)) is not None
+        for name in ("return", "length")
+        if (found := _course(name, rows[name].astype(np.float64), points)) is not None
     )
     if not recording.num_envs or recording.path is None or not rows["length"].sum():
         return Sketch(courses, (), 0, 0)
@@ -158,14 +158,10 @@ def _consecutive(recording: Recording, positions: Array, begin: int, stop: int) 
     lengths = recording.index["length"][positions].astype(np.int64)
     ends = np.cumsum(lengths)
     first, last = np.searchsorted(ends, [begin, stop - 1], side="right").tolist()
-    start, end = begin - int(ends[first] - lengths[first]), stop - int(ends[last] - lengths[last])
-    if first == last:
-        yield recording.read_steps(int(positions[first]), start, end, _FIELDS, images=False)
-        return
-    yield recording.read_steps(int(positions[first]), start, int(lengths[first]), _FIELDS, images=False)
-    if last > first + 1:
-        yield recording.read(positions[first + 1 : last], fields=_FIELDS, images=False)
-    yield recording.read_steps(int(positions[last]), 0, end, _FIELDS, images=False)
+    for i in range(first, last + 1):
+        length, before = int(lengths[i]), int(ends[i] - lengths[i])
+        start, end = max(begin - before, 0), min(stop - before, length)
+        yield recording.read_steps(int(positions[i]), start, end, _FIELDS, images=False)
 
 
 def _distributions(
