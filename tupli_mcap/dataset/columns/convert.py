@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tupli_mcap.arrays import arrays_at
 from tupli_mcap.dataset.columns.load import Selected
 from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items.steps import map_arrays, pick
@@ -98,16 +99,8 @@ def _cells(column: Any, rows: int) -> Any:
         return column
     cells = np.empty(rows, object)
     for i in range(rows):
-        cells[i] = _value(column, i)
+        cells[i] = arrays_at(column, i)
     return cells
-
-
-def _value(column: Any, row: int) -> Any:
-    if isinstance(column, dict):
-        return {key: _value(part, row) for key, part in column.items()}
-    if isinstance(column, tuple):
-        return tuple(_value(part, row) for part in column)
-    return column[row]
 
 
 # ---- parsers: columns of steps as the arrays of a library

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
@@ -46,10 +46,8 @@ class Samples(Sequence[dict[str, Any]]):
             return [self[k] for k in range(*i.indices(self._size))]
         if not -self._size <= i < self._size:
             raise IndexError(f"expected a sample from 0 to {self._size - 1}, found {i}")
-        return {name: _sample(column, i) for name, column in self.batch.items()}
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (self[i] for i in range(self._size))
+        sample: dict[str, Any] = arrays_at(self.batch, i)
+        return sample
 
 
 class Items(ABC, Generic[T]):
@@ -200,11 +198,3 @@ class StepItems(Items[T]):
     def _episodes(self, steps: Array) -> Array:
         """The places of the steps' episodes in the query."""
         return self._episode_ends.searchsorted(steps, side="right")
-
-
-def _sample(column: Any, i: int) -> Any:
-    if isinstance(column, Mapping):
-        return {key: _sample(part, i) for key, part in column.items()}
-    if isinstance(column, tuple):
-        return tuple(_sample(part, i) for part in column)
-    return column[i]

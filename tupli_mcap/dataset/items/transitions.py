@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.dataset.items.beside import BESIDE
 from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
@@ -87,7 +87,7 @@ class Transitions(StepItems[Transition]):
             )
 
     def _one(self, item: int) -> Transition:
-        return Transition(**{name: _first(part) for name, part in self._read(np.array([item])).items()})
+        return Transition(**arrays_at(self._read(np.array([item])), 0))
 
     def _batch(self, items: Array) -> Transition:
         return Transition(**self._read(items))
@@ -155,10 +155,3 @@ def _isin(rows: Array, ascending: Array) -> Array:
         return np.zeros(len(rows), np.bool_)
     is_in: Array = ascending[np.minimum(ascending.searchsorted(rows), len(ascending) - 1)] == rows
     return is_in
-
-
-def _first(column: Any) -> Any:
-    """The only row of a column."""
-    if isinstance(column, dict):
-        return {key: _first(part) for key, part in column.items()}
-    return tuple(_first(part) for part in column) if isinstance(column, tuple) else column[0]
