@@ -5,7 +5,7 @@ beside                         steps with infos and frames; infos as columns
 recorded, index, kept          reads steps from recordings; finds their chunks; caches decoded columns
 items                          the base of windows, transitions and delta windows
 windows, transitions, deltas   the three kinds of items
-order, draws, sumtree          numbers of items: each once an epoch, or drawn by weight
+order, draws                   numbers of items: each once an epoch, or drawn by weight
 shuffle                        an order that reads each chunk about once, also over workers and ranks
 batches                        reads items in batches, also ahead
 """
