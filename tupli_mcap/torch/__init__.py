@@ -1,8 +1,8 @@
 """Datasets for PyTorch's DataLoader over windows, transitions and episodes; `torch` in here is PyTorch itself.
 
 mapped, stream         items by number, for any sampler; batches in a shuffled order
-items, episodes        windows, transitions and whole episodes as tensors
-tensors, packed        columns as tensors; a batch from a worker to the loader
+items, packed          columns as tensors; a batch from a worker to the loader
+episodes               whole episodes as items
 rl, d3rlpy             for TorchRL; for d3rlpy"""
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ except ImportError as err:
     raise missing_extra("tupli_mcap.torch needs PyTorch", "torch") from err
 
 from tupli_mcap.torch.episodes import Episodes
-from tupli_mcap.torch.items import WORKER_CACHE_BYTES
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, collate, tensors
 from tupli_mcap.torch.mapped import MapDataset
 from tupli_mcap.torch.stream import StreamDataset
-from tupli_mcap.torch.tensors import collate, tensors
 
 __all__ = [
     "WORKER_CACHE_BYTES",

@@ -1,4 +1,9 @@
-"""Items (windows, transitions, episodes) as tensors, and the state dicts of datasets of them."""
+"""Items (windows, transitions, episodes) as tensors, batches of them, and the state dicts of datasets of them.
+
+A tensor has the recorded dtype, float16, bool and all integers too, and shares the memory of its array. PyTorch
+computes little with uint16, uint32 and uint64: convert those with `.to(torch.int64)` (uint64 from 2**63 on does not
+fit). Values that differ in size (texts, graphs) stay a list.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +11,13 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from torch.utils.data import get_worker_info
+import numpy as np
+import torch
+from torch.utils.data import default_collate, get_worker_info
 
-from tupli_mcap.dataset.items import Items, SamplingError
+from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.packed import packed
-from tupli_mcap.torch.tensors import tensors
 
 WORKER_CACHE_BYTES = 64 << 20
 
@@ -55,3 +61,24 @@ def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
     for name, value in expected.items():
         if state[name] != value:
             raise SamplingError(f"expected a state dict with {name}={value!r}, found {state[name]!r:.80}")
+
+
+def tensors(column: Any) -> Any:
+    """The column with a tensor in place of each array and number, nested in the same way; lists stay lists."""
+    if isinstance(column, np.ndarray):
+        return torch.from_numpy(column)
+    if isinstance(column, Mapping):
+        return {key: tensors(part) for key, part in column.items()}
+    if isinstance(column, tuple):
+        return tuple(tensors(part) for part in column)
+    return torch.from_numpy(np.asarray(column)) if isinstance(column, np.generic) else column
+
+
+def collate(samples: Any) -> Any:
+    """The `collate_fn` for a DataLoader: a batch that was read together is passed on without a copy.
+
+    Anything else is collated by PyTorch's own function.
+    """
+    if isinstance(samples, Samples):
+        return tensors(samples.batch)
+    return samples if isinstance(samples, dict) else default_collate(samples)

@@ -12,8 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.errors import did_you_mean
-from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
-from tupli_mcap.torch.tensors import collate
+from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state, collate
 
 # The further arguments of windows (True) and of transitions.
 _OF_ITEMS: Final = {True: ("stride", "pad", "history"), False: ("n_step", "discount")}

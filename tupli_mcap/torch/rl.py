@@ -10,8 +10,7 @@ import torch
 from tupli_mcap.dataset.items import SamplingError, Transitions
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import missing_extra
-from tupli_mcap.torch.items import check_state
-from tupli_mcap.torch.tensors import tensors
+from tupli_mcap.torch.items import check_state, tensors
 
 try:
     from tensordict import NonTensorStack, TensorDict
