@@ -2,7 +2,7 @@
 
 client, people, recordings    `TupliAPIClient`: the methods of a storage, for people, and for recordings
 session, answers, tokens      signed-in requests; their answers and errors; the user's tokens
-outbox, waiting               recordings that are written on this machine first, and sent in the background
+outbox                        recordings that are written on this machine first, and sent in the background
 upload                        sending one recording
 """
 

@@ -27,13 +27,20 @@ from typing import Final, NamedTuple
 import platformdirs
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, TupliError, warn
-from tupli_mcap.mcap.lock import LockedError, writers_kept_out
-from tupli_mcap.recording import Recording, journal_path, rewrite_recording
+from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
+from tupli_mcap.mcap.lock import LockedError, is_locked, writers_kept_out
+from tupli_mcap.mcap.records import has_summary
+from tupli_mcap.mcap.source import PathSource
+from tupli_mcap.recording import (
+    Recording,
+    finish_recording,
+    journal_path,
+    recover_recording,
+    rewrite_recording,
+)
 from tupli_mcap.storage.api.answers import ConflictError, SignInError, UnreachableError
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
-from tupli_mcap.storage.api.waiting import finished, note, numbers_of, sent_before, state_of
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.base import new_name
 from tupli_mcap.storage.catalog.entries import rows_of
@@ -109,7 +116,7 @@ class Outbox:
         found = []
         for path in self._paths():
             with contextlib.suppress(FileNotFoundError):
-                found.append(Waiting(path, path.stat().st_size, state_of(path)))
+                found.append(Waiting(path, path.stat().st_size, _state_of(path)))
         return found
 
     def waiting_elsewhere(self) -> dict[tuple[str, str], int]:
@@ -205,12 +212,12 @@ class Outbox:
             raise SignInError(f"{path} is of {self._identity[1] or 'nobody'}, who is not signed in any more")
         with self._alone[path]:
             while path.exists():
-                state = state_of(path)
+                state = _state_of(path)
                 if state == "recording":
                     self._send_ended(path)
                     return
                 if state == "unfinished":
-                    path = finished(path)
+                    path = _finished(path)
                 try:
                     with writers_kept_out(path):
                         self._send_whole(path, tell)
@@ -222,7 +229,7 @@ class Outbox:
                         raise
 
     def _send_whole(self, path: Path, tell: Tell) -> None:
-        before = sent_before(path)
+        before = _sent_before(path)
         with Recording(path) as recording:
             if len(recording):
                 try:
@@ -230,9 +237,9 @@ class Outbox:
                 except ConflictError:  # some of what was sent is not here any more
                     if not before:
                         raise
-                    self._send_part(path, recording, numbers_of(recording, before))
+                    self._send_part(path, recording, _numbers_of(recording, before))
         try:
-            for gone in (path, journal_path(path), note(path)):
+            for gone in (path, journal_path(path), _note(path)):
                 gone.unlink(missing_ok=True)
         except OSError as err:
             warn(f"{path} was sent, and cannot be deleted here: {err}", RuntimeWarning)
@@ -242,7 +249,7 @@ class Outbox:
         with Recording(path) as recording:
             ended = {row.episode for row in rows_of(recording, Sidecar(), live=True)}
             new = []
-            for number in numbers_of(recording, sent_before(path)):
+            for number in _numbers_of(recording, _sent_before(path)):
                 if number not in ended:
                     break
                 new.append(number)
@@ -254,7 +261,7 @@ class Outbox:
         with files.private_directory(path.parent, shown=path) as directory:
             rewrite_recording(recording, directory / path.name, episodes=numbers)
             send_file(self._session, directory / path.name)
-        files.write_bytes(note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
+        files.write_bytes(_note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
 
     def _send_at_exit(self, process: int) -> None:
         """At exit, sends what the program has recorded; the next program sends the rest."""
@@ -276,3 +283,62 @@ def _data_dir() -> Path:
     override = os.environ.get(_DATA_VARIABLE)
     found = Path(override) if override else platformdirs.user_data_path("tupli-mcap", appauthor=False)
     return found.absolute()
+
+
+# ---- the files of waiting recordings
+
+
+def _state_of(path: Path) -> str:
+    """`recording` while somebody writes to it, else `finished` or `unfinished`."""
+    with contextlib.suppress(RecordingError, FormatError):  # where it is gone on with at this moment
+        source = PathSource(path)
+        try:
+            if has_summary(source):
+                return "finished"
+        finally:
+            source.close()
+    return "recording" if is_locked(path) else "unfinished"
+
+
+def _numbers_of(recording: Recording, first: int) -> list[int]:
+    """The numbers of the episodes from `first` on."""
+    return sorted(number for number in recording.index["episode"].tolist() if number >= first)
+
+
+def _finished(path: Path) -> Path:
+    """Finishes the recording of a killed process; returns the path of the file to send.
+
+    Raises:
+        RecordingError, FormatError: nothing of it can be saved.
+    """
+    try:
+        finish_recording(path)
+        return path
+    except (RecordingError, FormatError) as err:
+        if is_locked(path):  # another process is at it
+            return path
+        report = recover_recording(path, overwrite=True)
+        if report.target is None or not report.saved:
+            raise RecordingError(f"{path}: nothing of it can be saved; delete it") from err
+    saved, damaged = Path(report.target), path.parents[1] / "damaged" / path.parent.name
+    damaged.mkdir(parents=True, exist_ok=True, mode=0o700)
+    moved = {_note(path): _note(saved)} | {each: damaged / each.name for each in (journal_path(path), path)}
+    for each, goal in moved.items():
+        with contextlib.suppress(FileNotFoundError):
+            each.replace(goal)
+    told = f"{path} was damaged: what could be saved of it is sent, the original is kept in {damaged}"
+    warn(told, RuntimeWarning)
+    return saved
+
+
+def _note(path: Path) -> Path:
+    """The path of the note of how many episodes of a recording were sent."""
+    return path.with_name(f"{path.name}.sent")
+
+
+def _sent_before(path: Path) -> int:
+    """The first episode of a recording that was not sent yet."""
+    try:
+        return int(json.loads(_note(path).read_bytes())["sent_before"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0
