@@ -79,6 +79,7 @@ class RecordedEpisode:
         self._number = number
         self._rows = np.arange(buffer.firsts[number], buffer.firsts[number] + buffer.sizes[number])
         self.terminated = bool(buffer.terminated[number])
+        self.observation_signature, self.action_signature, self.reward_signature = buffer.signatures
 
     @property
     def observations(self) -> Any:
@@ -94,18 +95,6 @@ class RecordedEpisode:
     def rewards(self) -> Array:
         """(L, 1), float32."""
         return self._buffer.rewards[self._rows]
-
-    @property
-    def observation_signature(self) -> Signature:
-        return self._buffer.signatures[0]
-
-    @property
-    def action_signature(self) -> Signature:
-        return self._buffer.signatures[1]
-
-    @property
-    def reward_signature(self) -> Signature:
-        return self._buffer.signatures[2]
 
     def size(self) -> int:
         return len(self._rows)
@@ -145,9 +134,6 @@ class _Episodes(Sequence[RecordedEpisode]):
         if isinstance(i, slice):
             return [self[k] for k in range(*i.indices(len(self)))]
         return RecordedEpisode(self._buffer, range(len(self))[i])
-
-    def __iter__(self) -> Iterator[RecordedEpisode]:
-        return (self[i] for i in range(len(self)))
 
 
 class RecordedBuffer:
