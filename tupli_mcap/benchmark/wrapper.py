@@ -30,24 +30,10 @@ __all__ = ["DeletedBenchmark", "TupliEnvWrapper"]
 
 # Not `journal_dir`: a storage finds a recording that is being written by the journal beside it.
 _RECORDING_OPTIONS = (
-    "record_info",
-    "step_callback",
-    "reward_space",
-    "compression",
-    "chunk_size",
-    "flush_seconds",
-    "durability",
-    "frames",
-    "frame_format",
-    "image_format",
-    "max_bytes",
-    "max_seconds",
-    "name",
-    "metadata",
-    "tags",
-    "split",
+    "record_info", "step_callback", "reward_space", "compression", "chunk_size", "flush_seconds", "durability",
+    "frames", "frame_format", "image_format", "max_bytes", "max_seconds", "name", "metadata", "tags", "split",
     "capture",
-)
+)  # fmt: skip
 
 
 class DeletedBenchmark(NamedTuple):
@@ -229,10 +215,8 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return {**self.__dict__, "_path": None}
 
     def _open(self) -> RecordEpisodes:
-        if self.id is None:
-            raise StorageError("this environment is not stored yet: call store(name=...) first")
         with self.storage.beginning_recording():
-            recorder = self._begin(self.id)
+            recorder = self._begin(self._stored_id())
         recorder.rotation.beginning = self.storage.beginning_recording
         recorder.rotation.finished = self._ingest
         return recorder
