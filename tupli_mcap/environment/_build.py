@@ -7,7 +7,7 @@ import copy
 import platform
 import sys
 from collections.abc import Mapping
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
@@ -71,7 +71,7 @@ def build(
     if spec is not None and window and not trusted:
         spec = {**spec, "kwargs": {k: v for k, v in spec["kwargs"].items() if k != "render_mode"}}
     try:
-        env = _unpickle(record) if spec is None else make_from_spec(spec, render_mode)
+        env = load(record.pickle or b"") if spec is None else make_from_spec(spec, render_mode)
     except (Exception, SystemExit) as err:
         made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
         raise TupliError(
@@ -194,7 +194,3 @@ def reasons_for_distrust(record: EnvironmentRecord) -> list[str]:
     size = len(record.pickle)
     said = f" (it says: {', '.join(record.classes)[:300]})" if record.classes else ""
     return [f"{size} bytes of pickled Python code with SHA-256 {sha256(record.pickle)}{said}"]
-
-
-def _unpickle(record: EnvironmentRecord) -> gym.Env[Any, Any]:
-    return cast("gym.Env[Any, Any]", load(record.pickle or b""))

@@ -24,11 +24,7 @@ class _Argument(NamedTuple):
     name: str
 
 
-class _Computed:
-    """An attribute is given a value that the code does not show."""
-
-
-_COMPUTED = _Computed()
+_COMPUTED = object()  # in place of a value that the code does not show
 
 
 def is_changed(obj: Any, arguments: Mapping[str, Any]) -> bool:
