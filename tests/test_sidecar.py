@@ -22,7 +22,7 @@ from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.bundles import bundle_recording
 from tupli_mcap.storage.listing import compactable, list_recordings
 from tupli_mcap.storage.sidecar import Deletion, Sidecar, sidecar_path
-from tupli_mcap.storage.verify import verify_storage
+from tupli_mcap.storage.verify import verify_paths
 from tupli_mcap.wrappers import RecordEpisodes
 
 
@@ -123,12 +123,12 @@ class TestAReplacedRecording:
 
     def test_is_told_by_verify(self, storage: FileStorage, run: Path) -> None:
         delete(storage, 0)
-        (report,) = verify_storage(storage).files
+        (report,) = verify_paths([storage.root])
         assert report.problems == []
         record(run, 3)
-        found = verify_storage(storage)
-        (problem,) = found.files[0].problems
-        assert found.ok
+        (report,) = verify_paths([storage.root])
+        (problem,) = report.problems
+        assert report.ok
         assert problem.kind == "leftover"
         assert "run.mcap.json is about another recording" in str(problem)
         assert numbers(storage) == [0, 1, 2]

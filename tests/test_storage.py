@@ -60,7 +60,7 @@ from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.exchange import copy_episodes
 from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
-from tupli_mcap.storage.verify import verify_storage
+from tupli_mcap.storage.verify import verify_paths
 from tupli_mcap.wrappers import RecordEpisodes
 
 BAD_IDS = [
@@ -600,7 +600,7 @@ class TestFileStorage(StorageContract):
             listed = list_recordings([root])
             of_files = TupliDataset.from_files(sorted(root.rglob("*.mcap")))
             assert len(left) == sum(item.episodes for item in listed) == len(of_files.preview())
-            assert all(report.ok for report in verify_storage(root).files)
+            assert all(report.ok for report in verify_paths([root]))
             assert state_of(root) == before
             seen.add(len(left))
             assert not left & {h.id for h in doomed} if len(left) == 2 else len(left) == 6
@@ -762,7 +762,7 @@ class TestFileStorage(StorageContract):
             assert other.count_episodes(F("n_tuples") > 0) == 2
             other.reindex()
             assert other.count_episodes() == 2
-        verify_storage(storage.root)
+        list(verify_paths([storage.root]))
         assert state_of(storage.root) == before
         assert victim.exists()
 
@@ -898,7 +898,7 @@ class TestFileStorage(StorageContract):
         assert other.load_benchmark(header.id).metadata == edited.metadata
         copied = copy_episodes(storage, FileStorage(tmp_path / "third"), benchmark_id=header.id)
         assert copied[header.id].episodes == 1
-        assert verify_storage(other.root).ok
+        assert all(report.ok for report in verify_paths([other.root]))
         document = json.loads((storage.root / "benchmarks" / f"{header.id}.json").read_text())
         validator("benchmark.schema.json").validate(document)
         assert storage.undo_benchmark_edit(header.id, dry_run=True).metadata.name == "cart pole"

@@ -46,7 +46,7 @@ from tupli_mcap.recording import VerifyReport
 from tupli_mcap.recording.edit import assemble, rewrite
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
-from tupli_mcap.storage.verify import verify_paths, verify_storage
+from tupli_mcap.storage.verify import verify_paths
 
 _IN_JOURNAL = "steps that are still in its journal are not verified"
 DO_NOT_CARE = (Opcode.HEADER,)  # the text that says which library wrote it
@@ -380,15 +380,14 @@ def storage_at(root: Path) -> FileStorage:
 
 def test_a_storage(tmp_path: Path) -> None:
     with storage_at(tmp_path / "lab") as storage:
-        report = verify_storage(storage)
-    assert report.ok
-    assert [item.problems for item in report.files] == [[], [], []]
-    assert [item.kind for item in report.files] == ["recording", "recording", "storage"]
+        reports = list(verify_paths([storage.root]))
+    assert [report.problems for report in reports] == [[], [], []]
+    assert [report.kind for report in reports] == ["recording", "recording", "storage"]
 
 
 def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
     root = tmp_path / "lab"
-    with storage_at(root) as storage:
+    with storage_at(root):
         artifact = next(path for path in (root / "artifacts").iterdir() if len(path.name) == 64)
         artifact.write_bytes(b"other")
         flip(root / "recordings" / "one.mcap", 2000)
@@ -396,18 +395,18 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
         (root / "recordings" / f".tupli-mcap-{32 * '0'}.tmp").write_bytes(b"x")
         notes = {"version": 1, "uuid": Recording(root / "recordings" / "two.mcap").uuid, "deleted": [77]}
         (root / "recordings" / "two.mcap.json").write_text(json.dumps(notes))
-        report = verify_storage(storage)
+        reports = list(verify_paths([root]))
         (root / "recordings" / "two.mcap.json").write_text("nonsense")
-        again = verify_storage(storage)
-    one, two, other = report.files
-    assert [item.ok for item in report.files] == [False, True, False]
+        again = list(verify_paths([root]))
+    one, two, other = reports
+    assert [report.ok for report in reports] == [False, True, False]
     assert one.path.endswith("one.mcap")
     assert "notes episodes that are not in the recording: [77]" in said(two)
     assert {problem.kind for problem in other.problems} == {"artifact", "leftover"}
     assert "has bytes with SHA-256" in said(other)
     assert "gone.mcap.journal is the journal of a recording that is not here" in said(other)
     assert "was left by a process that was killed" in said(other)
-    assert kinds(again.files[1]) == {"sidecar"}
+    assert kinds(again[1]) == {"sidecar"}
 
 
 def test_a_plain_directory_and_several_paths(tmp_path: Path) -> None:

@@ -61,25 +61,29 @@ def verify(
     replays = _Replays(trust, episodes, filter_of(filter_text)) if replay else None
     if replays is None and (trust or episodes is not None or filter_text is not None):
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
-    from tupli_mcap.storage.verify import StorageReport, verify_paths
+    from tupli_mcap.storage.verify import verify_paths
 
     addresses = {shown_name(path): path for path in paths if is_url(path)}
-    storage_report = StorageReport()
+    reports: list[VerifyReport] = []
     for report in verify_paths(paths):
-        storage_report.files.append(report)
+        reports.append(report)
         if not as_json:
             _print_verified(report)
         if replays is not None and report.kind == "recording" and report.ok:
             replays.add(addresses.get(report.path, report.path), quiet=as_json)
-    if not storage_report.files:
+    if not reports:
         raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
+    damaged = sum(not report.ok for report in reports)
     if as_json:
-        print_json({**storage_report.to_json(), "replays": None if replays is None else replays.to_json()})
-    elif len(storage_report.files) > 1:
-        say(f"{number(len(storage_report.files))} verified, {number(len(storage_report.damaged))} damaged")
+        told: dict[str, Any] = {"ok": not damaged, "files": len(reports), "damaged": damaged}
+        told["reports"] = [report.to_json() for report in reports]
+        told["replays"] = None if replays is None else replays.to_json()
+        print_json(told)
+    elif len(reports) > 1:
+        say(f"{number(len(reports))} verified, {number(damaged)} damaged")
     if replays is not None and not replays.tried and not as_json:
         fail("no episode was run again: no undamaged recording has such an episode")
-    if not storage_report.ok or (replays is not None and not replays.ok):
+    if damaged or (replays is not None and not replays.ok):
         raise typer.Exit(1)
 
 

@@ -6,9 +6,7 @@ import contextlib
 import hashlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, RecordingError, TupliError
@@ -19,46 +17,13 @@ from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.remote import copied, is_server, is_url, matching, shown
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.bundles import carried_benchmark
-from tupli_mcap.storage.files import FileStorage
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
-from tupli_mcap.storage.listing import is_storage, scan
+from tupli_mcap.storage.listing import find_recordings, is_storage
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
 
-__all__ = ["StorageReport", "verify_paths", "verify_storage"]
-
-
-@dataclass
-class StorageReport:
-    """The result of verifying: a report for each recording, and one (kind "storage") for each storage's other files."""
-
-    files: list[VerifyReport] = field(default_factory=list)
-
-    @property
-    def damaged(self) -> list[VerifyReport]:
-        """The reports with damage."""
-        return [report for report in self.files if not report.ok]
-
-    @property
-    def ok(self) -> bool:
-        """Whether there is no damage."""
-        return not self.damaged
-
-    def to_json(self) -> dict[str, Any]:
-        """The report as a JSON value."""
-        return {
-            "ok": self.ok,
-            "files": len(self.files),
-            "damaged": len(self.damaged),
-            "reports": [report.to_json() for report in self.files],
-        }
-
-
-def verify_storage(storage: FileStorage | Path) -> StorageReport:
-    """Verifies all recordings of a storage (or any directory), its artifacts, benchmarks and notes."""
-    root = storage.root if isinstance(storage, FileStorage) else storage
-    return StorageReport(list(verify_paths([root])))
+__all__ = ["verify_paths"]
 
 
 def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
@@ -74,18 +39,11 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
         path = Path(given)
         if path.is_dir():
             try:
-                items = sorted(scan(path))
-            except (OSError, TupliError) as err:
-                report = VerifyReport(str(path), kind="storage")
-                message, _, advice = str(err).removeprefix(f"{path}: ").partition("; ")
-                if isinstance(err, OSError):
-                    message = f"it cannot be read: {err.strerror}"
-                    advice = "check the directory's permissions"
-                Findings(report).error("file", message, advice=advice)
-                yield report
+                found = find_recordings(path)
+            except TupliError as err:
+                yield _refused(VerifyReport(str(path), kind="storage"), err, "check the directory")
                 continue
-            for item in items:
-                yield _recording(path / item.relative)
+            yield from map(_recording, found)
             yield from _directory(path)
         else:
             yield _recording(path)
@@ -112,10 +70,16 @@ def _at_url(url: str) -> VerifyReport:
         with copied(url) as path:
             report = _recording(path)
     except TupliError as err:
-        report = VerifyReport(shown(url))
-        message, _, advice = str(err).removeprefix(f"{shown(url)} ").partition("; ")
-        Findings(report).error("file", message, advice=advice or "check the address")
+        report = _refused(VerifyReport(shown(url)), err, "check the address")
     report.path = shown(url)
+    return report
+
+
+def _refused(report: VerifyReport, err: Exception, advice: str) -> VerifyReport:
+    """The report on what cannot be read; `advice` is given if the error gives none."""
+    message = str(err).removeprefix(f"{report.path}: ").removeprefix(f"{report.path} ")
+    message, _, told = message.partition("; ")
+    Findings(report).error("file", message, advice=told or advice)
     return report
 
 
@@ -130,10 +94,7 @@ def _recording(path: Path) -> VerifyReport:
                 _sidecar(path, findings)
                 _benchmark(path, findings)
     except (TupliError, OSError) as err:
-        message, _, advice = str(err).removeprefix(f"{path}: ").removeprefix(f"{path} ").partition("; ")
-        Findings(report).error(
-            "file", message, advice=advice or "give a recording (.mcap) or a directory of them"
-        )
+        _refused(report, err, "give a recording (.mcap) or a directory of them")
     return report
 
 
