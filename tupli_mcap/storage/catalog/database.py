@@ -60,7 +60,7 @@ class Database:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._engine = _engine(path, lock=_lock_file(path))
+        self._engine = _engine(path, guarded=True)
         self._alone = Lock(path.with_name(f"{path.name}.sync.lock"))
         self._lock = threading.Lock()
         self._process = os.getpid()
@@ -86,7 +86,7 @@ class Database:
 
     def replace(self) -> None:
         """Put an empty catalog in the file's place."""
-        with self._lock, _translated(self.path), _usable(self.path), _exclusive(self.path):
+        with self._lock, _translated(self.path), _usable(self.path), _guard(self.path):
             self._create()
 
     @contextlib.contextmanager
@@ -177,7 +177,7 @@ class Database:
 
     def _make(self) -> None:
         """Make the catalog, unless another process is first."""
-        with _exclusive(self.path):
+        with _guard(self.path):
             engine = _engine(self.path)
             try:
                 is_there = _is_catalog(engine, self.path)
@@ -243,7 +243,7 @@ class MemoryDatabase:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Keep out the other threads; reentrant in a thread."""
+        """As `Database.alone`, for threads."""
         self._leave_parent()
         with self._turn:
             yield
@@ -282,15 +282,15 @@ class MemoryDatabase:
             self._is_made = False
 
 
-def _engine(path: Path, *, lock: Path | None = None) -> Engine:
-    """An engine for a file; each connection is opened while the file is kept from being replaced by `lock`."""
+def _engine(path: Path, *, guarded: bool = False) -> Engine:
+    """An engine for a file; if it is guarded, nobody replaces the file while a connection is opened."""
     # A file that is deleted meanwhile must not come back, empty, without the lock of those who make one.
     uri = f"file:{quote(str(path))}?mode=rw"
     engine = _prepared(create_engine(URL.create("sqlite", database=uri, query={"uri": "true"})))
 
     @event.listens_for(engine, "do_connect")
     def _connect(dialect: Dialect, _: object, args: Any, kwargs: Any) -> Any:
-        with contextlib.nullcontext() if lock is None else _shared(lock):
+        with _guard(path, exclusive=False) if guarded else contextlib.nullcontext():
             connection: Any = dialect.connect(*args, **kwargs)
             try:
                 # Opens SQLite's files beside this one, by name: later it might find those of a new file instead.
@@ -340,7 +340,7 @@ def _is_catalog(engine: Engine, path: Path) -> bool:
             schema = {tuple(row) for row in connection.exec_driver_sql(_SCHEMA)}
             return (application, version, schema) == (APPLICATION_ID, VERSION, _our_schema())
     except DBAPIError as err:
-        if _is_damage(err) or not path.exists():
+        if _has_code(err, _DAMAGED) or not path.exists():
             return False
         raise
 
@@ -386,24 +386,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def _lock_file(path: Path) -> Path:
-    return path.with_name(f"{path.name}.lock")
-
-
 @contextlib.contextmanager
-def _exclusive(path: Path) -> Iterator[None]:
-    """Hold the lock for creating or replacing the file."""
-    file = locked(_lock_file(path))
-    try:
-        yield
-    finally:
-        drop_private(file)
-
-
-@contextlib.contextmanager
-def _shared(lock: Path) -> Iterator[None]:
-    """Keep others from replacing the file."""
-    file = locked(lock, exclusive=False)
+def _guard(path: Path, *, exclusive: bool = True) -> Iterator[None]:
+    """Hold the lock for creating or replacing the file; if not `exclusive`, keep others from it."""
+    file = locked(path.with_name(f"{path.name}.lock"), exclusive=exclusive)
     try:
         yield
     finally:
@@ -426,7 +412,7 @@ def _translated(path: Path | None) -> Iterator[None]:
     try:
         yield
     except DBAPIError as err:
-        if _is_damage(err):
+        if _has_code(err, _DAMAGED):
             raise CatalogDamagedError(
                 f"{named} is damaged ({err.orig}); delete it, it is rebuilt from the recordings"
             ) from err
@@ -436,10 +422,6 @@ def _translated(path: Path | None) -> Iterator[None]:
         raise StorageError(f"{named} cannot be used: {err}") from err
     except sqlite3.Error as err:  # of a connection that is used as it is
         raise CatalogUnusableError(f"{named} cannot be used: {err}") from err
-
-
-def _is_damage(err: DBAPIError) -> bool:
-    return _has_code(err, _DAMAGED)
 
 
 def _has_code(err: DBAPIError, codes: Sequence[int]) -> bool:
