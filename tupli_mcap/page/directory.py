@@ -154,7 +154,7 @@ class FileShelf(_OpenToAll):
             return
         with entry_of(self._path.parent, name) as entry:
             put_entry(self._catalog, name, entry)
-        self._known = None if entry.live else entry.stamp
+        self._known = entry.stamp
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
         return _opened(self._opened, self._path.parent, recording, self.path_of(recording), of)

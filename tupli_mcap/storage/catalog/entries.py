@@ -25,14 +25,12 @@ class Entry(NamedTuple):
     """A recording to catalogue.
 
     Attributes:
-        stamp: of the file, taken before it was read.
-        live: somebody writes to it.
+        stamp: of the file, taken before it was read; while somebody writes to it, it says that it must be read again.
         runs: JSON of a list.
         numbers: of all its episodes, deleted ones too.
     """
 
     stamp: RecordingStamp
-    live: bool
     uuid: str
     benchmark_id: str
     runs: str
@@ -53,14 +51,15 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
         live |= is_locked(path)  # again, since a writer may have begun or ended in the meantime
         numbers = recording.index["episode"].tolist()
         rows = rows_of(recording, notes.about(recording.metadata), live=live)
-        yield Entry(stamp, live, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
+        stamp = stamp._replace(mixed=LIVE) if live else stamp
+        yield Entry(stamp, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
 
 
 def put_entry(catalog: Catalog, relative: str, entry: Entry) -> None:
-    """Catalogues a recording; while somebody writes to it, its stamp says that it must be read again."""
+    """Catalogues a recording."""
     catalog.put_recording(
         relative,
-        entry.stamp._replace(mixed=LIVE) if entry.live else entry.stamp,
+        entry.stamp,
         uuid=entry.uuid,
         benchmark_id=entry.benchmark_id,
         runs=entry.runs,
