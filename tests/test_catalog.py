@@ -37,7 +37,7 @@ from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
 from tupli_mcap.storage.catalog.place import catalog_path
-from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, find_episodes
+from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, declared_keys, find_episodes
 from tupli_mcap.storage.catalog.tables import FLAGGED_KEYS, LAST_EPISODE, RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.texts import escape_text, unescape_text
@@ -550,11 +550,11 @@ class TestDeclaredKeys:
             catalog.declare_key("metadata.score")
             catalog.declare_key("metadata.x.y")
         with Catalog(catalog.path) as again:
-            assert again.declared_keys() == ["metadata.score", "metadata.x.y"]
+            assert again.ask(declared_keys) == ["metadata.score", "metadata.x.y"]
             assert "ix_value" in again.explain(F("metadata.score") == 1)
             again.declare_key("benchmark_id")  # indexed as it is
             assert again.count(F("benchmark_id") == "b") == 1
-        assert catalog.declared_keys()[-1] == "benchmark_id"
+        assert catalog.ask(declared_keys)[-1] == "benchmark_id"
 
     @pytest.mark.parametrize(
         ("key", "message"),
@@ -567,7 +567,7 @@ class TestDeclaredKeys:
     def test_keys_that_cannot_be_declared(self, catalog: Catalog, key: str, message: str) -> None:
         with pytest.raises(FilterError, match=message):
             catalog.declare_key(key)
-        assert catalog.declared_keys() == []
+        assert catalog.ask(declared_keys) == []
 
     @settings(max_examples=60, deadline=None)
     @given(st.text(max_size=6))
@@ -577,7 +577,7 @@ class TestDeclaredKeys:
             put(catalog, rows=[row(0, {name: 3}), row(1, {name + "x": 3})])
             assert catalog.count(wanted) == 1
             catalog.declare_key(F("metadata", name).key)
-            assert catalog.declared_keys() == [F("metadata", name).key]
+            assert catalog.ask(declared_keys) == [F("metadata", name).key]
             assert "ix_value" in catalog.explain(wanted)
             assert catalog.count(wanted) == 1
 
@@ -876,7 +876,7 @@ class TestSharing:
         with Catalog(path) as catalog:
             assert len(catalog.recordings()) == 40
             assert catalog.count() == 800
-            assert sorted(catalog.declared_keys()) == [f"metadata.score{n}" for n in range(3)]
+            assert sorted(catalog.ask(declared_keys)) == [f"metadata.score{n}" for n in range(3)]
 
     @pytest.mark.parametrize("in_memory", [False, True])
     def test_several_threads(self, tmp_path: Path, in_memory: bool) -> None:

@@ -64,7 +64,7 @@ class Catalog:
 
     @property
     def identity(self) -> int:
-        """A number that identifies the file of the last transaction, among all that were at its path."""
+        """Tells the file of the last transaction from all others that were at its path."""
         return self._database.identity
 
     def is_current(self) -> bool:
@@ -118,13 +118,10 @@ class Catalog:
         rows: Iterable[EpisodeRow],
         runs: str = "[{}]",
     ) -> None:
-        """Catalogue a recording in one transaction; it replaces its earlier entry.
-
-        `runs` is JSON: a list of its episodes' runs. `rows` is consumed a chunk at a time while the catalog
-        is locked for other writers.
+        """Catalogue a recording, see `queries.put_recording`. `rows` is consumed a chunk at a time while the catalog is
+        locked for other writers.
 
         Raises:
-            FormatError: A row's metadata is not a strict JSON object.
             StorageError: Two rows have one episode number, or SQLite refuses.
         """
         remaining = iter(rows)
@@ -141,23 +138,19 @@ class Catalog:
             )
 
     def remove_recording(self, relpath: str) -> None:
-        """Forget a recording and its episodes; nothing happens if it is not catalogued."""
+        """See `queries.remove_recording`."""
         with self._write() as connection:
             queries.remove_recording(connection, relpath)
 
     def episodes(
         self, filter: BaseFilter | str | None = None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
-        """The episodes that match a filter, ordered by recording (path) and episode number.
-
-        Raises:
-            FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be.
-        """
+        """See `queries.find_episodes`."""
         with self._read() as connection:
             return list(queries.find_episodes(connection, filter, limit=limit, offset=offset))
 
     def count(self, filter: BaseFilter | str | None = None) -> int:
-        """The number of episodes that match a filter. Raises as `episodes` does."""
+        """See `queries.count_episodes`."""
         with self._read() as connection:
             return queries.count_episodes(connection, filter)
 
@@ -167,23 +160,14 @@ class Catalog:
             return question(connection)
 
     def explain(self, filter: BaseFilter | str | None) -> str:
-        """The SQL of a filter, its parameters, SQLite's plan for it, and whether Python checks the result again."""
+        """See `queries.plan_of`."""
         with self._read() as connection:
             return queries.plan_of(connection, filter)
 
     def declare_key(self, key: str) -> None:
-        """Index a key, so that filters on it find few episodes among many; declaring it twice is fine.
-
-        Raises:
-            FilterError: There is no such top-level key, or it is that of all metadata.
-        """
+        """See `queries.declare_key`."""
         with self._write() as connection:
             queries.declare_key(connection, key)
-
-    def declared_keys(self) -> list[str]:
-        """The declared keys, in the order of their declaration."""
-        with self._read() as connection:
-            return queries.declared_keys(connection)
 
     def _read(self) -> AbstractContextManager[Connection]:
         return self._database.transaction()

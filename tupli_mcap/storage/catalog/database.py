@@ -266,7 +266,7 @@ class MemoryDatabase:
 
     @property
     def identity(self) -> int:
-        """A number that identifies the database of the last transaction, among those before it."""
+        """As `Database.identity`."""
         return self._opened
 
     def is_current(self) -> bool:
