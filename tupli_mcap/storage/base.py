@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import itertools
+import re
 import secrets
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -38,6 +39,7 @@ __all__ = [
     "check_page",
     "each_opened",
     "episode_id",
+    "is_episode_id",
     "new_name",
     "oldest_first",
     "published_in",
@@ -52,6 +54,7 @@ TupliStorageError = StorageError
 LOCAL_USER = "local_storage"
 """The creator of all items in a directory; also the only group that sees them."""
 _ATTEMPTS = 5
+_EPISODE_ID = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 _MOST_IDS = 10_000  # in one filter; a server takes twice as many
 _T = TypeVar("_T")
 _Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
@@ -340,6 +343,11 @@ def published_in(groups: Sequence[str], group: str) -> list[str]:
 def episode_id(uuid: str, episode: int) -> str:
     """The id of an episode: its recording's UUID and its number."""
     return f"{uuid}-{episode}"
+
+
+def is_episode_id(uri: object) -> bool:
+    """Whether a value has the form of such an id."""
+    return isinstance(uri, str) and _EPISODE_ID.fullmatch(uri) is not None
 
 
 def uuid_of(header: EpisodeHeader) -> str:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import re
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
@@ -33,7 +32,7 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, published_in
+from tupli_mcap.storage.base import TupliStorage, is_episode_id, published_in
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
@@ -42,7 +41,6 @@ from tupli_mcap.storage.texts import is_hash
 __all__ = ["TupliAPIClient"]
 
 _Model = TypeVar("_Model", bound=BaseModel)
-_EPISODE_ID: Final = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 
 
 class TupliAPIClient(People, Recordings, TupliStorage):
@@ -318,7 +316,7 @@ def _hash(uri: str, kind: str) -> str:
 
 
 def _episode(uri: str) -> str:
-    if not isinstance(uri, str) or not _EPISODE_ID.fullmatch(uri):
+    if not is_episode_id(uri):
         raise _unknown("episode", uri)
     return uri
 

@@ -43,7 +43,7 @@ class ArtifactFiles:
         return item
 
     def load(self, uri: str) -> bytes:
-        path = self._find(uri)
+        path = self.path(uri)
         with os_errors("cannot read the artifact", path):
             data = path.read_bytes()
         if sha256(data) != uri:
@@ -52,12 +52,8 @@ class ArtifactFiles:
             )
         return data
 
-    def demand(self, uri: str) -> None:
-        """Raises NotFoundError if there is no such artifact."""
-        self._find(uri)
-
     def item(self, uri: str) -> ArtifactMetadataItem:
-        self._find(uri)
+        self.path(uri)
         return self._read(self._sidecar(uri))
 
     def list(self, filter: BaseFilter | str | None) -> list[ArtifactMetadataItem]:
@@ -72,7 +68,7 @@ class ArtifactFiles:
 
     def delete(self, uri: str) -> None:
         with self._lock:
-            path = self._find(uri)
+            path = self.path(uri)
             with os_errors("cannot delete the artifact", path):
                 self._sidecar(uri).unlink(missing_ok=True)
                 path.unlink(missing_ok=True)
@@ -84,7 +80,8 @@ class ArtifactFiles:
             with os_errors("cannot publish the artifact", self._sidecar(uri)):
                 self._write(self._sidecar(uri), item.model_copy(update={"published_in": groups}))
 
-    def _find(self, uri: str) -> Path:
+    def path(self, uri: str) -> Path:
+        """The file of an artifact; raises NotFoundError if there is none."""
         path = self._directory / uri if is_hash(uri) else None
         if path is None or not path.is_file():
             raise NotFoundError(

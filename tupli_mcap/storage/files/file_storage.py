@@ -171,7 +171,7 @@ class FileStorage(TupliStorage):
         return self._artifacts.list(filter)
 
     def artifact_users(self, uri: str) -> list[str]:
-        self._artifacts.demand(uri)
+        self._artifacts.path(uri)  # is there one?
         return [
             header.id for header in self.list_benchmarks() if uri in self._benchmarks.artifacts(header.id)
         ]

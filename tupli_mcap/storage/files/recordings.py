@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import re
 import stat
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -17,14 +16,19 @@ from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, episode_id, new_name, published_in, uuid_of
+from tupli_mcap.storage.base import (
+    LOCAL_USER,
+    episode_id,
+    is_episode_id,
+    new_name,
+    published_in,
+    uuid_of,
+)
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
 __all__ = ["RecordingFiles"]
-
-_EPISODE_ID = re.compile(r"([0-9a-f]{32})-(0|[1-9][0-9]{0,9})\Z")
 
 
 class RecordingFiles:
@@ -39,18 +43,14 @@ class RecordingFiles:
         self._catalog = catalog
 
     def new_path(self, benchmark_id: str, name: str) -> Path:
-        """A unique path below the benchmark's directory: time (UTC), name and random digits."""
+        """See `TupliStorage.new_recording_path`."""
         directory = self._root / "recordings" / benchmark_id
         with os_errors("cannot make the directory", directory):
             directory.mkdir(parents=True, exist_ok=True)
         return directory / new_name(name)
 
     def path(self, recording: str) -> Path:
-        """The file of a catalogued recording.
-
-        Raises:
-            NotFoundError: There is none with this path, or it is not below the root.
-        """
+        """See `FileStorage.recording_path`."""
         if not isinstance(recording, str):
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
@@ -84,8 +84,7 @@ class RecordingFiles:
         Raises:
             NotFoundError: There is no such episode.
         """
-        match = _EPISODE_ID.match(uri) if isinstance(uri, str) else None
-        if match:
+        if is_episode_id(uri):
             # The catalog may be out of date, so only the place of the episode is taken from it.
             found = self._catalog.known(FilterEQ(key="id", value=uri), limit=1)
             if found and self._holds(found[0]):
@@ -136,11 +135,7 @@ class RecordingFiles:
             sidecar.write(path)  # the next query notices
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> int:
-        """Delete episodes, all of them or none: by notes beside their recordings; recordings without other episodes
-        are removed.
-
-        Returns the number of episodes that were still there.
-        """
+        """Delete episodes, all or none, and recordings that have no others; returns how many were still there."""
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
             by_recording.setdefault((header.recording, uuid_of(header)), set()).add(header.episode)
@@ -190,7 +185,7 @@ class RecordingFiles:
         return doomed
 
     def deleted(self, only: Collection[str] | None = None) -> list[str]:
-        """The ids of the episodes that are deleted and still in their recordings, or `only` in those at these paths."""
+        """See `FileStorage.deleted_episodes`."""
         found = []
         for path in self._paths(only):
             notes = Notes.read(path, self._root)
@@ -203,7 +198,7 @@ class RecordingFiles:
         return found
 
     def restore(self, ids: Collection[str], only: Collection[str] | None = None) -> int:
-        """Restore deleted episodes, `only` in recordings at these paths below the root; returns their number."""
+        """See `FileStorage.restore_episodes`."""
         restored = 0
         with self._lock:
             self._finish_deletion()
@@ -284,11 +279,7 @@ class RecordingFiles:
                 directory.rmdir()
 
     def compact(self, only: Collection[str] | None = None) -> int:
-        """Rewrite the recordings that hold deleted episodes, and remove the temporary files of killed processes;
-        returns the number of bytes that this freed. `only`: the recordings at these paths below the root.
-
-        Recordings that are being written stay unchanged. Episodes that stay keep their ids.
-        """
+        """See `FileStorage.compact`."""
         freed = files.remove_left(files.left_below(self._root))
         with self._lock:
             self._finish_deletion()
