@@ -21,6 +21,7 @@ from tupli_mcap.storage.texts import is_hash
 
 __all__ = [
     "BenchmarkContent",
+    "attachments_of",
     "benchmark_entry",
     "benchmark_hash",
     "declared_spaces",
@@ -186,9 +187,15 @@ def recording_attachments(serialized: str) -> dict[str, tuple[str, bytes]]:
         record = unpack(serialized).record
     except FormatError:
         return {}
-    attachments = {DOCUMENT_NAME: ("application/json", record.to_json())}
+    too_large = record.pickle is not None and len(record.pickle) > _MOST_PICKLE
+    return {} if too_large else attachments_of(record)
+
+
+def attachments_of(
+    record: EnvironmentRecord, entry: Mapping[str, Any] | None = None
+) -> dict[str, tuple[str, bytes]]:
+    """An environment as attachments; `entry` replaces its `benchmark` entry."""
+    attachments = {DOCUMENT_NAME: ("application/json", record.to_json(entry))}
     if record.pickle is not None:
-        if len(record.pickle) > _MOST_PICKLE:
-            return {}
         attachments[PICKLE_NAME] = ("application/octet-stream", record.pickle)
     return attachments

@@ -23,7 +23,6 @@ from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     DOCUMENT_NAME,
-    PICKLE_NAME,
     artifacts_of,
     benchmark_hash,
     header_of,
@@ -43,10 +42,7 @@ def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
             f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so it has no benchmark to import; "
             "copy it into the storage's directory, where its episodes are found"
         )
-    pickle = recording.read_attachment(PICKLE_NAME) if PICKLE_NAME in recording.attachments else None
-    return EnvironmentRecord.from_json(
-        recording.read_attachment(DOCUMENT_NAME), pickle, where=f"{path}: {DOCUMENT_NAME}"
-    )
+    return recording.benchmark.record
 
 
 def carried_benchmark(

@@ -26,8 +26,8 @@ from tupli_mcap.storage.base import LOCAL_USER, anew, each_opened
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     DOCUMENT_NAME,
-    PICKLE_NAME,
     artifacts_of,
+    attachments_of,
     benchmark_entry,
     benchmark_hash,
     declared_spaces,
@@ -169,9 +169,7 @@ def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
         **(content.record.benchmark or {}),
         "artifact_metadata": {uri: plain(listed[0]) for uri, listed in items.items() if listed},
     }
-    attachments = {DOCUMENT_NAME: ("application/json", content.record.to_json(entry))}
-    if content.record.pickle is not None:
-        attachments[PICKLE_NAME] = ("application/octet-stream", content.record.pickle)
+    attachments = attachments_of(content.record, entry)
     for uri in content.artifacts:
         attachments[ARTIFACT_PREFIX + uri] = ("application/octet-stream", storage.load_artifact(uri))
     return attachments
