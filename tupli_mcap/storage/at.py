@@ -26,16 +26,12 @@ def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
     if not isinstance(place, str | os.PathLike) or not os.fspath(place):
         raise StorageError(f"expected a storage, or the path of its directory, found {place!r:.80}")
     name = os.fspath(place)
-    if glob.has_magic(name) or name.endswith(".mcap"):
-        raise StorageError(
-            f"expected the directory of a storage, found {shown(name)!r:.80}; recordings are opened with "
-            "tupli_mcap.open(...)"
-        )
-    if name.startswith(("http://", "https://")):
+    of_recordings = glob.has_magic(name) or name.endswith(".mcap")
+    if name.startswith(("http://", "https://")) and not of_recordings:
         return TupliAPIClient(name)
-    if is_url(name):
+    if is_url(name) or of_recordings:
         raise StorageError(
-            f"expected the directory of a storage or the address of a server, found {shown(name)!r:.80}; "
+            f"expected the directory of a storage, found {shown(name)!r:.80}, which is no address of a server either; "
             "recordings are opened with tupli_mcap.open(...)"
         )
     return FileStorage(Path(place).expanduser())
