@@ -81,11 +81,7 @@ class SyncedCatalog:
         return self._settled(lambda: self._catalog.ask(question))
 
     def explain(self, filter: BaseFilter | str | None) -> str:
-        def ask() -> str:
-            self._declare_keys()
-            return self._catalog.explain(filter)
-
-        return self._with_usable_catalog(ask)
+        return self._settled(lambda: self._catalog.explain(filter))
 
     def declare_key(self, key: str) -> None:
         self._with_usable_catalog(lambda: self._catalog.declare_key(key))
