@@ -257,7 +257,7 @@ def _of_many(
 
     headers = source.episodes(filter)
     numbers = np.array([header.episode for header in headers])
-    returns = np.array([np.nan if h.episode_return is None else h.episode_return for h in headers])
+    returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
     named: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
         named.update(dict.fromkeys(places_of(item, text, numbers, returns)))

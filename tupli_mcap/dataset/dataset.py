@@ -68,13 +68,6 @@ class Dataset(RandomAccess):
         self._steps: RecordedSteps | None = None
         self._stats: dict[str, Mapping[str, FieldStatistics]] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_recordings": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._recordings = OpenRecordings(self._source.open)
-
     # ---- episodes
 
     @property
@@ -107,9 +100,7 @@ class Dataset(RandomAccess):
     @property
     def returns(self) -> Array:
         """The sum of each episode's rewards: float64 (episodes,), NaN if the rewards are no numbers."""
-        return np.array(
-            [np.nan if header.episode_return is None else header.episode_return for header in self.headers]
-        )
+        return np.array([header.episode_return for header in self.headers], np.float64)  # None becomes NaN
 
     @overload
     def __getitem__(self, chosen: int) -> Episode: ...

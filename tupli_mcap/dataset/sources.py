@@ -345,11 +345,15 @@ def _benchmark_header(recording: Recording) -> BenchmarkHeader:
 
 
 class OpenRecordings:
-    """Opens recordings by name. An `Episode` keeps its recording open as long as it lives. Not thread-safe."""
+    """Opens recordings by name. An `Episode` keeps its recording open as long as it lives. Not thread-safe; a pickled
+    copy opens them itself."""
 
     def __init__(self, open_recording: Callable[[str, Sequence[int]], Recording]) -> None:
         self._open = open_recording
         self._kept: OrderedDict[str, tuple[Recording, frozenset[int]]] = OrderedDict()  # with their episodes
+
+    def __reduce__(self) -> tuple[type[OpenRecordings], tuple[Callable[..., Recording]]]:
+        return OpenRecordings, (self._open,)
 
     def get(self, name: str, episodes: Sequence[int], needed: Sequence[int] | None = None) -> Recording:
         """The recording with at least the episodes `needed`, by default all of `episodes`.
