@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, BinaryIO, Final
+from typing import IO, BinaryIO, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError, warn
@@ -29,13 +29,12 @@ _HEAD = 16 << 10
 _AT_ONCE = 8
 
 
-class _Block:
+class _Block(NamedTuple):
     """Bytes of a file that have arrived, or are being fetched."""
 
-    __slots__ = ("coming", "start", "stop")
-
-    def __init__(self, start: int, stop: int, coming: Future[memoryview]) -> None:
-        self.start, self.stop, self.coming = start, stop, coming
+    start: int
+    stop: int
+    coming: Future[memoryview]
 
 
 class _Blocks:
