@@ -3,14 +3,12 @@
 steps                          the interface that items read from; steps in memory
 beside                         steps with infos and frames; infos as columns
 recorded, index, kept          reads steps from recordings; finds their chunks; caches decoded columns
-items                          the base of windows, transitions and delta windows
+items                          the base of windows, transitions and delta windows; reads them in batches, also ahead
 windows, transitions, deltas   the three kinds of items
 order, draws                   numbers of items: each once an epoch, or drawn by weight
 shuffle                        an order that reads each chunk about once, also over workers and ranks
-batches                        reads items in batches, also ahead
 """
 
-from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.beside import (
     BESIDE,
     FRAMES,
@@ -24,7 +22,7 @@ from tupli_mcap.dataset.items.beside import (
 from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
 from tupli_mcap.dataset.items.index import ListedEpisodes
-from tupli_mcap.dataset.items.items import Items, Samples
+from tupli_mcap.dataset.items.items import Batches, Items, Samples
 from tupli_mcap.dataset.items.order import Numbers, Order
 from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
 from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps, checked_fields

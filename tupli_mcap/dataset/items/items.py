@@ -1,23 +1,26 @@
-"""The base of windows, transitions and delta windows: items by number, each of which starts at a step."""
+"""The base of windows, transitions and delta windows: items by number, each of which starts at a step; and batches of
+them, which may be read ahead."""
 
 from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, Literal, Self, TypeVar, overload
 
 import numpy as np
 
 from tupli_mcap.arrays import Array, arrays_at
-from tupli_mcap.dataset.items.batches import Batches
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_numbers
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_numbers
 from tupli_mcap.recording.columns.fields import Parts
 from tupli_mcap.schema import BaseFilter, F
 
 __all__ = [
+    "Batches",
     "Items",
     "Samples",
     "StepItems",
@@ -198,3 +201,72 @@ class StepItems(Items[T]):
     def _episodes(self, steps: Array) -> Array:
         """The places of the steps' episodes in the query."""
         return self._episode_ends.searchsorted(steps, side="right")
+
+
+class Batches(Generic[T]):
+    """The items whose numbers an `Order` or a `Sampler` gives, one batch after the other.
+
+    Args:
+        read_ahead: number of batches that a thread reads while the caller uses the one before; this pays if chunks
+            are decompressed or files are slow. A sampler draws these early: weights that change meanwhile apply to
+            later batches.
+
+    Raises:
+        SamplingError: the numbers are those of other items.
+    """
+
+    def __init__(self, items: Items[T], numbers: Numbers, *, read_ahead: int = 0) -> None:
+        if not hasattr(numbers, "items_identity"):
+            raise SamplingError(f"expected an Order, a Sampler or a batch size, found {numbers!r:.80}")
+        if numbers.items_identity != items.identity:
+            raise SamplingError("expected numbers of the same items, found those of others")
+        self.items = items
+        self.numbers = numbers
+        self.read_ahead = checked_count(read_ahead, 0, "a number of batches to read ahead")
+        self._drawn: deque[tuple[Array, Future[T] | None]] = deque()
+
+    def __len__(self) -> int:
+        """Batches in an epoch of an `Order`.
+
+        Raises:
+            SamplingError: a `Sampler` has no end.
+        """
+        if not isinstance(self.numbers, Sized):
+            raise SamplingError("expected an Order, which has epochs, found a Sampler, which has no end")
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[T]:
+        source = iter(self.numbers)
+        drawn = self._drawn = deque()
+        pool = ThreadPoolExecutor(1) if self.read_ahead else None
+        try:
+            while True:
+                while len(drawn) <= self.read_ahead and (numbers := next(source, None)) is not None:
+                    drawn.append(
+                        (numbers, None if pool is None else pool.submit(self.items.__getitem__, numbers))
+                    )
+                if not drawn:
+                    return
+                numbers, future = drawn[0]
+                batch = self.items[numbers] if future is None else future.result()
+                drawn.popleft()
+                yield batch
+        finally:
+            if drawn and drawn is self._drawn:
+                self.numbers.give_back([numbers for numbers, _ in drawn])
+                drawn.clear()
+            if pool is not None:
+                pool.shutdown(cancel_futures=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The position of the iteration: the next batch is the first one that was not returned."""
+        return self.numbers.state_dict([numbers for numbers, _ in self._drawn])
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Makes the next iteration go on from a state.
+
+        Raises:
+            SamplingError: it is the state of something else, or of other items.
+        """
+        self.numbers.load_state_dict(state)
+        self._drawn = deque()
