@@ -3,11 +3,9 @@
 _capture, _build             from an environment to an `EnvironmentRecord` (`_record`), and back
 _changes, _local_code        whether an environment is as its constructors left it; which code is the user's own
 _pickling                    pickles of environments
-_arguments                   arguments that are more than data, and so need trust
 _docs                        names of dimensions and actions"""
 
-from tupli_mcap.environment._arguments import more_than_data
-from tupli_mcap.environment._build import build, entry_point_name, reasons_for_distrust
+from tupli_mcap.environment._build import build, entry_point_name, more_than_data, reasons_for_distrust
 from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, name_of, note, resets_itself
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._pickling import rebuild_ezpickled
