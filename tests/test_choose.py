@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from tupli_mcap.dataset.chosen import chosen_from
-from tupli_mcap.dataset.which import choose_episodes
 from tupli_mcap.errors import FilterError, RecordingError
-from tupli_mcap.recording import EpisodeData, Recording, write_recording
+from tupli_mcap.recording import Episode, EpisodeData, Recording, write_recording
 from tupli_mcap.recording.recover.evidence import metadata_at
-from tupli_mcap.schema import F, parse_filter
+from tupli_mcap.schema import BaseFilter, F, parse_filter
 from tupli_mcap.storage.sidecar import Sidecar
 
 RETURNS = [3.0, 9.0, -2.0, 9.0, float("nan"), -2.0]
@@ -35,6 +34,13 @@ def write(path: Path, returns: list[float]) -> Path:
     space = gym.spaces.Box(-1.0, 1.0, (1,))
     write_recording(path, episodes, observation_space=space, action_space=gym.spaces.Discrete(2))
     return path
+
+
+def choose_episodes(
+    recording: Recording, text: str = "all", filter: BaseFilter | None = None
+) -> list[Episode]:
+    with chosen_from(recording, text, filter) as chosen:
+        return [item.recording.episodes[at] for item in chosen for at in item.positions]
 
 
 @pytest.fixture

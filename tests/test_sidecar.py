@@ -13,7 +13,7 @@ import gymnasium as gym
 import pytest
 
 from tupli_mcap import TupliDataset
-from tupli_mcap.dataset.which import choose_episodes
+from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -72,7 +72,7 @@ class TestAReplacedRecording:
         assert len(TupliDataset.from_files(run).preview()) == 4
         assert [item.episodes for item in list_recordings([storage.root])] == [4]
         with Recording(run) as recording:
-            assert len(choose_episodes(recording, "all")) == 4
+            assert len(candidates(recording)) == 4
         bundle_recording(run, tmp_path / "bundle.mcap")
         with Recording(tmp_path / "bundle.mcap") as bundle:
             assert len(bundle) == 4

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError
-from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording import Recording
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
@@ -23,7 +23,6 @@ __all__ = [
     "bounds_of",
     "candidates",
     "check_choice",
-    "choose_episodes",
     "extreme",
     "may_be_noted",
     "named_positions",
@@ -38,28 +37,8 @@ _MAX_DIGITS: Final = 10  # an episode's number has 32 bits
 Positions = np.ndarray[Any, np.dtype[np.int64]]
 
 
-def choose_episodes(
-    recording: Recording, text: str = "all", filter: BaseFilter | None = None
-) -> list[Episode]:
-    """The episodes that a text such as "3,7-9", "best" or "first,last" names, in its order, each once.
-
-    Args:
-        recording: an open one.
-        text: numbers of episodes, ranges (of which only existing numbers count) and `WORDS`, separated by commas.
-        filter: only episodes that match it can be chosen; the number of another one is an error.
-
-    Episodes that the recording's storage has deleted cannot be chosen.
-
-    Raises:
-        FilterError: the text is something else, or the filter has an unknown key.
-        RecordingError: there is no such episode, or none at all.
-    """
-    among = candidates(recording, filter)
-    return [recording.episodes[position] for position in named_positions(recording, among, text, filter)]
-
-
 def check_choice(text: str, filter: BaseFilter | None = None) -> None:
-    """Raises FilterError if `choose_episodes` would raise it for every recording."""
+    """Raises FilterError if `named_positions` would raise it for every recording."""
     for item in text.split(","):
         if item.strip().lower() not in WORDS:
             bounds_of(item.strip(), text)
@@ -103,9 +82,12 @@ def positions_of(recording: Recording, headers: Iterable[EpisodeHeader]) -> Posi
 def named_positions(
     recording: Recording, among: Positions, text: str, filter: BaseFilter | None = None
 ) -> list[int]:
-    """The positions that a text names, as for `choose_episodes`, among some positions in the recording.
+    """The positions that a text such as "3,7-9", "best" or "first,last" names, in its order, each once, among some
+    positions in the recording.
 
-    `filter` is the filter that left these positions; errors name it.
+    Args:
+        text: numbers of episodes, ranges (of which only existing numbers count) and `WORDS`, separated by commas.
+        filter: the one that left these positions; errors name it.
 
     Raises:
         FilterError: the text is something else.
