@@ -28,10 +28,10 @@ from tupli_mcap.dataset.which import (
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown_name
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
-    from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
 
 __all__ = [
@@ -183,7 +183,7 @@ def chosen_from(
         if isinstance(episodes, str)
         else ",".join(map(str, ["all"] if episodes is None else episodes))
     )
-    wanted = _parsed(filter) if isinstance(filter, str) else filter
+    wanted = parse_filter(filter) if isinstance(filter, str) else filter
     with ExitStack() as stack:
         chosen: list[Chosen] = []
         for source in given:
@@ -225,12 +225,6 @@ def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
         found.setdefault(which, []).append(position)
         told.append(f"{recording.index['episode'][position]} ({', '.join(said)})")
     return [Chosen(chosen[which].recording, positions) for which, positions in found.items()], told
-
-
-def _parsed(text: str) -> BaseFilter:
-    from tupli_mcap.schema import parse_filter
-
-    return parse_filter(text)
 
 
 def _many_at(place: str) -> EpisodeSource | None:

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import Recording
-
-if TYPE_CHECKING:
-    from tupli_mcap.schema import BaseFilter, EpisodeHeader
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 
 __all__ = [
     "WORDS",
@@ -43,8 +41,6 @@ def check_choice(text: str, filter: BaseFilter | None = None) -> None:
         if item.strip().lower() not in WORDS:
             bounds_of(item.strip(), text)
     if filter is not None:
-        from tupli_mcap.schema import EpisodeHeader, check_keys
-
         check_keys(filter, EpisodeHeader)
 
 
@@ -58,7 +54,6 @@ def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positi
     if filter is None:
         return np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
     from tupli_mcap.dataset.sources import episode_headers
-    from tupli_mcap.schema import EpisodeHeader, check_keys, compile_predicate
 
     check_keys(filter, EpisodeHeader)
     matches = compile_predicate(filter, EpisodeHeader)
