@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.columns.load import Selected, TupleFilter, read_columns, selector_of
+from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
@@ -30,14 +30,16 @@ class Query:
         episode_filter: BaseFilter | None = None,
         tuple_filter: TupleFilter | None = None,
     ) -> None:
-        _check(benchmark_filter, BenchmarkHeader)
-        _check(episode_filter, EpisodeHeader)
+        if benchmark_filter is not None:
+            check_keys(benchmark_filter, BenchmarkHeader)
+        if episode_filter is not None:
+            check_keys(episode_filter, EpisodeHeader)
         self.source = source
         self.benchmark_filter = benchmark_filter
         self.episode_filter = episode_filter
         self.tuple_filter = tuple_filter
         self.layout: StepLayout | None = None
-        self._selector = None if tuple_filter is None else selector_of(tuple_filter)
+        self._selector = None if tuple_filter is None else TupleSelector(tuple_filter)
         self._benchmarks: list[BenchmarkHeader] | None = None
         self._headers: list[EpisodeHeader] | None = None
         self._selected: Selected | None = None
@@ -82,8 +84,7 @@ class Query:
         """The steps that match the tuple filter."""
         if self._selected is None:
             self.read(["terminals"])
-        if self._selected is None:
-            raise AssertionError("reading leaves the selection behind")
+        assert self._selected is not None  # reading leaves it behind
         return self._selected
 
     def refresh(self) -> list[EpisodeHeader]:
@@ -141,11 +142,6 @@ class Query:
         )
         self.layout = layout or self.layout
         return found
-
-
-def _check(filter: BaseFilter | None, model: type[BenchmarkHeader] | type[EpisodeHeader]) -> None:
-    if filter is not None:
-        check_keys(filter, model)
 
 
 def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:

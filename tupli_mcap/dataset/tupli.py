@@ -14,7 +14,7 @@ from tupli_mcap.dataset.columns import convert
 from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
-from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples, items_of
+from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.items.windows import FIVE
@@ -381,7 +381,7 @@ class TupliDataset(RandomAccess):
         in_order = np.sort(drawn)
         chosen = [headers[i] for i in in_order]
         columns, selected, layout = read_columns(self._query.source, chosen, SIX)
-        items = items_of(chosen, columns, selected.lengths, layout)
+        items = EpisodeItems(chosen, lambda: (columns, selected.lengths, layout))
         return [items[i] for i in np.searchsorted(in_order, drawn)]
 
     # --- display ---

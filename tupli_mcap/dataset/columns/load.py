@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIELDS
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
@@ -32,7 +32,6 @@ __all__ = [
     "TupleSelector",
     "read_columns",
     "read_in_order",
-    "selector_of",
     "steps_within",
 ]
 
@@ -317,11 +316,27 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 class TupleSelector:
-    """A tuple filter and the columns that it needs."""
+    """A tuple filter, and the `fields` of the columns that it needs.
 
-    def __init__(self, fields: tuple[str, ...], filter: TupleFilter) -> None:
-        self.fields = fields
+    Raises:
+        FilterError: it is neither an expression nor a function, or it names an unknown field of a step.
+    """
+
+    fields: tuple[str, ...]
+
+    def __init__(self, filter: TupleFilter) -> None:
         self.filter = filter
+        if isinstance(filter, BaseFilter):
+            check_keys(filter, STEP_KEYS)
+            needed = {field for key, field in STEP_KEYS.items() if _names(filter, key)}
+            self.fields = ("terminals", *sorted(needed - {"terminals"}))
+            self.filter = with_times(filter, "time")
+        elif callable(filter):
+            self.fields = (*FIVE, "infos")
+        else:
+            raise FilterError(
+                f"expected a function of one tuple or an expression like F('reward') > 0, found {filter!r:.80}"
+            )
 
     def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
         """A mask of the wanted steps of `columns` (by field, at least `self.fields`).
@@ -343,23 +358,6 @@ def _warn_of_unseen(filter: TupleFilter, keys: Collection[str]) -> None:
         if name == "info" and inside and inside[0] not in keys:
             known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
             warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
-
-
-def selector_of(filter: TupleFilter) -> TupleSelector:
-    """A filter with the columns that it needs.
-
-    Raises:
-        FilterError: it is neither an expression nor a function, or it names an unknown field of a step.
-    """
-    if isinstance(filter, BaseFilter):
-        check_keys(filter, STEP_KEYS)
-        needed = {field for key, field in STEP_KEYS.items() if _names(filter, key)}
-        return TupleSelector(("terminals", *sorted(needed - {"terminals"})), with_times(filter, "time"))
-    if not callable(filter):
-        raise FilterError(
-            f"expected a function of one tuple or an expression like F('reward') > 0, found {filter!r:.80}"
-        )
-    return TupleSelector(("states", "actions", "rewards", "terminals", "timeouts", "infos"), filter)
 
 
 def _names(filter: BaseFilter, key: str) -> bool:

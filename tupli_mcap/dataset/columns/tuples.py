@@ -12,7 +12,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import item_getter, reward_getter
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 
-__all__ = ["EpisodeItems", "Tuples", "items_of"]
+__all__ = ["EpisodeItems", "Tuples"]
 
 
 class Tuples(Sequence[RLTuple]):
@@ -113,10 +113,3 @@ class EpisodeItems(Sequence[EpisodeItem]):
 
     def __repr__(self) -> str:
         return f"<{len(self)} episodes>"
-
-
-def items_of(
-    headers: Sequence[EpisodeHeader], columns: Mapping[str, Any], lengths: Array, layout: StepLayout | None
-) -> EpisodeItems:
-    """The episodes whose columns are there."""
-    return EpisodeItems(headers, lambda: (columns, lengths, layout))

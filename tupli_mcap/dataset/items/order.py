@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -122,8 +122,8 @@ class Order:
                 )
             )
         random = seeded(self.seed, _EPOCHS, epoch)
-        order: Callable[[int], Array] = np.arange if self.shuffle is False else random.permutation
-        return _cut(order(self._n), self.batch_size)
+        order = np.arange(self._n) if self.shuffle is False else random.permutation(self._n)
+        return (order[first : first + self.batch_size] for first in range(0, self._n, self.batch_size))
 
     def give_back(self, batches: Sequence[Array]) -> None:
         state = self.state_dict(batches)
@@ -149,11 +149,6 @@ class Order:
         seed, epoch = checked_seed(state["seed"]), checked_count(state["epoch"], 0, "an epoch")
         self.batch = checked_count(state["batch"], 0, "a batch", len(self))
         self.seed, self.epoch, self._resumed = seed, epoch, True
-
-
-def _cut(order: Array, size: int) -> Iterator[Array]:
-    for first in range(0, len(order), size):
-        yield order[first : first + size]
 
 
 def seeded(seed: int, stream: int, number: int) -> np.random.Generator:

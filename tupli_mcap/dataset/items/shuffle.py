@@ -162,8 +162,7 @@ class ShuffledBatches:
 
     def _laid_out(self, low: int, high: int) -> Array:
         """The items at places `low` to `high - 1` of the shuffled blocks."""
-        if self._blocks is None:
-            raise AssertionError("only known blocks are shuffled")
+        assert self._blocks is not None  # only known blocks are shuffled
         first = int(np.searchsorted(self._ends, low, side="right"))
         last = int(np.searchsorted(self._ends, high, side="left"))
         found = np.concatenate([self._blocks.items(int(k)) for k in self._order[first : last + 1]])
