@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import hashlib
 import json
 import os
 import threading
@@ -27,6 +26,7 @@ from typing import Final, NamedTuple
 import platformdirs
 
 from tupli_mcap import files
+from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
 from tupli_mcap.mcap.lock import LockedError, is_locked, writers_kept_out
 from tupli_mcap.mcap.records import has_summary
@@ -89,7 +89,8 @@ class Outbox:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._identity = session.identity
-        self.directory = _data_dir() / "outbox" / _digest(f"{session.url}\n{session.username}")
+        whose = sha256(f"{session.url}\n{session.username}".encode())
+        self.directory = _data_dir() / "outbox" / whose[:16]
         self._turn = threading.Condition()
         self._behind: dict[Path, None] = {}  # what the thread has to send, in order
         self._thread: threading.Thread | None = None
@@ -273,10 +274,6 @@ class Outbox:
             why = "interrupted" if isinstance(err, KeyboardInterrupt) else err
             left = f"what was recorded waits in {self.directory} ({why}); tupli-mcap push sends it"
             warn(left, RuntimeWarning)
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _data_dir() -> Path:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from pydantic import BaseModel, Field
@@ -67,10 +68,7 @@ class Recordings:
         if not ticket.whole or ticket.episodes != episodes:
             yield None
             return
-
-        def pieces(start: int) -> Iterator[bytes]:
-            return self._session.stream(ticket.path, start)
-
+        pieces = partial(self._session.stream, ticket.path)
         with contextlib.ExitStack() as stack:
             with progress(ticket.size, f"fetching {what}", in_bytes=True) as bar:
                 kept = fetched(ticket.digest, pieces, digest=ticket.digest, tell=bar.advance)

@@ -68,7 +68,7 @@ class Session:
     def _connected(self) -> httpx.Client:
         import httpx
 
-        _hide_tickets()
+        logging.getLogger("httpx").addFilter(_NO_TICKETS)  # added twice, it is there once
         timeout = httpx.Timeout(TIMEOUT, connect=_CONNECT_TIMEOUT)
         client = httpx.Client(base_url=self.url, timeout=timeout, headers={"Accept": "application/json"})
         weakref.finalize(self, client.close)
@@ -334,10 +334,6 @@ class _NoTickets(logging.Filter):
 
 
 _NO_TICKETS: Final = _NoTickets()
-
-
-def _hide_tickets() -> None:
-    logging.getLogger("httpx").addFilter(_NO_TICKETS)  # added twice, it is there once
 
 
 def _checked(url: str) -> str:
