@@ -34,8 +34,6 @@ __all__ = ["SyncedCatalog"]
 _T = TypeVar("_T")
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
 
-_RESTLESS = f"the catalog of {{!r}} was replaced during each of {_ATTEMPTS} attempts; try again later"
-
 _TROUBLE = (CatalogMovedError, CatalogDamagedError, CatalogUnusableError)
 
 
@@ -95,7 +93,7 @@ class SyncedCatalog:
             with self._catalog.alone():  # nobody sees an incomplete catalog
                 self._catalog.reset()
                 self._warned.clear()
-                self._sync()
+                self._synced_answer(lambda: None)
 
         self._with_usable_catalog(make)
 
@@ -115,18 +113,20 @@ class SyncedCatalog:
         return self._with_usable_catalog(put)
 
     def _settled(self, ask: Callable[[], _T]) -> _T:
-        """Queries the up-to-date catalog, again if somebody replaced it in the meantime."""
+        """Queries the up-to-date catalog."""
+        return self._with_usable_catalog(lambda: self._synced_answer(ask))
 
-        def settle() -> _T:
-            for _ in range(_ATTEMPTS):
-                self._sync()
-                with contextlib.suppress(CatalogMovedError):
+    def _synced_answer(self, ask: Callable[[], _T]) -> _T:
+        """Brings the catalog up to date with the files and queries it, again if somebody replaced it meanwhile."""
+        for _ in range(_ATTEMPTS):
+            with contextlib.suppress(CatalogMovedError):
+                if self._sync_once():
                     found = ask()
                     if self._catalog.identity == self._synced and self._catalog.is_current():
                         return found
-            raise StorageError(_RESTLESS.format(str(self._root)))
-
-        return self._with_usable_catalog(settle)
+        raise StorageError(
+            f"the catalog of {str(self._root)!r} was replaced during each of {_ATTEMPTS} attempts; try again later"
+        )
 
     def _with_usable_catalog(self, work: Callable[[], _T]) -> _T:
         """The result of `work`; if the catalog fails, with a new one if it was damaged, else with one in memory."""
@@ -175,14 +175,6 @@ class SyncedCatalog:
             for key in self._declared_keys:
                 self._catalog.declare_key(key)
             self._undeclared = False
-
-    def _sync(self) -> None:
-        """Bring the catalog up to date with the files."""
-        for _ in range(_ATTEMPTS):
-            with contextlib.suppress(CatalogMovedError):
-                if self._sync_once():
-                    return
-        raise StorageError(_RESTLESS.format(str(self._root)))
 
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
