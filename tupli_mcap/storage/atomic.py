@@ -14,14 +14,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from pydantic import BaseModel, ValidationError
+
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.recording import journal_path
+from tupli_mcap.storage.texts import first_defect
 
-__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "refusals_told", "write_bytes"]
+__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "read_model", "refusals_told", "write_bytes"]
 
 _Class = TypeVar("_Class")
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
@@ -33,6 +37,22 @@ def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(path, data, overwrite=replace)
+
+
+def read_model(kind: type[_Model], path: Path, expected: str, advice: str = "") -> _Model:
+    """The model in a file of JSON; an empty one if there is no file.
+
+    Raises:
+        FormatError: The file is something else than what is expected.
+        StorageError: It cannot be read.
+    """
+    with os_errors("cannot read", path):
+        try:
+            return kind.model_validate_json(path.read_bytes())
+        except FileNotFoundError:
+            return kind()
+        except ValidationError as err:
+            raise FormatError(f"{path}: expected {expected}: {first_defect(err)}{advice}") from err
 
 
 @contextlib.contextmanager

@@ -25,11 +25,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
-from tupli_mcap.errors import FormatError
-from tupli_mcap.storage.atomic import os_errors, write_bytes
-from tupli_mcap.storage.texts import escape_text, first_defect, unescape_text
+from tupli_mcap.storage.atomic import os_errors, read_model, write_bytes
+from tupli_mcap.storage.texts import escape_text, unescape_text
 
 __all__ = ["Deletion", "Notes", "Sidecar", "sidecar_path", "storage_of"]
 
@@ -59,12 +58,7 @@ class Sidecar(BaseModel):
         Raises:
             FormatError: The file is no sidecar.
         """
-        path = sidecar_path(recording)
-        try:
-            data = _content(path)
-            return cls() if data is None else cls.model_validate_json(data)
-        except ValidationError as err:
-            raise FormatError(f"{path}: expected facts about a recording: {first_defect(err)}") from err
+        return read_model(cls, sidecar_path(recording), "facts about a recording")
 
     def is_about(self, metadata: Mapping[str, str]) -> bool:
         """Whether it counts for the recording with these metadata."""
@@ -99,12 +93,7 @@ class Deletion(BaseModel):
         Raises:
             FormatError: The file is something else.
         """
-        path = root / DELETING
-        try:
-            data = _content(path)
-            named = cls() if data is None else cls.model_validate_json(data)
-        except ValidationError as err:
-            raise FormatError(f"{path}: expected episodes to delete: {first_defect(err)}; delete it") from err
+        named = read_model(cls, root / DELETING, "episodes to delete", "; delete it")
         return cls(
             deleted={unescape_text(name): numbers for name, numbers in named.deleted.items()},
             uuids={unescape_text(name): uuid for name, uuid in named.uuids.items()},
@@ -168,15 +157,6 @@ class Notes(NamedTuple):
                 found.deleted |= said.deleted
                 found.published_in.update(said.published_in)
         return found
-
-
-def _content(path: Path) -> bytes | None:
-    """The content of a file; None if there is none."""
-    with os_errors("cannot read", path):
-        try:
-            return path.read_bytes()
-        except FileNotFoundError:
-            return None
 
 
 def storage_of(recording: Path) -> Path:

@@ -9,10 +9,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from sqlalchemy import Connection
 
-from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.annotate import user_name
 from tupli_mcap.schema import (
@@ -26,7 +26,7 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     FilterEQ,
 )
-from tupli_mcap.storage.atomic import Lock, fill, os_errors, refusals_told, write_bytes
+from tupli_mcap.storage.atomic import Lock, fill, os_errors, read_model, refusals_told, write_bytes
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
@@ -34,7 +34,6 @@ from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files.recordings import RecordingFiles
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.from_values import record_each, write_episodes
-from tupli_mcap.storage.texts import first_defect
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -347,9 +346,4 @@ class FileStorage(TupliStorage):
         )
 
     def _settings(self) -> _Settings:
-        path = self.root / "storage.json"
-        try:
-            with os_errors("cannot read", path):
-                return _Settings.model_validate_json(path.read_bytes()) if path.exists() else _Settings()
-        except ValidationError as err:
-            raise FormatError(f"{path}: expected the settings of a storage: {first_defect(err)}") from err
+        return read_model(_Settings, self.root / "storage.json", "the settings of a storage")
