@@ -26,8 +26,10 @@ def to_json(value: Mapping[str, Any]) -> bytes:
     return json.dumps(value, indent=2, ensure_ascii=False).encode("utf-8")
 
 
-def first_defect(err: ValidationError) -> str:
-    """The first defect of data: its place, and what is wrong."""
+def first_defect(err: Exception) -> str:
+    """What is wrong with data: of many defects the first one, and its place."""
+    if not isinstance(err, ValidationError):
+        return str(err)
     first = err.errors(include_url=False, include_input=False)[0]
     return f"{'.'.join(str(part) for part in first['loc']) or 'the whole'}: {first['msg']}"
 

@@ -212,10 +212,8 @@ class SavedColumns(RandomAccess):
                 if isinstance(header.get("run"), int):
                     header["run"] = runs[header["run"]]
             return [EpisodeHeader.model_validate(header) for header in found]
-        except ValidationError as err:
+        except (ValidationError, FormatError, IndexError, AttributeError) as err:
             raise _defect(self._directory / _MANIFEST, "headers of episodes", first_defect(err)) from err
-        except (FormatError, IndexError, AttributeError) as err:
-            raise _defect(self._directory / _MANIFEST, "headers of episodes", str(err)) from err
 
     def _values_now(self) -> Callable[[F | BaseFilter], Array]:
         return self.episode_values  # the headers are read only when values are needed

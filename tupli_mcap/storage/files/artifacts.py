@@ -97,9 +97,7 @@ class ArtifactFiles:
             text = sidecar.read_bytes()
         try:
             item = ArtifactMetadataItem.model_validate(loads(text))
-        except FormatError as err:
-            raise FormatError(f"{sidecar}: {err}") from err
-        except ValidationError as err:
+        except (FormatError, ValidationError) as err:
             raise FormatError(f"{sidecar}: expected an artifact's metadata: {first_defect(err)}") from err
         if item.id != sidecar.stem:
             raise FormatError(

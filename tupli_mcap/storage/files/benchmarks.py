@@ -166,9 +166,7 @@ class BenchmarkFiles:
     def _header(self, uri: str, document: dict[str, Any]) -> BenchmarkHeader:
         try:
             header = header_of(document.get("benchmark"))
-        except FormatError as err:
-            raise FormatError(f"{self._path(uri)}: expected a benchmark: {err}") from err
-        except ValidationError as err:
+        except (FormatError, ValidationError) as err:
             raise FormatError(f"{self._path(uri)}: expected a benchmark: {first_defect(err)}") from err
         if header.id != uri:
             raise FormatError(f"{self._path(uri)}: expected benchmark {uri}, found {header.id[:80]!r}")
