@@ -183,11 +183,7 @@ def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], tar
 
 
 def _excerpts(dataset: Dataset) -> list[Excerpt]:
-    """The episodes of a dataset, by recording.
-
-    Raises:
-        NotFoundError: a recording has not all of them any more.
-    """
+    """The episodes of a dataset, by recording. NotFoundError if a recording has not all of them any more."""
     found = []
     for name, headers in by_recording(dataset.headers).items():
         recording = dataset._open(name)

@@ -69,10 +69,7 @@ class Source(Protocol):
 
     def home_of(self, recording: str) -> tuple[TupliStorage, str]:
         """The storage that changes the recording that a header names, and the name that the storage has for it.
-
-        Raises:
-            RecordingError: nothing can change it.
-        """
+        RecordingError if nothing can change it."""
         ...
 
 
@@ -357,10 +354,7 @@ class OpenRecordings:
 
     def get(self, name: str, episodes: Sequence[int], needed: Sequence[int] | None = None) -> Recording:
         """The recording with at least the episodes `needed`, by default all of `episodes`.
-
-        Raises:
-            RecordingError: it cannot be opened.
-        """
+        RecordingError if it cannot be opened."""
         kept = self._kept.get(name)
         if kept is None or not kept[1].issuperset(episodes if needed is None else needed):
             recording = self._open(name, episodes)

@@ -125,10 +125,7 @@ def numbers_in(
 
 def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
     """The places that one item of a text names, among episodes with these numbers and returns; none if there is none.
-
-    Raises:
-        FilterError: the item is no number, no range and no word.
-    """
+    FilterError if the item is no number, no range and no word."""
     if item not in WORDS:
         first, last = bounds_of(item, text)
         return np.flatnonzero((numbers >= first) & (numbers <= last)).tolist()

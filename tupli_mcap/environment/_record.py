@@ -135,10 +135,7 @@ class EnvironmentRecord:
         cls, data: bytes, pickle: bytes | None = None, *, where: str = "benchmark.json"
     ) -> EnvironmentRecord:
         """Read `benchmark.json` and the pickle beside it, executing nothing.
-
-        Raises:
-            FormatError: The JSON is no such document, or names another digest than that of its contents.
-        """
+        FormatError if the JSON is no such document, or names another digest than that of its contents."""
         if len(data) > _MAX_JSON_BYTES:
             raise FormatError(f"{where}: expected at most {_MAX_JSON_BYTES} bytes, found {len(data)}")
         try:

@@ -35,10 +35,7 @@ _written = 0  # bytes of blocks since this process has last deleted some
 
 def kept_blocks(url: str, version: str) -> KeptBlocks | None:
     """The blocks of one version of a file; None if none are kept.
-
-    Raises:
-        RecordingError: TUPLI_MCAP_BLOCK_BYTES is no number of bytes.
-    """
+    RecordingError if TUPLI_MCAP_BLOCK_BYTES is no number of bytes."""
     text = os.environ.get(_VARIABLE, "0")
     if not text.isdecimal():
         raise RecordingError(f"expected {_VARIABLE} to be a number of bytes, found {text!r:.80}")

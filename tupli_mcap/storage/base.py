@@ -291,10 +291,7 @@ def each_opened(
     headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
 ) -> Iterator[tuple[EpisodeHeader, RecordedEpisode]]:
     """The episodes of headers that are sorted by recording; each recording is open while its episodes are given.
-
-    Raises:
-        NotFoundError: an episode was deleted meanwhile.
-    """
+    NotFoundError if an episode was deleted meanwhile."""
     for name, same in itertools.groupby(headers, key=lambda header: header.recording):
         group = list(same)
         with open_recording(name, [header.episode for header in group]) as recording:
@@ -330,11 +327,7 @@ def new_name(name: str = "") -> str:
 
 
 def published_in(groups: Sequence[str], group: str) -> list[str]:
-    """The groups that see an item, with `group` added.
-
-    Raises:
-        StorageError: `group` is no name of a group.
-    """
+    """The groups that see an item, with `group` added. StorageError if `group` is no name of a group."""
     if not isinstance(group, str) or not group or not group.isprintable():
         raise StorageError(f"expected the name of a group to publish in, found {group!r:.80}")
     return [*groups, *([] if group in groups else [group])]
@@ -357,10 +350,7 @@ def uuid_of(header: EpisodeHeader) -> str:
 
 def anew(read: Callable[[], _T]) -> _T:
     """Calls a function that lists and reads; calls it again if a listed item was deleted before it was read.
-
-    Raises:
-        NotFoundError: this happened five times.
-    """
+    NotFoundError if this happened five times."""
     for _ in range(_ATTEMPTS - 1):
         with contextlib.suppress(NotFoundError):
             return read()

@@ -51,10 +51,7 @@ class BenchmarkContent(NamedTuple):
 
 def plain(model: BaseModel) -> dict[str, Any]:
     """A model as JSON-able dict: NumPy values become numbers and lists, NaN becomes `{"$float": "nan"}`.
-
-    Raises:
-        StorageError: A value has no JSON form.
-    """
+    StorageError if a value has no JSON form."""
     try:
         value: dict[str, Any] = json.loads(dumps_plain(model.model_dump()))
     except (TypeError, ValueError) as err:
@@ -69,10 +66,7 @@ def benchmark_entry(header: BenchmarkHeader) -> dict[str, Any]:
 
 def header_of(entry: Any) -> BenchmarkHeader:
     """The header in the `benchmark` entry of a document, with its latest name and description.
-
-    Raises:
-        FormatError, ValidationError: The entry is no header.
-    """
+    FormatError or ValidationError if the entry is no header."""
     header = BenchmarkHeader.model_validate(restored(entry))
     for edit in edits_of(entry):
         header = header.edited({key: edit[key] for key in EDITABLE if key in edit})
@@ -80,11 +74,7 @@ def header_of(entry: Any) -> BenchmarkHeader:
 
 
 def edits_of(entry: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The edits of a benchmark's name and description, in order.
-
-    Raises:
-        FormatError: The entry holds something else.
-    """
+    """The edits of a benchmark's name and description, in order. FormatError if the entry holds something else."""
     said = entry.get("edits", [])
     if not isinstance(said, list) or not all(map(_is_edit, said)):
         raise FormatError(f"expected edits with a name or a description, found {said!r:.100}")
@@ -97,10 +87,7 @@ def _is_edit(said: Any) -> bool:
 
 def restored(value: Any) -> Any:
     """The values that `plain` turned into JSON: `{"$float": "nan"}` becomes NaN again.
-
-    Raises:
-        FormatError: `plain` did not make this JSON.
-    """
+    FormatError if `plain` did not make this JSON."""
     return loads(json.dumps(value))
 
 
@@ -130,11 +117,7 @@ def pack(
 
 
 def unpack(serialized: str, *, where: str = "the benchmark") -> BenchmarkContent:
-    """Parse a text of `pack`; executes nothing.
-
-    Raises:
-        FormatError: It is something else.
-    """
+    """Parse a text of `pack`; executes nothing. FormatError if it is something else."""
     try:
         document = json.loads(serialized)
         encoded = document.get("pickle") if isinstance(document, dict) else None
@@ -146,11 +129,7 @@ def unpack(serialized: str, *, where: str = "the benchmark") -> BenchmarkContent
 
 
 def artifacts_of(record: EnvironmentRecord, where: str) -> tuple[str, ...]:
-    """The artifact ids that the `benchmark` entry of a document names.
-
-    Raises:
-        FormatError: They are no ids.
-    """
+    """The artifact ids that the `benchmark` entry of a document names. FormatError if they are no ids."""
     ids = (record.benchmark or {}).get("artifacts", [])
     if not isinstance(ids, list) or not all(is_hash(item) for item in ids):
         raise FormatError(f"{where}: expected artifacts named by 64 hex digits, found {str(ids)[:100]!r}")

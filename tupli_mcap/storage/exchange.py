@@ -297,10 +297,7 @@ def push_recording(
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:
     """Sends the recordings of a server that wait on this machine; returns those that waited.
-
-    Raises:
-        StorageError: the server does not answer, or refuses some of it.
-    """
+    StorageError if the server does not answer, or refuses some of it."""
     waiting = client.waiting()
     if not dry_run:
         with progress(sum(each.size for each in waiting), "sending", in_bytes=True) as bar:
@@ -390,10 +387,7 @@ def unpublish_benchmark(
 
 def unpublish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
     """Hides the caller's episodes that match a filter from a group; returns their number.
-
-    Raises:
-        StorageError: none of them is published in the group.
-    """
+    StorageError if none of them is published in the group."""
     episodes = _hide(client, group, chosen, dry_run=dry_run)
     if not episodes:
         raise _none_in(client, group)

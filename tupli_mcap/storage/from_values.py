@@ -50,10 +50,7 @@ def infer_space(values: Sequence[Any], where: str = "value") -> gym.Space[Any]:
 
 def conform(value: Any, space: gym.Space[Any]) -> Any:
     """An equal value with the types of an inferred space's samples.
-
-    Raises:
-        SpaceError: The value does not have the space's structure, or would be changed.
-    """
+    SpaceError if the value does not have the space's structure, or would be changed."""
     if isinstance(space, spaces.Dict) and isinstance(value, Mapping) and value.keys() == space.spaces.keys():
         return {key: conform(value[key], part) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple) and isinstance(value, tuple) and len(value) == len(space.spaces):
@@ -150,10 +147,7 @@ def record_each(
     episodes: Iterable[Episode], record: Callable[[str, Sequence[Episode]], Sequence[EpisodeHeader]]
 ) -> list[EpisodeHeader]:
     """Stores episodes with a function that records those of one benchmark; returns their headers in the given order.
-
-    Raises:
-        StorageError: An episode has no tuple; nothing is stored.
-    """
+    StorageError if an episode has no tuple; nothing is stored."""
     groups: dict[str, list[tuple[int, Episode]]] = {}
     for i, episode in enumerate(episodes):
         if not episode.tuples:

@@ -117,10 +117,7 @@ class Compactable(NamedTuple):
 
 def scan(root: Path) -> Iterator[FoundRecording]:
     """Every recording below a directory; hidden files and links to directories are skipped.
-
-    Raises:
-        FormatError: `deleting.json` is damaged.
-    """
+    FormatError if `deleting.json` is damaged."""
     pending = [(os.fspath(root), "")]
     deleting = Deletion()
     while pending:
@@ -180,10 +177,7 @@ def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequen
 
 def find_recordings(path: Path) -> list[Path]:
     """A file itself, or the recordings (`.mcap`) below a directory, sorted.
-
-    Raises:
-        RecordingError: there is no such file or directory, or the directory cannot be read.
-    """
+    RecordingError if there is no such file or directory, or the directory cannot be read."""
     if path.is_dir():
         try:
             return [path / item.relative for item in sorted(scan(path))]
@@ -215,10 +209,7 @@ def list_recordings(
 
 def recordings_at(source: Path | str) -> Sequence[Path | str]:
     """The recordings of a path, as `find_recordings` finds them, or the files or URLs that match a pattern.
-
-    Raises:
-        RecordingError: there are none.
-    """
+    RecordingError if there are none."""
     if isinstance(source, str) and is_url(source):
         return matching(source)
     path = Path(source)
@@ -262,10 +253,7 @@ def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
 
 def compactable(root: Path) -> list[Compactable]:
     """The recordings of a storage that `FileStorage.compact` would rewrite.
-
-    Raises:
-        FormatError: a recording with deleted episodes, or its sidecar, is damaged.
-    """
+    FormatError if a recording with deleted episodes, or its sidecar, is damaged."""
     compactables = []
     for item in sorted(scan(root)):
         path = root / item.relative

@@ -54,10 +54,7 @@ class Sidecar(BaseModel):
     @classmethod
     def read(cls, recording: Path) -> Sidecar:
         """The sidecar at a recording's path, about any recording; an empty one if there is none.
-
-        Raises:
-            FormatError: The file is no sidecar.
-        """
+        FormatError if the file is no sidecar."""
         return read_model(cls, sidecar_path(recording), "facts about a recording")
 
     def is_about(self, metadata: Mapping[str, str]) -> bool:
@@ -89,10 +86,7 @@ class Deletion(BaseModel):
     @classmethod
     def read(cls, root: Path) -> Deletion:
         """The deletion that is going on in a storage; an empty one if there is none.
-
-        Raises:
-            FormatError: The file is something else.
-        """
+        FormatError if the file is something else."""
         named = read_model(cls, root / DELETING, "episodes to delete", "; delete it")
         return cls(
             deleted={unescape_text(name): numbers for name, numbers in named.deleted.items()},
@@ -134,10 +128,7 @@ class Notes(NamedTuple):
     @classmethod
     def read(cls, recording: Path, root: Path | None = None) -> Notes:
         """`root` is the directory of the recording's storage; by default, it follows from the recording's path.
-
-        Raises:
-            FormatError: A file with notes holds something else.
-        """
+        FormatError if a file with notes holds something else."""
         recording = recording.absolute()
         root = storage_of(recording) if root is None else root.absolute()
         # first: who finishes it notes everything beside the recordings before he removes it

@@ -157,11 +157,7 @@ class RecordedBuffer:
         )
 
     def append(self, episode: Any, index: int) -> None:
-        """Refused.
-
-        Raises:
-            SamplingError: always.
-        """
+        """Refused: always raises SamplingError."""
         raise SamplingError(
             "this buffer of recorded steps is read-only; add steps to another, and join both in a MixedReplayBuffer"
         )

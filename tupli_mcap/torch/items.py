@@ -45,10 +45,7 @@ class ReadItems:
 
 def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
     """Checks that a state dict is of these items, with the same options.
-
-    Raises:
-        SamplingError: it is of other items, or of other options.
-    """
+    SamplingError if it is of other items, or of other options."""
     if not isinstance(state, Mapping) or not {"items", *expected} <= set(state):
         raise SamplingError(
             f"expected a state dict with the keys {', '.join(['items', *expected])}, found {state!r:.80}"

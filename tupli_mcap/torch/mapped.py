@@ -61,10 +61,7 @@ class MapDataset(Dataset[dict[str, Any]]):
 
 def check_arguments(names: Iterable[str], *, of_windows: bool) -> None:
     """Checks what `Dataset.loader` passes on to `windows`, or else to `transitions`.
-
-    Raises:
-        TypeError: it takes no such argument.
-    """
+    TypeError if it takes no such argument."""
     for name in names:
         if name in _OF_ITEMS[of_windows]:
             continue

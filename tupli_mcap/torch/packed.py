@@ -98,11 +98,7 @@ ForkingPickler.register(PackedBatch, PackedBatch._handed_over)
 
 
 def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: dict[str, Any]) -> Any:
-    """The batch of another process, in the memory that this one shares.
-
-    Raises:
-        RuntimeError: that process is dead.
-    """
+    """The batch of another process, in the memory that this one shares. RuntimeError if that process is dead."""
     try:
         storage = rebuild(*arguments)
     except (EOFError, ConnectionError, FileNotFoundError) as err:

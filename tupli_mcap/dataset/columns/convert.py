@@ -73,11 +73,7 @@ def batches(
 
 
 def import_pandas() -> Any:
-    """The module pandas.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The module pandas. MissingExtraError if it is not installed."""
     try:
         import pandas
     except ImportError as err:

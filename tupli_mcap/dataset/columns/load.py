@@ -340,10 +340,7 @@ class TupleSelector:
 
     def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
         """A mask of the wanted steps of `columns` (by field, at least `self.fields`).
-
-        Raises:
-            FilterError: the expression does not fit the columns, or the function returned no flag.
-        """
+        FilterError if the expression does not fit the columns, or the function returned no flag."""
         if isinstance(self.filter, BaseFilter):
             steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
             return evaluate_columns(self.filter, steps)

@@ -112,10 +112,7 @@ def save_columns(
 
 def _layout_of(steps: Steps) -> StepLayout:
     """The layout of the columns: the spaces of the steps, with dtypes that hold the values of all their recordings.
-
-    Raises:
-        DatasetError: there is no step, or values are of variable size.
-    """
+    DatasetError if there is no step, or values are of variable size."""
     layout = steps.layout
     if layout is None or not len(steps):
         raise DatasetError("expected steps to save, found none; see preview() for what the filters leave")

@@ -61,10 +61,7 @@ class ListedEpisodes(NamedTuple):
 
 def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     """The positions of the episodes in the recording's index.
-
-    Raises:
-        NotFoundError: it is another recording, or an episode is missing, or shorter than listed: the file was changed.
-    """
+    NotFoundError if it is another recording, or an episode is missing, or shorter than listed: the file was changed."""
     if listed.uuid not in ("", recording.uuid):
         raise NotFoundError(f"{recording.name}: another recording was listed: {_CHANGED}")
     numbers = recording.index["episode"].astype(np.int64)
@@ -264,10 +261,7 @@ class OpenFiles:
 
     def source(self, where: str, head: bytes) -> Source:
         """The open file of a path. It closes when nobody holds it any more.
-
-        Raises:
-            NotFoundError: it does not begin with `head`: another file is there.
-        """
+        NotFoundError if it does not begin with `head`: another file is there."""
         if self._process != os.getpid():  # the lock may be held by a thread that is not here
             self._forget()
         with self._lock:

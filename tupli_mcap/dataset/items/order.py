@@ -39,11 +39,7 @@ class Numbers(Protocol):
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a state.
-
-        Raises:
-            SamplingError: it is the state of something else, or of other items.
-        """
+        """Goes on from a state. SamplingError if it is the state of something else, or of other items."""
         ...
 
 

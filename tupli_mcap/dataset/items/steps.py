@@ -137,11 +137,7 @@ def _same(steps: Steps) -> Steps:
 
 
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
-    """The fields as a list; one name becomes a list of one.
-
-    Raises:
-        SamplingError: a field is unknown, or is no text.
-    """
+    """The fields as a list; one name becomes a list of one. SamplingError if a field is unknown, or is no text."""
     return field_names(fields, known, SamplingError)
 
 
@@ -205,11 +201,7 @@ _MOST = 1 << 48  # largest count; sums of a few such numbers fit 64 bits
 
 
 def checked_count(value: object, least: int, what: str, most: int = _MOST) -> int:
-    """The value, if it is an integer from `least` to `most`.
-
-    Raises:
-        SamplingError: it is something else.
-    """
+    """The value, if it is an integer from `least` to `most`. SamplingError if it is something else."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise SamplingError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
     if value > most:
@@ -218,11 +210,7 @@ def checked_count(value: object, least: int, what: str, most: int = _MOST) -> in
 
 
 def checked_numbers(value: Any, what: str) -> Array:
-    """The value as int64, if it is integers in one dimension.
-
-    Raises:
-        SamplingError: it is something else.
-    """
+    """The value as int64, if it is integers in one dimension. SamplingError if it is something else."""
     try:
         numbers = np.asarray(value)
     except (TypeError, ValueError, OverflowError):  # lists of different lengths, for example

@@ -304,10 +304,7 @@ def _numbers_of(recording: Recording, first: int) -> list[int]:
 
 def _finished(path: Path) -> Path:
     """Finishes the recording of a killed process; returns the path of the file to send.
-
-    Raises:
-        RecordingError, FormatError: nothing of it can be saved.
-    """
+    RecordingError or FormatError if nothing of it can be saved."""
     try:
         finish_recording(path)
         return path

@@ -97,10 +97,7 @@ def carried_artifacts(
 
 def checked_signature(recording: Recording, required: bool, signers: Sequence[str] = ()) -> Signature | None:
     """The checked signature of a recording to import; None if it has none, or if its signature does not fit.
-
-    Raises:
-        SignatureError: One is required, and is missing, does not fit, or is of another key.
-    """
+    SignatureError if one is required, and is missing, does not fit, or is of another key."""
     if not required:
         known = _trust.trusted_keys() and SIGNATURE_NAME in recording.attachments
         try:

@@ -110,11 +110,7 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
 
 
 def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
-    """Numbers of the episodes that the storage lacks.
-
-    Raises:
-        StorageError: It holds other episodes with the same ids.
-    """
+    """Numbers of the episodes that the storage lacks. StorageError if it holds other episodes with the same ids."""
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
         return list(ids.values())

@@ -73,10 +73,7 @@ class Catalog:
 
     def alone(self) -> AbstractContextManager[None]:
         """The lock to hold while the catalog is brought up to date, so that nothing older replaces what is newer.
-
-        Raises:
-            CatalogUnusableError: The lock cannot be taken.
-        """
+        CatalogUnusableError if the lock cannot be taken."""
         return self._database.alone()
 
     def close(self) -> None:
@@ -120,10 +117,7 @@ class Catalog:
     ) -> None:
         """Catalogue a recording, see `queries.put_recording`. `rows` is consumed a chunk at a time while the catalog is
         locked for other writers.
-
-        Raises:
-            StorageError: Two rows have one episode number, or SQLite refuses.
-        """
+        StorageError if two rows have one episode number, or SQLite refuses."""
         remaining = iter(rows)
         first = list(itertools.islice(remaining, _ROWS_AT_ONCE))  # read before the lock is taken
         with self._write() as connection:

@@ -71,10 +71,7 @@ class Database:
 
     def open(self) -> None:
         """Make sure that the file is a catalog of this version; anything else is replaced by an empty one.
-
-        Raises:
-            StorageError: The file cannot be opened or written.
-        """
+        StorageError if the file cannot be opened or written."""
         with self._lock, _translated(self.path), _usable(self.path):
             self._open()
 
@@ -92,10 +89,7 @@ class Database:
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
         """Locks out other threads and processes that update the catalog; reentrant in a thread.
-
-        Raises:
-            CatalogUnusableError: The lock cannot be taken.
-        """
+        CatalogUnusableError if the lock cannot be taken."""
         with contextlib.ExitStack() as stack:
             try:
                 stack.enter_context(self._alone)

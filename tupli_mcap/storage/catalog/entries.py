@@ -41,10 +41,7 @@ class Entry(NamedTuple):
 @contextlib.contextmanager
 def entry_of(root: Path, relative: str) -> Iterator[Entry]:
     """The entry of a recording below a storage's root; its rows can be read inside the block.
-
-    Raises:
-        FormatError, RecordingError, OSError: It is damaged, or gone.
-    """
+    FormatError, RecordingError or OSError if it is damaged, or gone."""
     path = root / relative
     stamp, notes, live = stamp_of(root, relative), Notes.read(path, root), is_locked(path)
     with Recording(path) as recording:

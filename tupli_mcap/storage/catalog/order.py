@@ -145,10 +145,7 @@ def ranges(
 
 def beyond(connection: Connection, found: Sequence[Range], sort: Sort | None, after: After) -> list[Range]:
     """The ranges after an episode. If they are ordered by recording alone, that one may be deleted.
-
-    Raises:
-        NotFoundError: it was deleted, and the order depends on its values.
-    """
+    NotFoundError if it was deleted, and the order depends on its values."""
     path, number = escape_text(after.recording), min(after.episode, LAST_EPISODE)
     row_id = first_of(RECORDING.c.id) + number
     if sort is None:

@@ -34,10 +34,7 @@ _FORGOTTEN: Final = 90 * 86_400  # seconds after which a catalog that nobody ope
 
 def catalog_path(root: Path) -> Path | None:
     """The catalog of the storage in a directory; None if the cache directory is on a network file system.
-
-    Raises:
-        OSError: The directory cannot be made, or others may write there.
-    """
+    OSError if the directory cannot be made, or others may write there."""
     real = Path(os.path.realpath(root))
     status = real.stat()
     catalogs = cache_dir() / "catalogs"

@@ -100,10 +100,7 @@ def put_recording(
     runs: str,
 ) -> None:
     """Adds a recording, or replaces its entry. `runs` is JSON: a list of its episodes' runs.
-
-    Raises:
-        FormatError: A row's metadata is not a strict JSON object.
-    """
+    FormatError if a row's metadata is not a strict JSON object."""
     number = _add_recording(connection, relpath, stamp, uuid, benchmark_id, runs)
     indexed = _indexed(connection)
     remaining = iter(rows)
@@ -201,10 +198,7 @@ def plan_of(connection: Connection, filter: BaseFilter | str | None) -> str:
 
 def declare_key(connection: Connection, key: str) -> None:
     """Indexes a key, so that filters on it find few episodes among many; declaring it twice is fine.
-
-    Raises:
-        FilterError: There is no such top-level key, or it is that of all metadata.
-    """
+    FilterError if there is no such top-level key, or it is that of all metadata."""
     path = path_in(key, EpisodeHeader)
     if path == ("metadata",):
         raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
@@ -342,10 +336,7 @@ def _headers(
     connection: Connection, asked: Asked, found: Narrowed, rows: Iterable[Any]
 ) -> Iterator[EpisodeHeader]:
     """The episodes of rows, of `_COLUMNS` and `_OF_RECORDING`, that match.
-
-    Raises:
-        FilterError: the connection has the option `tupli_deadline`, and that has passed.
-    """
+    FilterError if the connection has the option `tupli_deadline`, and that has passed."""
     if time.monotonic() > connection.get_execution_options().get("tupli_deadline", math.inf):
         raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
     matches = None if asked.filter is None or not found.unsure else bound_predicate(asked.filter)

@@ -92,10 +92,7 @@ _INDEXED: Final = (
 
 def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
     """The row as the catalog holds it.
-
-    Raises:
-        FormatError: The episode's number is no 32-bit number, or its metadata no JSON object.
-    """
+    FormatError if the episode's number is no 32-bit number, or its metadata no JSON object."""
     if not 0 <= row.episode < 1 << EPISODE_BITS:
         raise FormatError(f"expected an episode number below 2**{EPISODE_BITS}, found {row.episode!r}")
     number, seed = row.episode_return, row.seed
@@ -225,10 +222,7 @@ def load_metadata(text: str) -> Any:
 
 def _searchable(text: str) -> str:
     """Metadata as a database can hold them, with keys that it reads as Python does.
-
-    Raises:
-        FormatError: The text is not a strict JSON object.
-    """
+    FormatError if the text is not a strict JSON object."""
     if "\\" not in text and '"$' not in text and (text.isascii() or not _SURROGATE.search(text)):
         try:
             if isinstance(_STRICT.decode(text), dict):

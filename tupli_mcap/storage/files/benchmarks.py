@@ -195,10 +195,7 @@ def name_in(document: dict[str, Any]) -> str:
 
 def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | None]:
     """The id of a benchmark, its document without the header's fields, and its pickle.
-
-    Raises:
-        StorageError: its hash is not that of its content.
-    """
+    StorageError if its hash is not that of its content."""
     try:
         content = unpack(query.serialized)
     except FormatError:

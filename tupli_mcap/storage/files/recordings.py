@@ -79,11 +79,7 @@ class RecordingFiles:
         return self._catalog.known(wanted) or self._catalog.headers(wanted)
 
     def header(self, uri: str) -> EpisodeHeader:
-        """The header of an episode.
-
-        Raises:
-            NotFoundError: There is no such episode.
-        """
+        """The header of an episode. NotFoundError if there is no such episode."""
         if is_episode_id(uri):
             # The catalog may be out of date, so only the place of the episode is taken from it.
             found = self._catalog.known(FilterEQ(key="id", value=uri), limit=1)

@@ -99,10 +99,7 @@ class SyncedCatalog:
 
     def put(self, relative: str) -> int:
         """Catalogue one recording; returns its number of episodes, -1 if it is not known yet.
-
-        Raises:
-            FormatError: It is damaged.
-        """
+        FormatError if it is damaged."""
 
         def put() -> int:
             alone = self._catalog.alone()
