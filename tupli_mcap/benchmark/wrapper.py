@@ -409,6 +409,5 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @classmethod
     def _deserialize(cls, env: gym.Env[Any, Any], storage: TupliStorage) -> gym.Env[Any, Any]:
-        """Override it to put the data back (`env.unwrapped.data =
-        storage.load_artifact(env.unwrapped.data)`)."""
+        """Override it to put the data back (`env.unwrapped.data = storage.load_artifact(env.unwrapped.data)`)."""
         return env

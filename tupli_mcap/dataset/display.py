@@ -16,8 +16,7 @@ _WIDTH = 100
 
 
 class Facts(NamedTuple):
-    """Known facts about a dataset: `headers`, and `steps` after the tuple filter, are None before they are
-    read."""
+    """Known facts about a dataset; `headers`, and `steps` after the tuple filter, are None before they are read."""
 
     source: str
     headers: Sequence[EpisodeHeader] | None

@@ -39,8 +39,7 @@ def _value(header: EpisodeHeader, key: str) -> Any:
 
 
 def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
-    """Raises FilterError if a filter that matches no episode names metadata or parts of runs that no episode
-    has."""
+    """FilterError if a filter that matches no episode names metadata, or parts of runs, that no episode has."""
     known = {
         ("metadata",): {key for header in among for key in header.metadata},
         ("run",): {key for header in among for key in header.run},

@@ -208,10 +208,7 @@ class FilesSource:
 
 class JoinedSource:
     """The recordings of several sources, each with its wanted episodes.
-
-    Raises:
-        DatasetError: two sources have different recordings with the same name.
-    """
+    DatasetError if two sources have different recordings with the same name."""
 
     def __init__(self, sources: Sequence[tuple[Source, Sequence[EpisodeHeader]]]) -> None:
         self._sources = [source for source, _ in sources]

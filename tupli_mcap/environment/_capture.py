@@ -124,11 +124,7 @@ class Snapshot:
                 self._failure = err
 
     def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
-        """The environment as data, see `capture`.
-
-        Raises:
-            TupliError: It cannot be pickled.
-        """
+        """The environment as data, see `capture`. TupliError if it cannot be pickled."""
         found = self._records[by_reference]
         if isinstance(found, TupliError):
             raise found
@@ -136,11 +132,7 @@ class Snapshot:
 
     def copy(self) -> gym.Env[Any, Any]:
         """A new environment of the same classes in the captured state. Do not close it: this may close what the
-        original uses.
-
-        Raises:
-            TupliError: The environment cannot be pickled.
-        """
+        original uses. TupliError if the environment cannot be pickled."""
         if self._copy is None:
             raise TupliError(
                 f"the environment {self._name} cannot be captured, since it cannot be pickled "

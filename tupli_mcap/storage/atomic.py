@@ -110,11 +110,7 @@ class LockError(StorageError):
 
 class Lock:
     """Keeps the other processes and threads out while a block reads, changes and writes. Reentrant in a
-    thread. A forked child does not inherit it.
-
-    Raises:
-        LockError: The file cannot be opened.
-    """
+    thread. A forked child does not inherit it. LockError if the file cannot be opened."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

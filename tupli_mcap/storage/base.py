@@ -189,8 +189,7 @@ class TupliStorage(ABC):
         limit: int | None = None,
         offset: int = 0,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        """The episodes that match a filter, in the order of their recordings; EpisodeItems with tuples if
-        asked."""
+        """The episodes that match a filter, in the order of their recordings; EpisodeItems with tuples if asked."""
         check_page(limit, offset)
         if not include_tuples:
             return self._list_headers(filter, limit, offset)

@@ -137,8 +137,7 @@ def artifacts_of(record: EnvironmentRecord, where: str) -> tuple[str, ...]:
 
 
 def facts_about(env: gym.Env[Any, Any]) -> dict[str, Any]:
-    """Facts about an environment for the `benchmark` entry, besides its identity: its spaces, if they have
-    JSON."""
+    """Facts about an environment for the `benchmark` entry, besides its identity: its spaces, if they have JSON."""
     try:
         return {
             "observation_space": space_to_json(own_space(env.observation_space)),

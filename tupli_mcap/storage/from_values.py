@@ -107,8 +107,7 @@ def _episode_data(
 def _episode_spaces(
     episodes: Sequence[Episode], declared: Sequence[gym.Space[Any]]
 ) -> tuple[gym.Space[Any], gym.Space[Any], gym.Space[Any] | None]:
-    """Spaces of the states, actions and rewards of episodes: the declared ones that fit, else inferred
-    ones."""
+    """Spaces of the states, actions and rewards of episodes: the declared ones that fit, else inferred ones."""
     tuples = [item for episode in episodes for item in episode.tuples]
     columns = [[item.state for item in tuples], [item.action for item in tuples]]
     state, action = (

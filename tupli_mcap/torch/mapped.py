@@ -51,11 +51,7 @@ class MapDataset(Dataset[dict[str, Any]]):
         return {"items": self._reader.items.identity}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Checks that the state is one of the same items.
-
-        Raises:
-            SamplingError: it is of other items.
-        """
+        """Checks that the state is one of the same items; SamplingError if not."""
         check_state(state_dict, self._reader.items.identity, {})
 
 

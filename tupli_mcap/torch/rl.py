@@ -88,11 +88,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         return 0 <= int(item) < len(self)
 
     def set(self, cursor: Any, data: Any, *, set_cursor: bool = True) -> None:
-        """Refused.
-
-        Raises:
-            SamplingError: always.
-        """
+        """Refused: always raises SamplingError."""
         raise SamplingError("a RecordedStorage is read-only; add steps to another storage")
 
     def _empty(self) -> None:
@@ -103,11 +99,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         return {"items": self._transitions.identity}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Checks that a state is of the same transitions.
-
-        Raises:
-            SamplingError: it is of other transitions.
-        """
+        """Checks that a state is of the same transitions; SamplingError if not."""
         check_state(state_dict, self._transitions.identity, {})
 
 

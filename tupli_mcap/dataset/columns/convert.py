@@ -170,8 +170,7 @@ def _convert_each(convert: Callable[[Any], Any], columns: Five) -> Five:
 
 
 def _as_arrays(column: Any) -> Any:
-    """Turns lists of numbers, which subclasses may return, into arrays; values that differ in size stay a
-    list."""
+    """Turns lists of numbers, which subclasses may return, into arrays; values that differ in size stay a list."""
     if (
         isinstance(column, list)
         and column

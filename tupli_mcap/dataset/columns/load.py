@@ -317,10 +317,7 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 class TupleSelector:
     """A tuple filter, and the `fields` of the columns that it needs.
-
-    Raises:
-        FilterError: it is neither an expression nor a function, or it names an unknown field of a step.
-    """
+    FilterError if it is neither an expression nor a function, or if it names an unknown field of a step."""
 
     fields: tuple[str, ...]
 

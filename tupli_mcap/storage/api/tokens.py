@@ -29,10 +29,7 @@ _Servers = dict[str, dict[str, Any]]
 
 class TokenStore:
     """Tokens by server. Safe for threads and processes.
-
-    Raises:
-        StorageError: the file cannot be written, or the keyring does not give what it keeps.
-    """
+    StorageError if the file cannot be written, or the keyring does not give what it keeps."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -106,7 +106,6 @@ def _places(recording: Recording) -> list[int]:
 
 
 def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
-    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no
-    end."""
+    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no end."""
     last = {env: i for i, env in enumerate(envs)}
     return {i for i in last.values() if ends[i] == INTERRUPTED}
