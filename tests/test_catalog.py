@@ -35,11 +35,15 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import pages, place
-from tupli_mcap.storage.catalog.catalog import Catalog, CatalogDamagedError, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.database import CatalogDamagedError
+from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.place import catalog_path
-from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, declared_keys, find_episodes
+from tupli_mcap.storage.catalog.queries import count_episodes, declared_keys, find_episodes
+from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.catalog.tables import FLAGGED_KEYS, LAST_EPISODE, RECORDING, TALLY
 from tupli_mcap.storage.catalog.tallies import Tally, tallies
+from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 CREATED_NS = 1_795_251_600_000_001_999
@@ -848,7 +852,9 @@ class TestPlace:
 WORKER = """
 import sys
 from pathlib import Path
-from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.rows import EpisodeRow
+from tupli_mcap.storage.listing import RecordingStamp
 
 path, name = Path(sys.argv[1]), sys.argv[2]
 sys.stdin.readline()

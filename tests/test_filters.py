@@ -44,8 +44,10 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.schema.times import local_text, span_of, time_ns
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.catalog.tables import EPISODE
+from tupli_mcap.storage.listing import RecordingStamp
 
 STAMP = RecordingStamp(1, 2, 3)
 UUID = "0123456789abcdef0123456789abcdef"

@@ -31,7 +31,8 @@ from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
-from tupli_mcap.storage.catalog.catalog import EpisodeRow, RecordingStamp
+from tupli_mcap.storage.catalog.rows import EpisodeRow
+from tupli_mcap.storage.listing import RecordingStamp
 
 ACTING = re.compile("<script>|<img src=x", re.IGNORECASE)
 

@@ -10,8 +10,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 
-__all__ = ["PendingReset", "Retyped", "Tap"]
-
 
 class PendingReset(NamedTuple):
     """A reset without a step that no recorder has seen."""

@@ -26,8 +26,6 @@ from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
 from tupli_mcap.wrappers.base import check_kind
 
-__all__ = ["DeletedBenchmark", "TupliEnvWrapper"]
-
 # Not `journal_dir`: a storage finds a recording that is being written by the journal beside it.
 _RECORDING_OPTIONS = (
     "record_info", "step_callback", "reward_space", "compression", "chunk_size", "flush_seconds", "durability",

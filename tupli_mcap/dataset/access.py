@@ -34,8 +34,6 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 
-__all__ = ["RandomAccess", "episode_values"]
-
 
 class RandomAccess(SaysWhatIsMeant):
     """Items by number of a dataset, or of saved columns. Only requested items are read."""

@@ -34,18 +34,6 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.sources import Source as EpisodeSource
     from tupli_mcap.storage import TupliStorage
 
-__all__ = [
-    "Chosen",
-    "Examinable",
-    "Source",
-    "Subject",
-    "chosen_from",
-    "chosen_ids",
-    "extremes",
-    "subjects_of",
-    "subjects_once",
-]
-
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
 Source = Recording | str | os.PathLike[str]

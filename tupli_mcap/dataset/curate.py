@@ -34,20 +34,6 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.storage import TupliStorage
 
-__all__ = [
-    "FilterReport",
-    "delete",
-    "file_path",
-    "filter_dataset",
-    "merge_recordings",
-    "relabel",
-    "restore_episodes",
-    "save",
-    "split_recording",
-    "trim",
-    "trim_dataset",
-]
-
 
 class FilterReport(NamedTuple):
     """The result of filtering a dataset, or of a dry run; `size` of the file in bytes, 0 if none was written."""

@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 
     from tupli_mcap.dataset.columns.tables import Level
 
-__all__ = ["Dataset"]
-
 Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
 
 

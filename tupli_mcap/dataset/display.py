@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 from tupli_mcap.errors import plural
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 
-__all__ = ["Facts", "html", "text"]
-
 _ROWS = 20
 _WIDTH = 100
 

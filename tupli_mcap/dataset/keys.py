@@ -11,8 +11,6 @@ from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
 
-__all__ = ["check_metadata", "keys_of", "values_at"]
-
 
 def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
     """The keys of facts about episodes, and of the metadata of any of them."""

@@ -19,8 +19,6 @@ from tupli_mcap.remote import is_server, is_url
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings, is_storage
 
-__all__ = ["open"]
-
 Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
 
 

@@ -14,8 +14,6 @@ from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_re
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
 
-__all__ = ["Query"]
-
 
 class Query:
     """Three filters over a source, and the columns that were read for them. The filters never change.

@@ -36,18 +36,6 @@ from tupli_mcap.storage.sidecar import Notes, storage_of
 if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage
 
-__all__ = [
-    "DatasetError",
-    "FilesSource",
-    "JoinedSource",
-    "OpenRecordings",
-    "Source",
-    "StorageSource",
-    "episode_headers",
-    "numbers_by_recording",
-    "place_of",
-]
-
 _MOST_OPEN = 64
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 

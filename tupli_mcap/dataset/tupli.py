@@ -27,8 +27,6 @@ from tupli_mcap.storage.base import anew
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["TupliDataset"]
-
 SIX = (*FIVE, "infos")
 
 

@@ -15,19 +15,6 @@ from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 
-__all__ = [
-    "WORDS",
-    "Positions",
-    "bounds_of",
-    "candidates",
-    "check_choice",
-    "extreme",
-    "may_be_noted",
-    "named_positions",
-    "places_of",
-    "positions_of",
-]
-
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """Words in place of an episode's number; best and worst are by return, the first of equal ones."""
 

@@ -9,8 +9,6 @@ from typing import Final, TypeVar
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.names import shown
 
-__all__ = ["AUTHORITY", "SECONDS_VARIABLE", "BrokenOffError", "RefusedError", "asked", "why"]
-
 SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
 AUTHORITY: Final = "put the certificate of an authority of your own (PEM) into SSL_CERT_FILE"
 _T = TypeVar("_T")

@@ -24,8 +24,6 @@ from tupli_mcap.cache import cache_dir, delete_oldest, make_private
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.plan import Range
 
-__all__ = ["KeptBlocks", "kept_blocks"]
-
 _VARIABLE: Final = "TUPLI_MCAP_BLOCK_BYTES"
 _DIGEST: Final = 32
 _PARTS: Final = 16

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from urllib.parse import urlsplit
 
-__all__ = ["is_server", "is_url", "is_web", "shown", "shown_name"]
-
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
 

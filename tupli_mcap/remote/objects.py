@@ -16,8 +16,6 @@ from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.remote.failures import SECONDS_VARIABLE, BrokenOffError, RefusedError, asked
 from tupli_mcap.remote.names import is_web, shown
 
-__all__ = ["End", "NoRangesError", "RemoteObject", "find", "listed", "open_store"]
-
 _T = TypeVar("_T")
 Tell = Callable[[int], None]  # called with the number of bytes that have just arrived
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})

@@ -8,8 +8,6 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.names import is_web, shown
 from tupli_mcap.remote.objects import listed
 
-__all__ = ["is_pattern", "matching"]
-
 _MAGIC = re.compile(r"[*?\[]")
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 
-__all__ = ["is_cut_cheaper", "pieces_of"]
-
 Range = tuple[int, int]  # half-open: first byte, and the one after the last
 
 _LARGEST_GAP = 1 << 20

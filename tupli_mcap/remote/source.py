@@ -19,8 +19,6 @@ from tupli_mcap.remote.names import shown
 from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
 
-__all__ = ["BLOCK_BYTES", "RemoteSource", "copied", "open_url", "watching"]
-
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
 # Fetched when a file is opened: holds the summary and the index, unless the file is huge.
 _TAIL = 128 << 10

@@ -12,8 +12,6 @@ from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["storage_at"]
-
 
 def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
     """The storage at the address of a server, or in a directory, which need not exist; a storage is returned as it is.

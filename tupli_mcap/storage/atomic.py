@@ -22,8 +22,6 @@ from tupli_mcap.mcap.lock import drop_private, open_private
 from tupli_mcap.recording import journal_path
 from tupli_mcap.storage.texts import first_defect
 
-__all__ = ["Lock", "LockError", "fill", "locked", "os_errors", "read_model", "refusals_told", "write_bytes"]
-
 _Class = TypeVar("_Class")
 _Model = TypeVar("_Model", bound=BaseModel)
 

@@ -30,23 +30,6 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.schema.times import time_ns
 
-__all__ = [
-    "LOCAL_USER",
-    "TupliStorage",
-    "TupliStorageError",
-    "anew",
-    "by_recording",
-    "check_page",
-    "each_opened",
-    "episode_id",
-    "is_episode_id",
-    "new_name",
-    "oldest_first",
-    "published_in",
-    "uuid_of",
-    "with_tuples",
-]
-
 TupliStorageError = StorageError
 """The name this error has in PyTupli."""
 

@@ -19,22 +19,6 @@ from tupli_mcap.spaces.leaves import own_space
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 from tupli_mcap.storage.texts import is_hash
 
-__all__ = [
-    "BenchmarkContent",
-    "attachments_of",
-    "benchmark_entry",
-    "benchmark_hash",
-    "declared_spaces",
-    "edits_of",
-    "facts_about",
-    "header_of",
-    "pack",
-    "plain",
-    "recording_attachments",
-    "restored",
-    "unpack",
-]
-
 PICKLE_NAME = "env.cloudpickle"
 DOCUMENT_NAME = "benchmark.json"
 ARTIFACT_PREFIX = "artifacts/"

@@ -29,8 +29,6 @@ from tupli_mcap.remote import copied, shown
 from tupli_mcap.remote.objects import NoRangesError, find
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["fetched", "fetched_url"]
-
 _BUDGET_VARIABLE: Final = "TUPLI_MCAP_CACHE_BYTES"
 _BUDGET: Final = 4 << 30
 _PART: Final = ".part"

@@ -39,19 +39,6 @@ from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, che
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
-__all__ = [
-    "Copied",
-    "Published",
-    "Pushed",
-    "copy_episodes",
-    "publish_benchmark",
-    "publish_own",
-    "push_recording",
-    "send_waiting",
-    "unpublish_benchmark",
-    "unpublish_own",
-]
-
 
 class Copied(NamedTuple):
     """Numbers of items that were new to the target, or would be."""

@@ -16,8 +16,6 @@ from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.schema import Benchmark, Episode, EpisodeHeader
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 
-__all__ = ["conform", "infer_space", "record_each", "write_episodes"]
-
 _NUMBERS = (bool, int, float, np.generic)
 _KINDS = "biuf"
 _NUMBER = spaces.Box(-np.inf, np.inf, (), np.float64)

@@ -25,23 +25,6 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
-__all__ = [
-    "LIVE",
-    "Compactable",
-    "FoundRecording",
-    "ListedRecording",
-    "RecordingStamp",
-    "compactable",
-    "find_recordings",
-    "is_storage",
-    "list_recordings",
-    "listed_of",
-    "recordings_at",
-    "scan",
-    "stamp_of",
-]
-
-
 _PARTS = ("benchmarks", "artifacts", "recordings", "storage.json")
 
 

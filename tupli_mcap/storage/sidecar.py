@@ -30,8 +30,6 @@ from pydantic import BaseModel, Field
 from tupli_mcap.storage.atomic import os_errors, read_model, write_bytes
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["Deletion", "Notes", "Sidecar", "sidecar_path", "storage_of"]
-
 DELETING = "deleting.json"
 EpisodeNumber = Annotated[int, Field(ge=0, lt=1 << 32)]
 RecordingUuid = Annotated[str, Field(pattern="^([0-9a-f]{32})?$")]

@@ -9,8 +9,6 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-__all__ = ["escape_text", "first_defect", "is_hash", "to_json", "unescape_text"]
-
 _TO_ESCAPE: Final = re.compile("[\x00\x01\ud7ff\ud800-\udfff]")
 _ESCAPED: Final = re.compile("\x01[\x01\x02]|\ud7ff[\x01\u0100-\u08ff]")
 _SURROGATES_AT: Final = 0x100

@@ -23,8 +23,6 @@ from tupli_mcap.storage.listing import find_recordings, is_storage
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
 
-__all__ = ["verify_paths"]
-
 
 def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
     """Verifies files and directories, one after the other, also after damage. A URL is copied to a temporary file.

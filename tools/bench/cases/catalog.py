@@ -19,7 +19,9 @@ MATCHES = 1000
 def filter_catalog(run: Run) -> Iterator[Target]:
     """A range of a declared metadata key that matches 1,000 of all catalogued episodes."""
     from tupli_mcap.schema import FilterGEQ
-    from tupli_mcap.storage.catalog.catalog import Catalog, EpisodeRow, RecordingStamp
+    from tupli_mcap.storage.catalog.catalog import Catalog
+    from tupli_mcap.storage.catalog.rows import EpisodeRow
+    from tupli_mcap.storage.listing import RecordingStamp
 
     total = run.part(1_000_000)
     matches = min(MATCHES, total // 2)

@@ -17,18 +17,6 @@ from tupli_mcap.messages.step import StepLayout
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "D4RL_NAMES",
-    "BaseTupleParser",
-    "NumpyTupleParser",
-    "TensorflowTupleParser",
-    "TorchTupleParser",
-    "batches",
-    "dataframe",
-    "import_pandas",
-    "mark_cuts",
-]
-
 D4RL_NAMES: Mapping[str, str] = {
     "observations": "states",
     "actions": "actions",

@@ -26,15 +26,6 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, ev
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
 
-__all__ = [
-    "Selected",
-    "TupleFilter",
-    "TupleSelector",
-    "read_columns",
-    "read_in_order",
-    "steps_within",
-]
-
 _BLOCK_BYTES = 64 << 20
 _RECORDED = tuple(field for field in FIELDS if field != "infos")
 

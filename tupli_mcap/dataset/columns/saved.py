@@ -32,8 +32,6 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.texts import first_defect
 
-__all__ = ["SavedColumns", "open_columns", "save_columns"]
-
 _MANIFEST = "manifest.json"
 _BLOCK_BYTES = 16 << 20  # of steps that are written at once
 _BLOCK = 4096  # steps in a block: cheap to read together

@@ -18,8 +18,6 @@ from tupli_mcap.spaces.statistics import ElementStatistics
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
 
-__all__ = ["QUANTILES", "STATISTICAL", "FieldStatistics", "statistics_of"]
-
 STATISTICAL = ("states", "actions", "rewards", "next_states")
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 _SAMPLED = 1 << 16  # steps that quantiles are computed from, at even distances

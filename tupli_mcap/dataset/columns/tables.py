@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from tupli_mcap.messages.step import StepLayout
     from tupli_mcap.spaces.labels import Labels
 
-__all__ = ["Level", "arrow", "dataframe"]
-
 Level: TypeAlias = Literal["steps", "episodes"]
 _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is of no use to anybody
 

@@ -12,8 +12,6 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import item_getter, reward_getter
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 
-__all__ = ["EpisodeItems", "Tuples"]
-
 
 class Tuples(Sequence[RLTuple]):
     """The steps of some columns as tuples, which are made on access.

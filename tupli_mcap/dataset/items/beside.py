@@ -12,8 +12,6 @@ from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields,
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.recording.frames import Frames, gathered
 
-__all__ = ["BESIDE", "FRAMES", "INFOS", "FrameValues", "InfoValues", "StepsWith", "info_columns", "info_keys"]
-
 INFOS, FRAMES = BESIDE = ("infos", "frames")
 
 

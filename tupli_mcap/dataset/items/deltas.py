@@ -15,8 +15,6 @@ from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.recording.columns.fields import OTHER_NAMES, Parts
 
-__all__ = ["DeltaWindow", "DeltaWindows", "Unit"]
-
 Unit = Literal["steps", "seconds", "clock"]
 UNITS = ("steps", "seconds", "clock")
 KEYS = {

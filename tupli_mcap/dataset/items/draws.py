@@ -15,8 +15,6 @@ from tupli_mcap.schema import BaseFilter, F
 if TYPE_CHECKING:
     from tupli_mcap.dataset.items.items import Items
 
-__all__ = ["Sampler", "Weights"]
-
 Weights = Array | Sequence[float] | F | BaseFilter
 _DRAWS = 0  # the stream of random numbers; an `Order` has another
 

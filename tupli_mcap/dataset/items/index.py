@@ -28,8 +28,6 @@ from tupli_mcap.recording.columns.runs import Segments, SegmentsBuilder
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import uuid_of
 
-__all__ = ["ListedEpisodes", "OpenFiles", "StepIndex", "positions_of"]
-
 _CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
 _HEAD = 1024  # bytes: the file's first metadata are shorter
 _MOST_OPEN = 64  # files; a few more while several threads read

@@ -19,13 +19,6 @@ from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, 
 from tupli_mcap.recording.columns.fields import Parts
 from tupli_mcap.schema import BaseFilter, F
 
-__all__ = [
-    "Batches",
-    "Items",
-    "Samples",
-    "StepItems",
-]
-
 T = TypeVar("T", bound="Parts")
 _MANY = 1 << 20  # items that are processed together
 

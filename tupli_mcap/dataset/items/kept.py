@@ -13,8 +13,6 @@ from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_r
 from tupli_mcap.recording.columns.gather import Column, Rows, do_all
 from tupli_mcap.recording.columns.runs import Part, Segments
 
-__all__ = ["NumberedRows"]
-
 # Threads that decode small chunks contend for the interpreter lock at each one: for few chunks, one thread is faster.
 _FEW_CHUNKS = 128
 _LARGE_CHUNK = 1 << 20  # bytes

@@ -15,8 +15,6 @@ from tupli_mcap.dataset.items.steps import SamplingError, checked_count
 if TYPE_CHECKING:
     from tupli_mcap.dataset.items.items import Items
 
-__all__ = ["Numbers", "Order", "Shuffle", "check_state", "checked_seed", "seeded"]
-
 Shuffle = Literal["exact", "blocks"]
 _EPOCHS = 1  # the stream of random numbers; a `Sampler` has another
 _SHUFFLES = (False, "exact", "blocks")

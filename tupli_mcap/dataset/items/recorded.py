@@ -20,8 +20,6 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache
 from tupli_mcap.recording.columns.gather import EPISODE, Plan, final_rows, image_rows, put, step_rows
 
-__all__ = ["CACHE_BYTES", "THREADS", "RecordedSteps", "steps_of"]
-
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
 _STATES = ("states",)

@@ -21,8 +21,6 @@ from tupli_mcap.arrays import Array
 if TYPE_CHECKING:
     from tupli_mcap.dataset.items.items import Items
 
-__all__ = ["Blocks", "Part", "ShuffledBatches", "mixing"]
-
 _CHUNK_BYTES = 256 << 10  # assumed if the size of chunks is not known
 
 

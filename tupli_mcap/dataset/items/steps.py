@@ -12,21 +12,6 @@ from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIVE, field_names
 
-__all__ = [
-    "FIELDS",
-    "MemorySteps",
-    "SamplingError",
-    "Steps",
-    "checked_count",
-    "checked_fields",
-    "checked_numbers",
-    "following",
-    "map_arrays",
-    "pick",
-    "pick_runs",
-    "rows_of_runs",
-]
-
 FIELDS = (*FIVE, "next_states", "times")
 _MAX_ITEM = 1 << 30  # bytes of an item of an array
 _BLOCK = 4096  # steps in memory that are close to each other

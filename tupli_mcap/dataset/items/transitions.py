@@ -14,8 +14,6 @@ from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
 from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
-__all__ = ["TRANSITION_FIELDS", "Transition", "Transitions"]
-
 TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
 
 

@@ -19,8 +19,6 @@ from tupli_mcap.dataset.items.steps import (
 )
 from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
-__all__ = ["Pad", "Window", "Windows", "shaped_rows"]
-
 Pad = Literal["none", "repeat", "zero"]
 PADS = ("none", "repeat", "zero")
 FIVE = ("states", "actions", "rewards", "terminals", "timeouts")

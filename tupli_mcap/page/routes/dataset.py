@@ -29,7 +29,8 @@ from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.schema import EpisodeHeader
-from tupli_mcap.storage.catalog.queries import Sort, find_episodes
+from tupli_mcap.storage.catalog.order import Sort
+from tupli_mcap.storage.catalog.queries import find_episodes
 
 __all__ = ["router", "shown_first"]
 

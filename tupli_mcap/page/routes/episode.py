@@ -21,7 +21,8 @@ from tupli_mcap.page.shelf import Shelf, find_episode, opened, python_line, seen
 from tupli_mcap.page.texts import iso
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_bound
-from tupli_mcap.storage.catalog.queries import After, Sort, find_episodes
+from tupli_mcap.storage.catalog.order import After, Sort
+from tupli_mcap.storage.catalog.queries import find_episodes
 
 __all__ = ["FIELDS", "Seen", "look", "router"]
 

@@ -24,7 +24,8 @@ from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episode
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
 from tupli_mcap.schema.facts import comparisons, path_in
-from tupli_mcap.storage.catalog.queries import After, Sort, count_episodes, declared_keys, find_episodes
+from tupli_mcap.storage.catalog.order import After, Sort
+from tupli_mcap.storage.catalog.queries import count_episodes, declared_keys, find_episodes
 from tupli_mcap.storage.catalog.tables import TALLY
 
 __all__ = ["Table", "router", "table_of"]

@@ -17,7 +17,7 @@ from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.queries import After
+from tupli_mcap.storage.catalog.order import After
 
 __all__ = ["router"]
 

@@ -43,7 +43,7 @@ from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served,
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
-from tupli_mcap.storage.catalog.queries import After
+from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.texts import first_defect
 
 __all__ = ["router"]

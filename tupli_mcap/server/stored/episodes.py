@@ -25,7 +25,7 @@ from tupli_mcap.server.people.access import (
 from tupli_mcap.server.tables import FILE, USER
 from tupli_mcap.storage.base import by_recording, published_in
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.queries import After
+from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
 from tupli_mcap.storage.catalog.tallies import Seen, recordings_seen, tally
 from tupli_mcap.storage.texts import escape_text, unescape_text

@@ -14,17 +14,6 @@ from tupli_mcap.storage.texts import first_defect
 if TYPE_CHECKING:
     import httpx
 
-__all__ = [
-    "LATER",
-    "ConflictError",
-    "Page",
-    "SignInError",
-    "TokenPair",
-    "UnreachableError",
-    "as_told",
-    "error_of",
-]
-
 LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
 _LATER: Final = "try again later"

@@ -38,8 +38,6 @@ from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
 from tupli_mcap.storage.texts import is_hash
 
-__all__ = ["TupliAPIClient"]
-
 _Model = TypeVar("_Model", bound=BaseModel)
 
 

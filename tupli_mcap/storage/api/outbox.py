@@ -46,8 +46,6 @@ from tupli_mcap.storage.base import new_name
 from tupli_mcap.storage.catalog.entries import rows_of
 from tupli_mcap.storage.sidecar import Sidecar
 
-__all__ = ["Outbox", "Waiting", "outbox_of"]
-
 _DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
 _WHOSE: Final = "whose.json"
 _MOST_PAUSE: Final = 60.0  # seconds between two attempts

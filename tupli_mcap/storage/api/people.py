@@ -20,8 +20,6 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.api.answers import SignInError, as_told
 from tupli_mcap.storage.api.session import Session
 
-__all__ = ["People"]
-
 
 class People:
     """Methods for the people of a server. Every method raises StorageError if the user lacks the right."""

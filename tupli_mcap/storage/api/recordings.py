@@ -23,8 +23,6 @@ from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.sidecar import Notes
 
-__all__ = ["Recordings", "without_deleted"]
-
 
 class Recordings:
     """Methods for the recordings of a server."""

@@ -30,8 +30,6 @@ from tupli_mcap.storage.api.tokens import TokenStore, user_tokens
 if TYPE_CHECKING:
     import httpx
 
-__all__ = ["DEFAULT_URL", "TIMEOUT", "Session", "pages"]
-
 DEFAULT_URL: Final = "http://127.0.0.1:8080"
 TIMEOUT: Final = 60.0  # seconds without a byte
 _CONNECT_TIMEOUT: Final = 10.0

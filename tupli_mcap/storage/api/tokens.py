@@ -20,8 +20,6 @@ from tupli_mcap.storage.atomic import Lock, os_errors
 if TYPE_CHECKING:
     from keyring.backend import KeyringBackend
 
-__all__ = ["TokenStore", "last_server", "user_tokens"]
-
 _SERVICE: Final = "tupli-mcap"
 _TOKENS: Final = ("access_token", "refresh_token")
 _Servers = dict[str, dict[str, Any]]

@@ -18,8 +18,6 @@ from tupli_mcap.storage.api.answers import UnreachableError, as_told
 from tupli_mcap.storage.api.session import TIMEOUT, Session
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["Sent", "Tell", "send_file"]
-
 Tell = Callable[[int], None]
 """Is told how many more bytes were sent or fetched; fewer than none, where some have to be sent again."""
 

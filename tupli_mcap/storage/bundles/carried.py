@@ -32,8 +32,6 @@ from tupli_mcap.storage.benchmark_json import (
 )
 from tupli_mcap.storage.texts import first_defect
 
-__all__ = ["carried_artifacts", "carried_benchmark", "carried_environment", "checked_signature"]
-
 
 def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
     """The environment that a recording carries; raises StorageError if there is none, FormatError if it is damaged."""

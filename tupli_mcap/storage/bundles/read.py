@@ -25,8 +25,6 @@ from tupli_mcap.storage.bundles.carried import carried_artifacts, carried_benchm
 if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["ImportPreview", "preview_import", "read_bundle"]
-
 _PIECE = 1 << 22
 
 

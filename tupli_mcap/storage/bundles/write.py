@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
     from tupli_mcap.storage.files import FileStorage
 
-__all__ = ["bundle_recording", "export_episodes", "write_bundle"]
-
 Attachments = dict[str, tuple[str, bytes]]
 
 

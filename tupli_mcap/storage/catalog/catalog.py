@@ -13,26 +13,11 @@ from sqlalchemy import Connection, select
 
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.database import (
-    CatalogDamagedError,
-    CatalogMovedError,
-    CatalogUnusableError,
-    Database,
-    MemoryDatabase,
-)
+from tupli_mcap.storage.catalog.database import Database, MemoryDatabase
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.catalog.tables import RECORDING
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
-
-__all__ = [
-    "Catalog",
-    "CatalogDamagedError",
-    "CatalogMovedError",
-    "CatalogUnusableError",
-    "EpisodeRow",
-    "RecordingStamp",
-]
 
 _ROWS_AT_ONCE: Final = 20_000
 _T = TypeVar("_T")

@@ -46,10 +46,6 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = [
-    "ALL", "Condition", "Narrowed", "compared", "flagged", "near_value", "of_runs", "recorded", "unsure_value",
-]  # fmt: skip
-
 Condition = ColumnElement[bool]
 
 _MOST_VALUES: Final = 250  # in a comparison: databases limit them

@@ -18,8 +18,6 @@ from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
-__all__ = ["Entry", "entry_of", "put_entry", "rows_of", "runs_of"]
-
 
 class Entry(NamedTuple):
     """A recording to catalogue.

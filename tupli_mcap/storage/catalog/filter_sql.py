@@ -50,8 +50,6 @@ from tupli_mcap.storage.catalog.tables import (
     VALUE,
 )
 
-__all__ = ["Source", "in_all", "merged", "narrowed", "recordings_of", "sources"]
-
 _MOST_COMPARISONS: Final = 64  # in a statement: databases limit them
 _NOT_INDEXED: Final = (FilterType.NE, FilterType.CONTAINS)
 

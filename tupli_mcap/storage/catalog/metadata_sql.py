@@ -22,8 +22,6 @@ from sqlalchemy.types import NullType, TypeDecorator, TypeEngine
 
 from tupli_mcap.storage.catalog.tables import EPISODE, TEXT
 
-__all__ = ["among", "can_search", "kind_at", "number_at", "text_at", "value_at"]
-
 _SEARCHABLE: Final = re.compile(r"(?!\$)[ !#-&(-\[\]-~]+")  # printable ASCII without " ' and \
 
 

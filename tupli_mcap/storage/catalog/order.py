@@ -22,8 +22,6 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["After", "Range", "Sort", "beyond", "has_index", "ranges"]
-
 ORDERED: Final = VALUE.alias("ordered")
 """`VALUE`, by which episodes are put in order."""
 

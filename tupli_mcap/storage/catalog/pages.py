@@ -37,8 +37,6 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["Asked", "candidates"]
-
 _FEW: Final = 5_000
 _SCANNED: Final = 30_000
 _MOST: Final = 200_000

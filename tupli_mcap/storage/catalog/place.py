@@ -20,8 +20,6 @@ from typing import Final
 
 from tupli_mcap.cache import cache_dir, make_private
 
-__all__ = ["catalog_path", "is_private"]
-
 _MOUNTS: Final = Path("/proc/self/mounts")
 # SQLite needs locks and memory maps that hold between machines.
 _REMOTE: Final = re.compile(

@@ -65,20 +65,6 @@ from tupli_mcap.storage.catalog.tallies import tally
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = [
-    "After",
-    "Sort",
-    "count_episodes",
-    "declare_key",
-    "declared_keys",
-    "each_once",
-    "find_episodes",
-    "insert_all",
-    "plan_of",
-    "put_recording",
-    "remove_recording",
-]
-
 _ROWS_AT_ONCE: Final = 20_000
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
 _GROWTH: Final = 8  # how many times as many episodes are looked at next, where none has matched

@@ -22,19 +22,6 @@ from tupli_mcap.storage.base import episode_id
 from tupli_mcap.storage.catalog.tables import EPISODE_BITS, FLAGGED_KEYS
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = [
-    "EpisodeRow",
-    "StoredRow",
-    "flag_bits",
-    "header",
-    "indexed_text",
-    "indexed_values",
-    "is_indexed",
-    "is_whole",
-    "nearest_float",
-    "store_row",
-]
-
 _INT64_MIN: Final = -(2**63)
 _INDEXED_CHARACTERS: Final = 500
 _MOST_EXACT: Final = 2.0**53  # below, integers have floats of their own

@@ -20,27 +20,6 @@ from sqlalchemy import (
 )
 from sqlalchemy.sql.elements import ColumnElement
 
-__all__ = [
-    "APPLICATION_ID",
-    "DECLARED",
-    "EPISODE",
-    "EPISODE_BITS",
-    "FLAGGED_KEYS",
-    "INDEXED_FACTS",
-    "LAST_EPISODE",
-    "METADATA",
-    "NUMBER",
-    "RECORDING",
-    "TALLY",
-    "TEXT",
-    "VALUE",
-    "VERSION",
-    "episodes_of",
-    "first_of",
-    "in_order",
-    "of_one_recording",
-]
-
 APPLICATION_ID: Final = 0x7475_706C  # "tupl": how SQLite tells whose file this is
 VERSION: Final = 9
 

@@ -24,8 +24,6 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, episodes_of
 from tupli_mcap.storage.texts import unescape_text
 
-__all__ = ["Seen", "Tally", "recordings_seen", "tallies", "tally"]
-
 Seen = Callable[[ColumnElement[str], ColumnElement[str]], ColumnElement[bool]]
 """What may be seen: a condition on `created_by` and `published_in` of any table that has them."""
 

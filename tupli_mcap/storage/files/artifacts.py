@@ -15,8 +15,6 @@ from tupli_mcap.storage.base import LOCAL_USER, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import plain, restored
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
-__all__ = ["ArtifactFiles"]
-
 
 class ArtifactFiles:
     """The artifacts of a directory. Several processes may use it at once."""

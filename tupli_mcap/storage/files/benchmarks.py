@@ -30,8 +30,6 @@ from tupli_mcap.storage.benchmark_json import (
 )
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
-__all__ = ["BenchmarkFiles", "document_of", "name_in"]
-
 _Edits: TypeAlias = Sequence[Mapping[str, Any]]
 
 

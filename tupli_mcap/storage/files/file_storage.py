@@ -38,8 +38,6 @@ from tupli_mcap.storage.from_values import record_each, write_episodes
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
-__all__ = ["FileStorage"]
-
 _T = TypeVar("_T")
 
 

@@ -28,8 +28,6 @@ from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
 
-__all__ = ["RecordingFiles"]
-
 
 class RecordingFiles:
     """The recordings below a storage's root, and changes of their episodes.

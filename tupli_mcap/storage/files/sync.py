@@ -18,18 +18,11 @@ from tupli_mcap.progress import progress
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.base import episode_id
-from tupli_mcap.storage.catalog.catalog import (
-    Catalog,
-    CatalogDamagedError,
-    CatalogMovedError,
-    CatalogUnusableError,
-    RecordingStamp,
-)
+from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.database import CatalogDamagedError, CatalogMovedError, CatalogUnusableError
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry
 from tupli_mcap.storage.catalog.place import catalog_path
-from tupli_mcap.storage.listing import scan, stamp_of
-
-__all__ = ["SyncedCatalog"]
+from tupli_mcap.storage.listing import RecordingStamp, scan, stamp_of
 
 _T = TypeVar("_T")
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
