@@ -25,11 +25,7 @@ if TYPE_CHECKING:
         TorchTupleParser,
     )
     from tupli_mcap.dataset.columns.saved import SavedColumns, open_columns
-    from tupli_mcap.dataset.curate import (
-        merge_recordings,
-        restore_episodes,
-        split_recording,
-    )
+    from tupli_mcap.dataset.curate import merge_recordings, restore_episodes, split_recording
     from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.dataset.opening import open
     from tupli_mcap.dataset.sources import DatasetError

@@ -17,14 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union,
 
 import numpy as np
 
-from tupli_mcap.dataset.which import (
-    Positions,
-    candidates,
-    extreme,
-    named_positions,
-    places_of,
-    positions_of,
-)
+from tupli_mcap.dataset.which import Positions, candidates, extreme, named_positions, places_of, positions_of
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown_name

@@ -15,12 +15,7 @@ from tupli_mcap.dataset.sources import DatasetError, Source
 from tupli_mcap.dataset.which import candidates, may_be_noted
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.recording import (
-    Episode,
-    rewrite_recording,
-    say_made_of,
-    trim_recording,
-)
+from tupli_mcap.recording import Episode, rewrite_recording, say_made_of, trim_recording
 from tupli_mcap.recording.edit import merge, split
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts

@@ -8,12 +8,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from tupli_mcap.dataset.dataset import Dataset
-from tupli_mcap.dataset.sources import (
-    DatasetError,
-    FilesSource,
-    StorageSource,
-    place_of,
-)
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, place_of
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url
 from tupli_mcap.storage import TupliStorage

@@ -10,13 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Items
-from tupli_mcap.dataset.items.steps import (
-    SamplingError,
-    Steps,
-    checked_count,
-    checked_fields,
-    map_arrays,
-)
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
 from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
 Pad = Literal["none", "repeat", "zero"]

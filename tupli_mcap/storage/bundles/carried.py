@@ -13,12 +13,7 @@ from tupli_mcap.errors import FormatError, SignatureError, StorageError, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.signature import Signature, verify_signature
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.schema import (
-    ArtifactMetadata,
-    BenchmarkHeader,
-    BenchmarkQuery,
-    FilterEQ,
-)
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkHeader, BenchmarkQuery, FilterEQ
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,

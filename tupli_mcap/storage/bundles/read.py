@@ -12,14 +12,10 @@ from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.files import create
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.sign.sign import episodes_alike
-from tupli_mcap.schema import (
-    FilterIN,
-)
+from tupli_mcap.schema import FilterIN
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import by_recording, episode_id
-from tupli_mcap.storage.benchmark_json import (
-    artifacts_of,
-)
+from tupli_mcap.storage.benchmark_json import artifacts_of
 from tupli_mcap.storage.bundles.carried import carried_artifacts, carried_benchmark, checked_signature
 
 if TYPE_CHECKING:

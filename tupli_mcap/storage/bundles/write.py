@@ -12,14 +12,7 @@ from tupli_mcap.recording import Episode, EpisodeData, Recording, rewrite_record
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA
-from tupli_mcap.schema import (
-    BaseFilter,
-    BenchmarkHeader,
-    BenchmarkMetadata,
-    EpisodeHeader,
-    FilterEQ,
-    bound,
-)
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, BenchmarkMetadata, EpisodeHeader, FilterEQ, bound
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import LOCAL_USER, anew, each_opened

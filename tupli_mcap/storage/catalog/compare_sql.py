@@ -15,19 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sqlalchemy import (
-    Select,
-    and_,
-    case,
-    exists,
-    false,
-    func,
-    not_,
-    or_,
-    select,
-    true,
-    union_all,
-)
+from sqlalchemy import Select, and_, case, exists, false, func, not_, or_, select, true, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.messages.episodes import END_NAMES
@@ -37,13 +25,7 @@ from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import can_search, kind_at, text_at, value_at
 from tupli_mcap.storage.catalog.rows import flag_bits, indexed_text, is_whole, nearest_float
-from tupli_mcap.storage.catalog.tables import (
-    EPISODE,
-    RECORDING,
-    TALLY,
-    VALUE,
-    first_of,
-)
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, VALUE, first_of
 from tupli_mcap.storage.texts import escape_text
 
 Condition = ColumnElement[bool]

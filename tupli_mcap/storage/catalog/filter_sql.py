@@ -43,12 +43,7 @@ from tupli_mcap.storage.catalog.compare_sql import (
     recorded,
     unsure_value,
 )
-from tupli_mcap.storage.catalog.tables import (
-    EPISODE,
-    EPISODE_BITS,
-    INDEXED_FACTS,
-    VALUE,
-)
+from tupli_mcap.storage.catalog.tables import EPISODE, EPISODE_BITS, INDEXED_FACTS, VALUE
 
 _MOST_COMPARISONS: Final = 64  # in a statement: databases limit them
 _NOT_INDEXED: Final = (FilterType.NE, FilterType.CONTAINS)

@@ -16,14 +16,7 @@ from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.base import (
-    LOCAL_USER,
-    episode_id,
-    is_episode_id,
-    new_name,
-    published_in,
-    uuid_of,
-)
+from tupli_mcap.storage.base import LOCAL_USER, episode_id, is_episode_id, new_name, published_in, uuid_of
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
