@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import NotFoundError, RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
@@ -22,6 +22,8 @@ from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.listing import find_recordings, is_storage
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
+
+_AGAIN = "store it again, or import its bundle"
 
 
 def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
@@ -126,14 +128,12 @@ def _benchmark(path: Path, findings: Findings) -> None:
     if any(problem.kind == "benchmark" for problem in findings.report.problems):
         return  # said already
     with Recording(path) as recording:
-        if "benchmark.json" not in recording.attachments:
-            return
-        if "id" not in (recording.benchmark.record.benchmark or {}):
-            return
-        try:
-            carried_benchmark(recording, path)
-        except TupliError as err:
-            findings.error("benchmark", str(err).removeprefix(f"{path}: "))
+        carries = "benchmark.json" in recording.attachments
+        if carries and "id" in (recording.benchmark.record.benchmark or {}):
+            try:
+                carried_benchmark(recording, path)
+            except TupliError as err:
+                findings.error("benchmark", str(err).removeprefix(f"{path}: "))
 
 
 # ---- the other files of a directory
@@ -145,7 +145,10 @@ def _directory(root: Path) -> Iterator[VerifyReport]:
     findings = Findings(report)
     is_whole = is_storage(root)
     for check in (_leftovers, *((_artifacts, _benchmarks) if is_whole else ())):
-        _guarded(check, root, findings)
+        try:
+            check(root, findings)
+        except (OSError, TupliError) as err:
+            findings.error("storage", str(err), advice="check the directory's permissions")
     if is_whole or report.problems:
         yield report
 
@@ -163,13 +166,6 @@ def _left_in(directory: Path) -> Iterator[VerifyReport]:
 def _left(name: str, findings: Findings) -> None:
     advice = "delete it; in a storage, tupli-mcap compact removes such files"
     findings.note("leftover", f"{name} was left by a process that was killed", advice)
-
-
-def _guarded(check: Callable[[Path, Findings], None], root: Path, findings: Findings) -> None:
-    try:
-        check(root, findings)
-    except (OSError, TupliError) as err:
-        findings.error("storage", str(err), advice="check the directory's permissions")
 
 
 def _leftovers(root: Path, findings: Findings) -> None:
@@ -196,13 +192,9 @@ def _finished_journal(path: Path, relative: str, findings: Findings) -> None:
     recording = path.with_name(path.name.removesuffix(".journal"))
     if is_locked(recording) or journal_path(recording).name != path.name:
         return
-    try:
-        with Recording(recording) as opened:
-            complete = opened.complete
-    except TupliError:
-        return
-    if complete:
-        findings.note("leftover", f"{relative} lies beside a finished recording", "delete it")
+    with contextlib.suppress(TupliError), Recording(recording) as opened:
+        if opened.complete:
+            findings.note("leftover", f"{relative} lies beside a finished recording", "delete it")
 
 
 def _artifacts(root: Path, findings: Findings) -> None:
@@ -213,11 +205,7 @@ def _artifacts(root: Path, findings: Findings) -> None:
     artifacts = ArtifactFiles(directory, Lock(root / ".lock"))
     for path in sorted(directory.iterdir()):
         if path.name.endswith(".json") and is_hash(path.stem) and not path.with_suffix("").exists():
-            findings.error(
-                "artifact",
-                f"artifact {path.stem} has no bytes",
-                advice="store it again, or import its bundle",
-            )
+            findings.error("artifact", f"artifact {path.stem} has no bytes", advice=_AGAIN)
         if not is_hash(path.name):
             continue
         with path.open("rb") as file:
@@ -225,7 +213,7 @@ def _artifacts(root: Path, findings: Findings) -> None:
         findings.report.attachments += 1
         if digest != path.name:
             what = f"artifact {path.name} has bytes with SHA-256 {digest}"
-            findings.error("artifact", what, advice="store it again, or import its bundle")
+            findings.error("artifact", what, advice=_AGAIN)
         try:
             artifacts.item(path.name)
         except (TupliError, FileNotFoundError) as err:
@@ -247,5 +235,5 @@ def _benchmarks(root: Path, findings: Findings) -> None:
                 if not (root / "artifacts" / artifact).is_file():
                     what = f"benchmark {path.stem} lacks its artifact {artifact}"
                     findings.error("benchmark", what, advice="store the artifact again, or import its bundle")
-        except (NotFoundError, TupliError) as err:
-            findings.error("benchmark", str(err), advice="store it again, or import its bundle")
+        except TupliError as err:
+            findings.error("benchmark", str(err), advice=_AGAIN)
