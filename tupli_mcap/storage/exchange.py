@@ -7,13 +7,12 @@ import itertools
 import os
 import shutil
 import tempfile
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap import trust
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, did_you_mean, plural
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError, did_you_mean, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -33,7 +32,7 @@ from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import TupliStorage, anew
+from tupli_mcap.storage.base import TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.catalog.queries import each_once
@@ -99,18 +98,16 @@ def _copy(
             if uri == benchmark_id:
                 raise
             # somebody has published the episodes without their benchmark, which must not keep the others away
-            warnings.warn(f"not copied: {len(headers)} episodes: {err}", stacklevel=4)
+            warn(f"not copied: {len(headers)} episodes: {err}")
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         absent = [header for header in headers if header.id not in held]
         deleted = _deleted_beside(target, held.values())
         new = [header for header in absent if header.id not in deleted]
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
-        groups = [
-            (name, list(of)) for name, of in itertools.groupby(new, key=lambda header: header.recording)
-        ]
+        groups = by_recording(new)
         brought = len(new) if dry_run else 0
-        for i, (name, of) in enumerate(groups, start=1):
+        for i, (name, of) in enumerate(groups.items(), start=1):
             if not dry_run:
                 numbers = [header.episode for header in of]
                 brought += _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
@@ -126,9 +123,7 @@ def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, 
     differ = sum(dumps_plain(here.metadata) != dumps_plain(there.metadata) for here, there in both)
     if differ:
         hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
-        warnings.warn(
-            f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}", stacklevel=5
-        )
+        warn(f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}")
 
 
 def _deleted_beside(target: TupliStorage, held: Iterable[EpisodeHeader]) -> set[str]:
@@ -144,9 +139,7 @@ def _say_what_was_deleted(target: TupliStorage, episodes: int) -> None:
     if not episodes:
         return
     hint = f"; `tupli-mcap restore {target.root}` restores them" if isinstance(target, FileStorage) else ""
-    warnings.warn(
-        f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}", stacklevel=5
-    )
+    warn(f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}")
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
@@ -336,10 +329,9 @@ def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str,
         if is_own or not {group, "global"}.isdisjoint(item.published_in):
             hidden.discard(item.id)
     if hidden:
-        warnings.warn(
+        warn(
             f"not published in {group}: {plural(len(hidden), 'artifact')} of others that benchmark {benchmark.id[:8]} "
-            "needs; only the owner may publish it",
-            stacklevel=3,
+            "needs; only the owner may publish it"
         )
 
 
