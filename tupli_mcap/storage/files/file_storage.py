@@ -134,21 +134,13 @@ class FileStorage(TupliStorage):
         with self._lock:
             deleted = 0
             if episodes:
-                self._refuse_live(uri)
+                self._recordings.refuse_live(uri)
                 deleted = self._recordings.delete(
                     self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
                 )
             self._benchmarks.delete(uri)
             self._recordings.remove_directory(self.root / "recordings" / uri)
             return deleted
-
-    def _refuse_live(self, uri: str) -> None:
-        live = self._recordings.live(uri)
-        if live:
-            raise StorageError(
-                f"benchmark {uri} is being recorded to {', '.join(map(str, live[:3]))}: nothing is deleted; "
-                "close that first, or keep the episodes"
-            )
 
     def beginning_recording(self) -> AbstractContextManager[object]:
         return self._lock

@@ -53,16 +53,20 @@ class RecordingFiles:
             raise NotFoundError(f"there is no recording {recording[:200]!r} in {str(self._root)!r}")
         return path
 
-    def live(self, benchmark_id: str) -> list[Path]:
-        """The recordings of a benchmark that are being written."""
+    def refuse_live(self, benchmark_id: str) -> None:
+        """Raises StorageError if somebody records episodes of a benchmark."""
         found = []
         for item in sorted(scan(self._root)):
             path = self._root / item.relative
             if is_locked(path):
                 with contextlib.suppress(RecordingError, FormatError), Recording(path) as recording:
                     if recording.benchmark_id == benchmark_id:
-                        found.append(path)
-        return found
+                        found.append(str(path))
+        if found:
+            raise StorageError(
+                f"benchmark {benchmark_id} is being recorded to {', '.join(found[:3])}: nothing is deleted; "
+                "close that first, or keep the episodes"
+            )
 
     def of_recording(self, path: Path) -> list[EpisodeHeader]:
         """The episodes of a recording that was just catalogued, without a query of the others."""
