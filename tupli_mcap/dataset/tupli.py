@@ -131,9 +131,7 @@ class TupliDataset(RandomAccess):
     def with_cache(self, cache_bytes: int, threads: int | None = None) -> Self:
         """The dataset with another budget for the cache of random access (bytes, 512 MiB by default).
 
-        Args:
-            cache_bytes: the budget.
-            threads: number of threads that read chunks; by default that of cores, at most 4.
+        `threads` read chunks; by default as many as there are cores, at most 4.
 
         Raises:
             SamplingError: a number is no integer, or too small.
@@ -165,14 +163,11 @@ class TupliDataset(RandomAccess):
         anew(attempt)  # again if episodes are deleted while they are read: the next listing lacks them
 
     def save_columns(self, directory: str | os.PathLike[str]) -> None:
-        """Write the steps to a new directory as plain `.npy` files, which `open_columns` reads mapped into memory.
+        """Write the steps to an unused path as plain `.npy` files, which `open_columns` reads mapped into memory.
 
         The directory also holds `manifest.json`; see docs/howto/columns.md. It is written atomically: a killed process
         leaves none. It holds the steps as they are listed now, without infos, and does not depend on the recordings.
         Steps are read a few at a time, within the budget of `with_cache`.
-
-        Args:
-            directory: an unused path.
 
         Raises:
             DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
@@ -352,7 +347,6 @@ class TupliDataset(RandomAccess):
         """Batches of `batch_size` steps; the last one may have fewer. The steps are loaded first.
 
         Args:
-            batch_size: steps of a batch.
             shuffle: in a new random order each time, see `set_seed`.
             parser: turns the five columns of each batch into its form; without one, a batch is a list of `RLTuple`.
 

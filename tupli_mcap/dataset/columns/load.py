@@ -58,10 +58,7 @@ def read_columns(
     episode). Memory holds at most the result, one block of episodes (64 MiB, or one episode) and the cache
     of one recording.
 
-    Args:
-        source: opens the recordings.
-        headers: the episodes.
-        selector: the tuple filter; `known` is its result if it was evaluated before.
+    `selector` is the tuple filter, and `known` its result if it was evaluated before.
 
     Raises:
         SpaceError: one array cannot hold two of the recordings.

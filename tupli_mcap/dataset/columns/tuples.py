@@ -70,12 +70,9 @@ Columns = tuple[Mapping[str, Any], Array, StepLayout | None]
 
 
 class EpisodeItems(Sequence[EpisodeItem]):
-    """Episodes with their steps.
+    """Episodes with their steps, or those of them at the `chosen` positions.
 
-    Args:
-        headers: the episodes.
-        columns: returns the columns of all of them, the number of steps of each, and their layout.
-        chosen: positions in `headers`.
+    `columns` returns the columns of all of them, the number of steps of each, and their layout.
     """
 
     def __init__(

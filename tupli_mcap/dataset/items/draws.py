@@ -23,7 +23,6 @@ class Sampler:
     """Draws batches of item numbers without end, with replacement; a seed always gives the same batch i.
 
     Args:
-        items: the items to draw from.
         batch_size: numbers in a batch.
         by: "steps" draws from all items with equal chances; "episodes" first draws an episode that has items, then
             one of its items, so that long episodes weigh no more than short ones.

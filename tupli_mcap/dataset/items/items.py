@@ -52,9 +52,7 @@ class Items(ABC, Generic[T]):
     An index gives one item; a slice or an array of numbers gives a batch, which is read together. Negative numbers
     count from the end.
 
-    Args:
-        steps: the steps to read.
-        parameters: tell these items apart from others of the same steps.
+    `parameters` tell these items apart from others of the same steps.
     """
 
     def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:

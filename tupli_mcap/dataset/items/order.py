@@ -45,7 +45,6 @@ class Order:
     """Gives every item's number once an epoch, in batches; iterating again begins the next epoch.
 
     Args:
-        items: the items.
         batch_size: numbers in a batch; the last one may have fewer.
         shuffle: False keeps their order. "exact" makes all orders equally likely. "blocks" takes chunks in a
             random order, and mixes the items of as many as half the cache holds: each is read about once an epoch.

@@ -36,8 +36,6 @@ class RecordedSteps:
         listed: the episodes, in order.
         open_recording: a context manager that opens a recording by its name.
         mask: the wanted ones of the listed steps (bool); None for all.
-        cache_bytes: budget of the cache.
-        threads: number of threads that read chunks.
 
     Raises:
         SpaceError: one array cannot hold two of the recordings.

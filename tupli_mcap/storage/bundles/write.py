@@ -97,8 +97,6 @@ def bundle_recording(
     A recording that was made outside a storage gets a benchmark: its environment, under the name that it has.
 
     Args:
-        path: of the recording.
-        target: of the new file.
         storage: has the parts that the recording lacks; None if it lacks none, like a bundle or a recording of an
             environment that needs no artifacts.
         sign: the key to sign it with; without it, a signature stays if nothing it covers changes.
