@@ -27,8 +27,8 @@ from tupli_mcap.dataset.items import (
     info_keys,
 )
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
-from tupli_mcap.dataset.items.windows import FIVE
 from tupli_mcap.errors import SaysWhatIsMeant
+from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in

@@ -17,9 +17,9 @@ from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
-from tupli_mcap.dataset.items.windows import FIVE
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
+from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew

@@ -10,7 +10,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items import Items, Steps, Window
 from tupli_mcap.dataset.items.steps import checked_fields, map_arrays
-from tupli_mcap.dataset.items.windows import FIVE
+from tupli_mcap.recording.columns.fields import FIVE
 
 
 class Episodes(Items[Window]):

@@ -13,6 +13,7 @@ from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items.steps import map_arrays, pick
 from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.columns.fields import FIVE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,8 +57,7 @@ def batches(
         if parser is None:
             yield list(Tuples(batch, layout))
         else:
-            names = ("states", "actions", "rewards", "terminals", "timeouts")
-            yield parser.parse_lists(*(batch[name] for name in names))
+            yield parser.parse_lists(*(batch[name] for name in FIVE))
 
 
 def import_pandas() -> Any:

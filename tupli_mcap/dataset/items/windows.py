@@ -11,11 +11,10 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Items
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
-from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
+from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames, Parts
 
 Pad = Literal["none", "repeat", "zero"]
 PADS = ("none", "repeat", "zero")
-FIVE = ("states", "actions", "rewards", "terminals", "timeouts")
 
 
 @dataclass(frozen=True, repr=False)
