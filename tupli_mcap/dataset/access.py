@@ -8,24 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.dataset.items import (
+from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
+from tupli_mcap.dataset.items.beside import (
     BESIDE,
     FRAMES,
     INFOS,
-    DeltaWindows,
     FrameValues,
     InfoValues,
-    Pad,
-    SamplingError,
-    Steps,
     StepsWith,
-    Transitions,
-    Unit,
-    Windows,
-    checked_fields,
     info_columns,
     info_keys,
 )
+from tupli_mcap.dataset.items.steps import checked_fields
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import SaysWhatIsMeant
 from tupli_mcap.recording.columns.fields import FIVE

@@ -18,7 +18,8 @@ from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
 from tupli_mcap.dataset.columns.load import read_in_order
 from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
-from tupli_mcap.dataset.items import INFOS, ListedEpisodes, RecordedSteps, Steps, info_columns, info_keys
+from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
+from tupli_mcap.dataset.items.beside import INFOS, info_columns, info_keys
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
 from tupli_mcap.dataset.sources import (

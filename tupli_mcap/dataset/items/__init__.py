@@ -9,36 +9,21 @@ order, draws                   numbers of items: each once an epoch, or drawn by
 shuffle                        an order that reads each chunk about once, also over workers and ranks
 """
 
-from tupli_mcap.dataset.items.beside import (
-    BESIDE,
-    FRAMES,
-    INFOS,
-    FrameValues,
-    InfoValues,
-    StepsWith,
-    info_columns,
-    info_keys,
-)
 from tupli_mcap.dataset.items.deltas import DeltaWindow, DeltaWindows, Unit
 from tupli_mcap.dataset.items.draws import Sampler
 from tupli_mcap.dataset.items.index import ListedEpisodes
 from tupli_mcap.dataset.items.items import Batches, Items, Samples
 from tupli_mcap.dataset.items.order import Numbers, Order
 from tupli_mcap.dataset.items.recorded import RecordedSteps, steps_of
-from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps, checked_fields
+from tupli_mcap.dataset.items.steps import FIELDS, MemorySteps, SamplingError, Steps
 from tupli_mcap.dataset.items.transitions import Transition, Transitions
 from tupli_mcap.dataset.items.windows import Pad, Window, Windows
 
 __all__ = [
-    "BESIDE",
     "FIELDS",
-    "FRAMES",
-    "INFOS",
     "Batches",
     "DeltaWindow",
     "DeltaWindows",
-    "FrameValues",
-    "InfoValues",
     "Items",
     "ListedEpisodes",
     "MemorySteps",
@@ -50,14 +35,10 @@ __all__ = [
     "Samples",
     "SamplingError",
     "Steps",
-    "StepsWith",
     "Transition",
     "Transitions",
     "Unit",
     "Window",
     "Windows",
-    "checked_fields",
-    "info_columns",
-    "info_keys",
     "steps_of",
 ]
