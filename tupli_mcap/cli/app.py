@@ -32,8 +32,6 @@ from tupli_mcap.cli.terminal import (
 )
 from tupli_mcap.errors import FilterError, TupliError, did_you_mean
 
-__all__ = ["app", "main"]
-
 FAILED, USAGE, INTERRUPTED = 1, 2, 130  # 128 + SIGINT, as shells have it
 _VALUES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH", "file": "FILE"}  # in helps
 

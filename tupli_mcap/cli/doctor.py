@@ -15,8 +15,6 @@ from tupli_mcap.cli.terminal import say, say_styled, status
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
 
-__all__ = ["doctor"]
-
 _INDENT = 9  # columns: the longest severity and a gap
 _OTHERS = 3  # how many recordings with the same finding are named
 _STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}

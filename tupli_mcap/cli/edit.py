@@ -42,8 +42,6 @@ from tupli_mcap.remote import is_url, shown_name
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
 
-__all__ = ["edit", "filter_", "merge", "recover", "split", "tag", "trim"]
-
 _NO_JOURNAL = {
     "missing": "their journal is not beside the file; if the file was cut off, also all after the cut",
     "stale": "the journal beside the file belongs to another recording",

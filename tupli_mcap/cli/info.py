@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.describe.series import Series
     from tupli_mcap.schema import BaseFilter
 
-__all__ = ["info", "sparkline"]
-
 BLOCKS = "▁▂▃▄▅▆▇█"
 PLAIN = ".:-=+*#@"  # where blocks cannot be printed
 _WIDEST, _NARROWEST = 40, 8

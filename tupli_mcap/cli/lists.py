@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from tupli_mcap.storage import TupliStorage
     from tupli_mcap.storage.listing import ListedRecording
 
-__all__ = ["episodes", "list_stored", "ls", "print_episodes"]
-
 _ROOMY = 100  # columns a terminal needs for metadata and times side by side
 _Cells = Callable[["Sequence[ListedRecording]"], list[str]]
 

@@ -17,12 +17,6 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
     from tupli_mcap.storage import FileStorage, TupliAPIClient, TupliStorage
 
-__all__ = [
-    "AnyStorage", "Benchmark", "ColumnNames", "DryRun", "Episodes", "File", "FilterText", "Force", "Json", "Limit",
-    "Output", "Sort", "Sources", "StoragePath", "Url", "any_storage", "dataset_of", "filter_of", "full_id",
-    "local_path", "open_storage", "pair_of", "recordings_of", "server_at",
-]  # fmt: skip
-
 
 def local_path(text: str | Path) -> Path:
     """A path, for commands that take no URL; BadParameter for a URL. Typer passes defaults through it, too."""

@@ -12,26 +12,6 @@ from typing import Any, Final, Literal, NamedTuple
 
 from tupli_mcap.cli.terminal import say, say_json, say_styled, terminal_width, visible
 
-__all__ = [
-    "JSON_VERSION",
-    "Column",
-    "begin_json",
-    "bytes_of",
-    "counted",
-    "number",
-    "numbers",
-    "print_facts",
-    "print_json",
-    "print_json_error",
-    "print_result",
-    "print_table",
-    "print_wrapped",
-    "short_ids",
-    "short_value",
-    "time_of",
-    "when",
-]
-
 JSON_VERSION: Final = 1
 """The version of what --json prints. It grows when a key goes away or changes its meaning, not when a key is added."""
 

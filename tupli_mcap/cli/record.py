@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from tupli_mcap.wrappers.rollout import RolloutSummary
 
-__all__ = ["record"]
-
 
 def _check_policy(value: str | None) -> str | None:
     if value is not None and not all(value.partition(":")[::2]):

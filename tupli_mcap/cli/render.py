@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from tupli_mcap.replay import RenderReport
     from tupli_mcap.schema import BaseFilter
 
-__all__ = ["plot", "render"]
-
 _MOST_NAMES = 5
 
 

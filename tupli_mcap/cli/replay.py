@@ -11,8 +11,6 @@ from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, filter_
 from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
 
-__all__ = ["replay"]
-
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Apart = Annotated[
     bool,

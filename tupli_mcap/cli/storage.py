@@ -47,18 +47,6 @@ from tupli_mcap.remote import is_server
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
 
-__all__ = [
-    "compact",
-    "declare_key",
-    "delete",
-    "list_artifacts",
-    "list_benchmarks",
-    "list_episodes",
-    "reindex",
-    "rename",
-    "restore",
-]
-
 _ROOMY = 100  # columns a terminal needs for benchmarks and their environments side by side
 
 

@@ -18,27 +18,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import TextIO
 
-__all__ = [
-    "ask_secret",
-    "can_print",
-    "confirmed",
-    "fail",
-    "fetch_progress",
-    "flush",
-    "one_line",
-    "print_traceback",
-    "say",
-    "say_interrupted",
-    "say_json",
-    "say_styled",
-    "status",
-    "step_progress",
-    "stop_writing",
-    "terminal_width",
-    "visible",
-    "warnings_in_one_line",
-]
-
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _UNUSUAL = re.compile(r"[^\n -~]")
 _hide_bar: Callable[[], None] | None = None

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from tupli_mcap.replay import Certificate
     from tupli_mcap.schema import BaseFilter
 
-__all__ = ["verify"]
-
 _STATES = {"unfinished": "not finished", "recording": "being recorded"}
 _NOTHING = "nothing to be done"
 _PROBLEMS = 20  # how many problems of a file are shown; --json has all

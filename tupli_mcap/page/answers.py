@@ -24,18 +24,6 @@ from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import FilterEQ, format_filter, join_key
 
-__all__ = [
-    "FILE_NAME",
-    "FOR_VIEWERS",
-    "POLICY",
-    "PageRoute",
-    "Shown",
-    "SignInNeededError",
-    "address",
-    "error_page",
-    "page",
-]
-
 POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"

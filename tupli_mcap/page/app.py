@@ -21,8 +21,6 @@ from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
 from tupli_mcap.viewer.process import has_display
 
-__all__ = ["browse", "create_app"]
-
 _HOST = "127.0.0.1"
 
 

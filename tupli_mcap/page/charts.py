@@ -15,8 +15,6 @@ from markupsafe import Markup
 from tupli_mcap.arrays import Array
 from tupli_mcap.page.texts import number
 
-__all__ = ["Line", "histogram", "line_path", "lines", "over_time", "share"]
-
 _WIDE, _HIGH = 1000, 100  # size of a drawing before it is stretched
 _TICKS = 4
 _PATH = Markup('<path class="{}" d="{}"/>')

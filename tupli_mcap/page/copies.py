@@ -22,17 +22,6 @@ from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = [
-    "MOST_COMPARED",
-    "MOST_MERGED",
-    "film_file",
-    "in_pieces",
-    "recording_of",
-    "replay_file",
-    "sent",
-    "streamed",
-]
-
 MOST_COMPARED = 8
 MOST_MERGED = 256
 """Most recordings of an answer: all of them are open at the same time."""

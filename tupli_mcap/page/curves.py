@@ -18,8 +18,6 @@ from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.spaces.labels import Labels, short_path
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Curves", "Track", "curves_of", "values_at"]
-
 SO_FAR: Final = "return so far"
 _POINTS: Final = 800  # most points of a track
 _READ_BYTES: Final = 64 << 20  # most bytes of steps that are read of an episode

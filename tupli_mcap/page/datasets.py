@@ -21,16 +21,6 @@ from tupli_mcap.storage.catalog.tallies import Tally, tallies
 from tupli_mcap.storage.listing import LIVE
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
-__all__ = [
-    "Dataset",
-    "all_datasets",
-    "dataset_filter",
-    "dataset_of",
-    "find_dataset",
-    "of_dataset",
-    "of_recording",
-]
-
 _PLAIN: Final = re.compile(r"\w[\w.@:+ -]{0,100}(/\w[\w.@:+ -]{0,100}){0,3}", re.ASCII)
 _NAMELESS: Final = "-"
 _UNNAMED: Final = "Recordings without an environment"

@@ -20,8 +20,6 @@ from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.entries import entry_of, put_entry
 from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 
-__all__ = ["DirectoryShelf", "FileShelf", "OpenedRecordings", "shelf_of"]
-
 T = TypeVar("T")
 _MOST_OPEN = 16
 _CACHE_BYTES = 64 << 20  # of each open recording

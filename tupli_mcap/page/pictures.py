@@ -16,9 +16,6 @@ from tupli_mcap.replay.recorded_film import as_picture
 from tupli_mcap.spaces.labels import short_path
 from tupli_mcap.spaces.leaves import Leaf
 
-__all__ = ["Camera", "cameras_of", "picture_at"]
-
-
 _COARSE = 200  # pixels
 
 

@@ -26,8 +26,6 @@ from tupli_mcap.storage.catalog.tables import (
 from tupli_mcap.storage.catalog.tallies import Tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["SampledEpisodes", "SampledValues", "sample_episodes", "sample_numbers", "sample_values"]
-
 _EPISODES: Final = 2_000
 _RECORDINGS: Final = 250  # most recordings that episodes are taken from
 _IDS_AT_ONCE: Final = 500

@@ -13,8 +13,6 @@ from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Filter
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 from tupli_mcap.storage.catalog.tallies import recordings_seen
 
-__all__ = ["Shelf", "find_episode", "find_some", "opened", "python_line", "seen_episodes", "seen_recordings"]
-
 T = TypeVar("T")
 
 

@@ -18,8 +18,6 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.spaces.labels import element_names
 
-__all__ = ["Sparks", "sparks_of"]
-
 _MOST_STEPS: Final = 400_000  # most steps that are read for one table
 _POINTS: Final = 120
 

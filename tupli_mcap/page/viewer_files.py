@@ -17,8 +17,6 @@ from tupli_mcap.cache import cache_dir, make_private
 from tupli_mcap.errors import StorageError, os_reason
 from tupli_mcap.storage.catalog.place import is_private
 
-__all__ = ["NAMES", "viewer_file", "viewer_version"]
-
 NAMES: Final = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "application/wasm"}
 _turn = threading.Lock()
 

@@ -36,8 +36,6 @@ from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.traffic.metrics import Metrics
 from tupli_mcap.server.wire import Error, tell_errors, told
 
-__all__ = ["create_app"]
-
 # Recordings are compressed already. A page may hold text from a stranger's link beside private content: compressed, its
 # size would reveal whether the two are alike (the BREACH attack).
 _AS_THEY_ARE = ("application/octet-stream", "text/html", "font/*", "image/*", "video/*")

@@ -33,8 +33,6 @@ from tupli_mcap.storage.catalog.database import remove_database
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
 from tupli_mcap.storage.texts import unescape_text
 
-__all__ = ["Copied", "back_up", "restore"]
-
 _PASSING: Final = (FAILURE, PENDING, UPLOAD)  # tables about the running server, which a backup leaves out
 _ATTEMPTS: Final = 20
 _UNLIMITED: Final = 7 * 24 * 3600.0

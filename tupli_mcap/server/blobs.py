@@ -19,8 +19,6 @@ from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = ["PIECE", "Blobs", "BucketBlobs", "DirectoryBlobs", "LostError", "blobs_of"]
-
 PIECE: Final = 4 << 20
 """The size of the pieces in which a body is fetched (bytes)."""
 _QUICK: Final = timedelta(seconds=10)

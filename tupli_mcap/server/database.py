@@ -28,19 +28,6 @@ from tupli_mcap.server import migrations, tables
 from tupli_mcap.storage.catalog.database import BUSY_MS, prepared_sqlite
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = [
-    "Database",
-    "TooLongError",
-    "UnavailableError",
-    "audience",
-    "audit",
-    "demand_few",
-    "demand_pending",
-    "pend",
-    "pending",
-    "settle",
-]
-
 _STEPS = 20_000  # instructions of SQLite between two looks at the clock
 _CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
 # A writer on PostgreSQL holds this lock; no time limit is set for its statements.

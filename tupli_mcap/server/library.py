@@ -27,6 +27,7 @@ from tupli_mcap.schema import (
     EpisodeHeader,
     EpisodeItem,
     FilterEQ,
+    Right,
 )
 from tupli_mcap.server.blobs import blobs_of
 from tupli_mcap.server.database import (
@@ -39,7 +40,7 @@ from tupli_mcap.server.database import (
     settle,
 )
 from tupli_mcap.server.people import accounts, quotas, throttle
-from tupli_mcap.server.people.access import Caller, DeniedError, Right
+from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored import arrivals, episodes
@@ -52,8 +53,6 @@ from tupli_mcap.storage.from_values import write_episodes
 from tupli_mcap.storage.listing import is_storage, scan
 from tupli_mcap.storage.sidecar import Notes
 from tupli_mcap.storage.texts import escape_text, unescape_text
-
-__all__ = ["Library"]
 
 _ADMIN = "admin"
 _PASSWORD_VARIABLE = "TUPLI_MCAP_ADMIN_PASSWORD"

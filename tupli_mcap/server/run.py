@@ -22,8 +22,6 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.traffic import logs
 from tupli_mcap.server.traffic.patience import PatientProtocol
 
-__all__ = ["Listening", "configured", "run"]
-
 _KEEP_ALIVE_SECONDS = 30
 _STOP_SECONDS = 600  # how long running requests may take once the server has to stop
 _START_SECONDS = 60

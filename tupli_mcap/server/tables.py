@@ -8,25 +8,6 @@ from sqlalchemy import Boolean, Column, Index, MetaData, Table, UniqueConstraint
 
 from tupli_mcap.storage.catalog.tables import NUMBER, TEXT
 
-__all__ = [
-    "API_TOKEN",
-    "AUDIENCE",
-    "AUDIT",
-    "CLAIM",
-    "FAILURE",
-    "FILE",
-    "GROUP",
-    "ITEM",
-    "MEMBERSHIP",
-    "METADATA",
-    "PENDING",
-    "PRINCIPAL",
-    "REFRESH_TOKEN",
-    "ROLE",
-    "UPLOAD",
-    "USER",
-]
-
 METADATA: Final = MetaData()
 
 # Users and groups share one name space: a group with the name of a user would see what is private to that user.

@@ -25,17 +25,6 @@ from tupli_mcap.server.people.quotas import FullError
 from tupli_mcap.server.tables import UPLOAD
 from tupli_mcap.storage.atomic import os_errors
 
-__all__ = [
-    "BusyError",
-    "ChecksumError",
-    "GoneError",
-    "Incoming",
-    "TooLargeError",
-    "TooManyUploadsError",
-    "Upload",
-    "Uploads",
-]
-
 _KEPT_SECONDS: Final = 7 * 24 * 3600
 
 

@@ -39,20 +39,6 @@ from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLa
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
-__all__ = [
-    "AskedFilter",
-    "Error",
-    "Found",
-    "Listing",
-    "answer",
-    "artifact_metadata",
-    "demand_short",
-    "listed",
-    "paged",
-    "tell_errors",
-    "told",
-]
-
 _MOST_VALUES: Final = 20_000
 _MOST_METADATA: Final = 64 << 10  # bytes of JSON
 _MOST_OFFSET: Final = 1 << 53  # larger numbers in JSON are not exact in all programs

@@ -12,8 +12,6 @@ from tupli_mcap.cli.output import print_facts, print_json, print_result
 from tupli_mcap.cli.terminal import ask_secret
 from tupli_mcap.errors import StorageError
 
-__all__ = ["login", "logout", "password", "signup", "whoami"]
-
 Username = Annotated[str, typer.Argument(metavar="USER", help="The user's name.")]
 
 

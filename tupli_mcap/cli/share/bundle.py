@@ -25,8 +25,6 @@ from tupli_mcap.remote import is_url
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
-__all__ = ["bundle", "export", "import_"]
-
 Source = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")]
 
 

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
     from tupli_mcap.storage import TupliAPIClient, TupliStorage
 
-__all__ = ["publish", "pull", "push", "unpublish"]
-
 Group = Annotated[str, typer.Option(metavar="GROUP", help="Who sees it: 'global' is everybody.")]
 Published = Annotated[
     str | None,

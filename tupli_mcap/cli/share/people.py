@@ -17,11 +17,6 @@ from tupli_mcap.errors import StorageError
 if TYPE_CHECKING:
     from tupli_mcap.schema import GroupMembershipQuery, GroupWithMembers
 
-__all__ = [
-    "add_group_members", "create_group", "create_role", "create_token", "delete_group", "delete_role", "delete_token",
-    "delete_user", "list_groups", "list_roles", "list_tokens", "list_users", "read_group", "remove_group_members",
-]  # fmt: skip
-
 Group = Annotated[str, typer.Argument(metavar="GROUP", help="The group's name.")]
 Users = Annotated[list[str], typer.Argument(metavar="USER", help="Names of users.")]
 Description = Annotated[str | None, typer.Option(help="A description of it.")]

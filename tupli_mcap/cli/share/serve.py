@@ -12,8 +12,6 @@ from tupli_mcap.cli.output import bytes_of, counted, print_result
 from tupli_mcap.cli.terminal import flush, say
 from tupli_mcap.errors import missing_extra
 
-__all__ = ["backup_server", "browse", "restore_server", "serve"]
-
 
 def browse(
     path: Annotated[

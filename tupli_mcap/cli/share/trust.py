@@ -13,8 +13,6 @@ from tupli_mcap.cli.output import bytes_of, print_facts, print_json, print_resul
 if TYPE_CHECKING:
     from tupli_mcap.recording.sign.carried_code import CarriedCode
 
-__all__ = ["trust", "untrust"]
-
 
 def trust(
     file: Annotated[

@@ -27,8 +27,6 @@ from tupli_mcap.page.sparks import sparks_of
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 
-__all__ = ["router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
 

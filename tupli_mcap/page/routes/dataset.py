@@ -32,8 +32,6 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.catalog.order import Sort
 from tupli_mcap.storage.catalog.queries import find_episodes
 
-__all__ = ["router", "shown_first"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _RECORDINGS: Final = 100  # most recordings that are listed
 _HISTOGRAMS: Final = 24  # most histograms of a field

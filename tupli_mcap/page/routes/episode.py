@@ -24,8 +24,6 @@ from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_boun
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.queries import find_episodes
 
-__all__ = ["FIELDS", "Seen", "look", "router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 
 

@@ -19,8 +19,6 @@ from tupli_mcap.page.shelf import find_episode, opened
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader
 
-__all__ = ["router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _STATIC = {path.name: path for path in (Path(__file__).parent.parent / "static").iterdir()}
 _MOST_CURVES = 5

@@ -28,8 +28,6 @@ from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.queries import count_episodes, declared_keys, find_episodes
 from tupli_mcap.storage.catalog.tables import TALLY
 
-__all__ = ["Table", "router", "table_of"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _DATASETS: Final = 50  # on a page
 _ROWS: Final = 50

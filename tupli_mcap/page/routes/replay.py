@@ -13,8 +13,6 @@ from tupli_mcap.page.copies import replay_file, sent
 from tupli_mcap.page.shelf import Shelf, find_some
 from tupli_mcap.page.viewer_files import NAMES, viewer_file, viewer_version
 
-__all__ = ["router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Ids = Annotated[list[str], Query(alias="episode", min_length=1, max_length=8)]
 # The viewer needs WebAssembly, and is embedded in our own pages.

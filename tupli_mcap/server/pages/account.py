@@ -16,8 +16,6 @@ from tupli_mcap.server.pages.session import Code, Member, Visit, begin
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.wire import told
 
-__all__ = ["router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
 _Days = Annotated[int, Form()]

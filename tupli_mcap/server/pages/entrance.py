@@ -18,8 +18,6 @@ from tupli_mcap.server.pages.session import Code, Visitor
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.wire import told
 
-__all__ = ["router"]
-
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Next = Annotated[str, Form(alias="next")]
 

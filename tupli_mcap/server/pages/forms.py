@@ -14,8 +14,6 @@ from tupli_mcap.page.answers import page
 from tupli_mcap.server.pages.session import Visit, shelf_of
 from tupli_mcap.server.wire import told
 
-__all__ = ["done", "form_page", "tried"]
-
 
 def form_page(
     request: Request,

@@ -8,12 +8,11 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request, Response
 
 from tupli_mcap.page.answers import PageRoute, address
+from tupli_mcap.schema import Right
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import GLOBAL, Right
-
-__all__ = ["router"]
+from tupli_mcap.server.people.access import GLOBAL
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]

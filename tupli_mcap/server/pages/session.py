@@ -23,19 +23,6 @@ from tupli_mcap.server.pages.shelf import LibraryShelf
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 
-__all__ = [
-    "COOKIE",
-    "Code",
-    "Member",
-    "Visit",
-    "Visitor",
-    "begin",
-    "end",
-    "is_own_origin",
-    "shelf_of",
-    "shown",
-]
-
 COOKIE: Final = "tupli_mcap_session"
 
 

@@ -14,17 +14,15 @@ from sqlalchemy import Connection, func, select
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, parse_bound
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import DeniedError, Right, known_audiences, readable
+from tupli_mcap.server.people.access import DeniedError, known_audiences, readable
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.storage.benchmark_json import unpack
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
 from tupli_mcap.storage.texts import unescape_text
-
-__all__ = ["router"]
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]

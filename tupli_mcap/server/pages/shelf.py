@@ -15,15 +15,13 @@ from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.page.shelf import seen_episodes
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Right
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people.access import Caller, Right, as_told, readable, readable_episodes
+from tupli_mcap.server.people.access import Caller, as_told, readable, readable_episodes
 from tupli_mcap.server.stored.selection import Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.texts import escape_text, unescape_text
-
-__all__ = ["LibraryShelf"]
 
 T = TypeVar("T")
 

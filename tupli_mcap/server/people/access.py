@@ -19,21 +19,6 @@ from tupli_mcap.server.tables import AUDIENCE, FILE, GROUP, USER
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, first_of
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = [
-    "DEFAULT_ROLES",
-    "GLOBAL",
-    "GUEST",
-    "Caller",
-    "DeniedError",
-    "Right",
-    "as_told",
-    "demand_audience",
-    "known_audiences",
-    "left_alone",
-    "readable",
-    "readable_episodes",
-]
-
 _Item = TypeVar("_Item", bound=DBItem)
 GLOBAL: Final = "global"
 """The group of all signed-in users."""

@@ -14,33 +14,10 @@ from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import Connection, Select, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audit, demand_few
-from tupli_mcap.server.people.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError, Right
+from tupli_mcap.server.people.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
 from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
-
-__all__ = [
-    "ConflictError",
-    "add_members",
-    "caller_named",
-    "change_password",
-    "create_group",
-    "create_role",
-    "create_user",
-    "delete_group",
-    "delete_role",
-    "delete_user",
-    "demand_over",
-    "guest",
-    "hash_password",
-    "list_groups",
-    "list_roles",
-    "list_users",
-    "members_of",
-    "memberships_of",
-    "prepare",
-    "remove_members",
-    "verify_password",
-]
 
 # The minimum that OWASP recommends: a sign-in takes 19 MiB, and one core.
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))

@@ -9,8 +9,6 @@ from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FILE, ITEM, UPLOAD, USER
 
-__all__ = ["FullError", "demand_room", "quota_of", "set_quota", "used_by"]
-
 
 class FullError(StorageError):
     """A user's quota is used up, or the server's disk is full."""

@@ -17,8 +17,6 @@ from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.tables import FAILURE
 from tupli_mcap.storage.texts import escape_text
 
-__all__ = ["TooManyError", "Turns", "demand_few_failures", "note_attempt"]
-
 _SECONDS: Final = 60
 _MOST_WAITING: Final = 100  # requests of a user
 _T = TypeVar("_T")

@@ -27,8 +27,6 @@ from tupli_mcap.server.people.accounts import caller_named, guest
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import API_TOKEN, REFRESH_TOKEN, USER
 
-__all__ = ["SignInError", "Tokens"]
-
 _API_PREFIX: Final = "tmcap_"
 _ALGORITHM: Final = "HS256"
 _MOST_DAYS: Final = 3650  # of a token for machines

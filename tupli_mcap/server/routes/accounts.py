@@ -7,14 +7,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter
 from pydantic import BaseModel, FailFast, Field
 
-from tupli_mcap.schema import Group, UserRole
+from tupli_mcap.schema import Group, Right, UserRole
 from tupli_mcap.server.database import audit
 from tupli_mcap.server.people import accounts, quotas
-from tupli_mcap.server.people.access import Right
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
-
-__all__ = ["Credentials", "router"]
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
 

@@ -21,8 +21,6 @@ from starlette.concurrency import run_in_threadpool
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
-__all__ = ["BODY", "MADE", "body_of"]
-
 _MEDIA: Final = "application/octet-stream"
 _SIGNED_SECONDS: Final = 3600
 MADE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {_MEDIA: {}}}}

@@ -16,18 +16,6 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError
 
-__all__ = [
-    "Address",
-    "AnyCaller",
-    "Holder",
-    "Person",
-    "Reader",
-    "Served",
-    "TicketHolder",
-    "Writer",
-    "no_machine",
-]
-
 _BEARER = HTTPBearer(auto_error=False, description="An access token of `POST /v1/tokens`, or an API token.")
 
 

@@ -10,16 +10,14 @@ from fastapi import APIRouter, Body, Response
 from pydantic import BaseModel, Field
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.schema import FilterEQ
+from tupli_mcap.schema import FilterEQ, Right
 from tupli_mcap.server.database import audit, demand_few
-from tupli_mcap.server.people.access import Right, as_told
+from tupli_mcap.server.people.access import as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
-
-__all__ = ["router"]
 
 router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
 _LONGEST_KEY = 200

@@ -16,8 +16,6 @@ from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.wire import Found, Listing, answer, artifact_metadata, demand_short, paged
 from tupli_mcap.storage.benchmark_json import restored
 
-__all__ = ["router"]
-
 router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"])
 
 

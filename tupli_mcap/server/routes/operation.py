@@ -5,12 +5,10 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from tupli_mcap.server.people.access import Right
+from tupli_mcap.schema import Right
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import AnyCaller, Served
 from tupli_mcap.server.traffic.metrics import Metrics
-
-__all__ = ["router"]
 
 router = APIRouter(tags=["operation"])
 

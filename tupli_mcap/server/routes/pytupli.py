@@ -30,11 +30,12 @@ from tupli_mcap.schema import (
     FilterEQ,
     Group,
     GroupMembershipQuery,
+    Right,
     UserRole,
 )
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import Caller, DeniedError, Right, as_told
+from tupli_mcap.server.people.access import Caller, DeniedError, as_told
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.throttle import Turns
 from tupli_mcap.server.routes.accounts import Credentials
@@ -45,8 +46,6 @@ from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
 from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.texts import first_defect
-
-__all__ = ["router"]
 
 router = APIRouter(tags=["PyTupli's routes"])
 _DENIED = "You do not have sufficient permissions for this operation."

@@ -14,8 +14,6 @@ from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served
 from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
 
-__all__ = ["router", "streamed"]
-
 router = APIRouter(prefix="/v1", tags=["episodes"])
 
 

@@ -16,8 +16,9 @@ from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS
+from tupli_mcap.schema import Right
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people.access import Caller, Right
+from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
@@ -25,8 +26,6 @@ from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
 from tupli_mcap.storage.texts import is_hash
-
-__all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
 _TUS = {"Tus-Resumable": "1.0.0"}

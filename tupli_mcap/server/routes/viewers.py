@@ -31,8 +31,6 @@ from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
 from tupli_mcap.server.wire import Error
 
-__all__ = ["router"]
-
 router = APIRouter(prefix="/v1", tags=["viewers"])
 _LONGEST_TICKET = 4096
 _MADE = 1  # to be increased when the same episodes give different bytes

@@ -16,8 +16,9 @@ from sqlalchemy import Connection, insert, select
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.recording import Recording
+from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audience, audit, settle
-from tupli_mcap.server.people.access import Caller, Right, readable
+from tupli_mcap.server.people.access import Caller, readable
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.stored.episodes import forget, whole_name
 from tupli_mcap.server.tables import CLAIM, FILE, ITEM
@@ -29,8 +30,6 @@ from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
-
-__all__ = ["demand_benchmark", "demand_short", "new_place", "register", "stored_already"]
 
 _MOST_METADATA: Final = 64 << 10  # characters of JSON
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie

@@ -11,12 +11,11 @@ from sqlalchemy import Connection, and_, delete, select, update
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import NotFoundError
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right
 from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people.access import (
     Caller,
     DeniedError,
-    Right,
     demand_audience,
     left_alone,
     readable,
@@ -29,11 +28,6 @@ from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
 from tupli_mcap.storage.catalog.tallies import Seen, recordings_seen, tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
-
-__all__ = [
-    "StoredFile", "count_episodes", "delete_episodes", "file_of", "find_episodes", "forget", "forget_unseen",
-    "names_of", "no_episode", "publish", "publish_one", "unpublish", "whole_name",
-]  # fmt: skip
 
 _MOST_VALUES: Final = 1000
 

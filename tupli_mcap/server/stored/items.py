@@ -22,6 +22,7 @@ from tupli_mcap.schema import (
     Benchmark,
     BenchmarkHeader,
     BenchmarkQuery,
+    Right,
     compile_predicate,
 )
 from tupli_mcap.server.database import audience, audit, pend
@@ -29,7 +30,6 @@ from tupli_mcap.server.people import quotas
 from tupli_mcap.server.people.access import (
     Caller,
     DeniedError,
-    Right,
     as_told,
     demand_audience,
     left_alone,
@@ -41,8 +41,6 @@ from tupli_mcap.storage.base import oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
 from tupli_mcap.storage.files.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
-
-__all__ = ["Items", "Kind", "artifact_key"]
 
 Kind = Literal["benchmark", "artifact"]
 _Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)

@@ -26,8 +26,6 @@ from tupli_mcap.server.tables import FILE
 from tupli_mcap.server.wire import AskedFilter
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-__all__ = ["EpisodeQuery", "Selected", "opened", "select_episodes"]
-
 _CACHE_BYTES: Final = 32 << 20  # cache of all recordings of an answer together
 
 

@@ -22,8 +22,6 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.traffic.metrics import Metrics
 
-__all__ = ["Gate"]
-
 _CONTENT: Final = frozenset(
     ("/v1/benchmarks", "/v1/artifacts", "/benchmarks/create", "/artifacts/upload", "/episodes/record")
 )

@@ -14,8 +14,6 @@ from typing import Any, Final
 
 import structlog
 
-__all__ = ["LOG", "set_up"]
-
 LOG: Final = logging.getLogger("tupli_mcap.server")
 """The logger. Fields in `extra` become fields of the line."""
 

@@ -15,8 +15,6 @@ from sqlalchemy import ColumnElement, Connection, func, select
 from tupli_mcap.server.tables import FILE, ITEM, PENDING, UPLOAD, USER
 from tupli_mcap.storage.catalog.tables import TALLY
 
-__all__ = ["Metrics"]
-
 # the directory in which the processes of one server count together
 _SHARED: Final = "PROMETHEUS_MULTIPROC_DIR"
 _SECONDS: Final = (0.005, 0.02, 0.1, 0.5, 2, 10, 60, 600)

@@ -8,8 +8,6 @@ from typing import Any, Final
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-__all__ = ["PatientProtocol"]
-
 _EVERY: Final = 4  # looks, while a client may be silent
 _MOST_HEAD: Final = 128 << 10  # bytes; a piece of the body may have come with it
 
