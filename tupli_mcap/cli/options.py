@@ -106,12 +106,8 @@ def dataset_of(sources: Sequence[str]) -> Dataset:
 
 
 def recordings_of(sources: Sequence[str]) -> list[str]:
-    """The recordings that paths and URLs name; those of directories and patterns in their order by name.
-
-    Raises:
-        BadParameter: a source is a server.
-        RecordingError: there is no such file.
-    """
+    """The recordings that paths and URLs name; those of directories and patterns in their order by name. BadParameter
+    for a server, RecordingError if there is no such file."""
     from tupli_mcap.storage.listing import recordings_at
 
     for source in filter(is_server, sources):
@@ -181,9 +177,7 @@ def server_at(url: str | None) -> TupliAPIClient:
 
 def full_id(storage: TupliStorage, text: str) -> str:
     """The benchmark id that starts with `text`, for ids as tables shorten them; `text` itself if none does.
-
-    NotFoundError if several do.
-    """
+    NotFoundError if several do."""
     if len(text) < _SHORTEST_ID or len(text) >= 64 or not set(text) <= set("0123456789abcdef"):
         return text
     found = [header.id for header in storage.list_benchmarks() if header.id.startswith(text)]

@@ -29,11 +29,7 @@ _MEDIA = "application/octet-stream"
 
 
 def recording_of(shelf: Shelf, numbers_of: Mapping[str, Sequence[int]]) -> StreamingResponse:
-    """An answer with one recording of some episodes, by recording and number, written while it is sent.
-
-    Raises:
-        SpaceError, RecordingError: the episodes cannot be merged into one recording.
-    """
+    """An answer with one recording of some episodes, by recording and number; see `streamed`."""
     if len(numbers_of) > MOST_MERGED:
         raise UnmergeableError(
             f"expected episodes of at most {MOST_MERGED} recordings, found {len(numbers_of)}; choose fewer"
@@ -48,11 +44,8 @@ def recording_of(shelf: Shelf, numbers_of: Mapping[str, Sequence[int]]) -> Strea
 def streamed(
     opening: AbstractContextManager[Sequence[Excerpt]], without: Collection[str] = (), **headers: str
 ) -> StreamingResponse:
-    """An answer with one recording of these episodes, written while it is sent; see `stream_excerpts`.
-
-    Raises:
-        SpaceError, RecordingError: the episodes cannot be merged. A later error ends the connection.
-    """
+    """An answer with one recording of these episodes, written while it is sent; see `stream_excerpts`. SpaceError or
+    RecordingError if they cannot be merged; a later error ends the connection."""
     return in_pieces(stream_excerpts(opening, without), _MEDIA, **headers)
 
 
@@ -83,11 +76,7 @@ class _Streamed(StreamingResponse):
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
     """Writes a temporary file for the Rerun viewer: one episode with its blueprint, or several in the same plots.
-
-    Raises:
-        MissingExtraError: rerun-sdk is not installed.
-        RecordingError: the episodes cannot be compared.
-    """
+    MissingExtraError without rerun-sdk, RecordingError if the episodes cannot be compared."""
     from tupli_mcap.dataset.chosen import Chosen
     from tupli_mcap.viewer.plan import plans_of
     from tupli_mcap.viewer.sdk import rerun_sdk
@@ -107,12 +96,8 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
 
 
 def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
-    """Writes the pictures of an episode as a temporary MP4.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
-        NotFoundError: the episode is gone, or has no pictures.
-    """
+    """Writes the pictures of an episode as a temporary MP4. MissingExtraError without PyAV, NotFoundError if the
+    episode is gone, or has no pictures."""
     from tupli_mcap.replay import film
 
     episode = opened(shelf, header)

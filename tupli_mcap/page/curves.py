@@ -62,11 +62,7 @@ class Curves:
 
 
 def curves_of(episode: Episode) -> Curves:
-    """Reads an episode, or the beginning of a long one.
-
-    Raises:
-        FormatError: the recording is damaged.
-    """
+    """Reads an episode, or the beginning of a long one."""
     recording, layout = episode.recording, episode.recording.layout
     most = max(1, _READ_BYTES // step_bytes(layout, images=False))
     read = min(len(episode), most)
@@ -93,11 +89,7 @@ def curves_of(episode: Episode) -> Curves:
 
 
 def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
-    """The values at a step as texts, by field and name. A value that has a track has the track's name.
-
-    Raises:
-        FormatError: the recording is damaged.
-    """
+    """The values at a step as texts, by field and name. A value that has a track has the track's name."""
     recording, layout = episode.recording, episode.recording.layout
     columns = recording.read_steps(episode.position, step, step + 1, images=False)
     told = {

@@ -154,11 +154,7 @@ def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
 
 
 def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
-    """A dataset by its key.
-
-    Raises:
-        NotFoundError: there is no such dataset, or the reader may not see it.
-    """
+    """A dataset by its key. NotFoundError if there is none that the reader may see."""
     benchmarks = {h.id: h for h in shelf.benchmarks(connection, FilterEQ(key="id", value=key))}
     found = _grouped(_tallies(shelf, connection, of_dataset(key)), benchmarks)
     if not found:

@@ -26,11 +26,7 @@ _CACHE_BYTES = 64 << 20  # of each open recording
 
 
 def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
-    """The shelf of a directory, or of one recording.
-
-    Raises:
-        RecordingError: the path does not exist.
-    """
+    """The shelf of a directory, or of one recording. RecordingError if the path does not exist."""
     if path.is_dir():
         return DirectoryShelf(path)
     if not path.exists():
@@ -67,10 +63,8 @@ class OpenedRecordings:
 
 
 class _OpenToAll:
-    """A shelf whose only reader is the user who runs the program, and may read everything.
-
-    A viewer on another host can read a recording only by an address with a secret ticket.
-    """
+    """A shelf whose only reader is the user who runs the program, and may read everything. A viewer on another host can
+    read a recording only by an address with a secret ticket."""
 
     user = ""
     places: Sequence[tuple[str, str]] = ()
@@ -142,11 +136,7 @@ class FileShelf(_OpenToAll):
         return self._catalog.ask(question)
 
     def _follow(self) -> None:
-        """Updates the catalog if the file has changed.
-
-        Raises:
-            RecordingError, FormatError: the file is gone, or damaged.
-        """
+        """Updates the catalog if the file has changed. RecordingError or FormatError if it is gone, or damaged."""
         name = self._path.name
         if self._known is not None and self._known == _stamp(self._path.parent, name):
             return

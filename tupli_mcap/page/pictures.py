@@ -53,12 +53,8 @@ def cameras_of(episode: Episode) -> list[Camera]:
 
 
 def picture_at(episode: Episode, cameras: Sequence[Camera], camera: int, place: int) -> tuple[bytes, str]:
-    """The bytes and the media type of a picture: a frame as it was recorded, an image as PNG.
-
-    Raises:
-        NotFoundError: there is no such picture.
-        MissingExtraError: Pillow, which images need, is not installed.
-    """
+    """The bytes and the media type of a picture: a frame as it was recorded, an image as PNG. NotFoundError if there is
+    none, MissingExtraError for an image without Pillow."""
     if not (0 <= camera < len(cameras) and 0 <= place < len(cameras[camera].steps)):
         raise NotFoundError("there is no such picture")
     chosen = cameras[camera]

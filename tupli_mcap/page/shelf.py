@@ -56,12 +56,10 @@ class Shelf(Protocol):
         ...
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
-        """An open recording of the catalog. Others use it at the same time: do not close it.
+        """An open recording of the catalog; NotFoundError if there is none. Others use it at the same time: do not
+        close it.
 
         of: how many recordings the caller opens for one answer; they share the memory of one cache.
-
-        Raises:
-            NotFoundError: there is no such recording.
         """
         ...
 
@@ -89,11 +87,7 @@ def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnEle
 
 
 def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
-    """Opens the episode of a header.
-
-    Raises:
-        NotFoundError: the episode is gone.
-    """
+    """Opens the episode of a header. NotFoundError if it is gone."""
     recording = shelf.open(header.recording)
     found = recording.index["episode"].searchsorted(header.episode)
     if found == len(recording.index) or recording.index["episode"][found] != header.episode:
@@ -102,11 +96,8 @@ def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:
-    """Episodes by their ids, each once, in the order of their recordings.
-
-    Raises:
-        NotFoundError: an episode does not exist, or the reader may not see it.
-    """
+    """Episodes by their ids, each once, in the order of their recordings. NotFoundError if one does not exist, or the
+    reader may not see it."""
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
     found = list(each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection))))
     known = {header.id for header in found}

@@ -22,11 +22,7 @@ _turn = threading.Lock()
 
 
 def viewer_version() -> str:
-    """The version of rerun-sdk.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The version of rerun-sdk. MissingExtraError if it is not installed."""
     from tupli_mcap.viewer.sdk import rerun_sdk
 
     return str(rerun_sdk().__version__)

@@ -176,11 +176,7 @@ class Checker:
         return same
 
     def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> np.ndarray[Any, Any]:
-        """The value as a recorder stores it.
-
-        Raises:
-            StepError: it cannot be recorded.
-        """
+        """The value as a recorder stores it. StepError if it cannot be recorded."""
         if self._casts:
             array = np.asarray(value)
             if array.shape == leaf.shape and np.can_cast(array.dtype, dtype, "same_kind"):

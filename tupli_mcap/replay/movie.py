@@ -134,11 +134,7 @@ def _av() -> Any:
 
 
 def write_movie(path: Path, kind: str, pictures: Iterator[Picture], count: int, fps: float) -> None:
-    """Writes `count` pictures as ".mp4" or ".gif"; all get the size of the first one.
-
-    Raises:
-        RecordingError: the file cannot be written.
-    """
+    """Writes `count` pictures as ".mp4" or ".gif"; all get the size of the first one. RecordingError if that fails."""
     first = next(pictures)
     size = first.shape[1], first.shape[0]
     rest = (resized(picture, *size) for picture in pictures)

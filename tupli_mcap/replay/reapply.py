@@ -81,10 +81,7 @@ class Replayer:
 
     def step(self, number: int, action: Any) -> Moment:
         """Takes step `number` of the episode. It goes on after an end, as a recorded episode may.
-
-        Raises:
-            EnvironmentFailedError: the environment raised.
-        """
+        EnvironmentFailedError if the environment raises."""
         try:
             moment = Moment(*self.env.step(action))
         except (Exception, SystemExit) as err:
@@ -93,11 +90,7 @@ class Replayer:
         return moment
 
     def start(self, plan: EpisodePlan) -> Moment:
-        """Starts an episode.
-
-        Raises:
-            EnvironmentFailedError: the environment raised.
-        """
+        """Starts an episode. EnvironmentFailedError if the environment raises."""
         if plan.how == "drawn" and self.used:
             self.close()  # an environment draws its own seed only in its first reset, so a new one began here
         if plan.how == "continues" and self._last is not None:

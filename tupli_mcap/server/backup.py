@@ -92,12 +92,8 @@ def back_up(settings: Settings, target: Path) -> Copied:
 
 
 def restore(backup: Path, settings: Settings) -> Copied:
-    """Restores a backup into empty places. After an interruption, call it again.
-
-    Raises:
-        StorageError: there is no backup, or the target holds data already.
-        FormatError: a file of the backup is damaged.
-    """
+    """Restores a backup into empty places. After an interruption, call it again. StorageError if there is no backup, or
+    the target holds data already; FormatError if a file of the backup is damaged."""
     kept, place = _place_of(Settings(backup)), _place_of(settings)
     if not kept.sqlite.exists():
         raise StorageError(f"expected the backup of a server in {str(backup)!r}, found none; check the path")

@@ -30,11 +30,8 @@ class LostError(StorageError):
 
 
 class Blobs(Protocol):
-    """Named bytes that never change. Thread-safe. A name is a path with forward slashes.
-
-    Every method raises UnavailableError if the object store does not answer, and StorageError if the file system
-    refuses.
-    """
+    """Named bytes that never change. Thread-safe. A name is a path with forward slashes. Every method raises
+    UnavailableError if the object store does not answer, and StorageError if the file system refuses."""
 
     def write(self, name: str, data: bytes) -> None:
         """Keeps bytes. Writing a name again requires the same bytes."""

@@ -44,12 +44,10 @@ class TooLongError(StorageError):
 
 
 class Database:
-    """Transactions on the tables of a server. Thread-safe.
+    """Transactions on the tables of a server. Thread-safe. StorageError if the database cannot be opened, or is of a
+    later version.
 
     seconds: how long a query may take, also in a writing transaction; TooLongError if it takes longer.
-
-    Raises:
-        StorageError: the database cannot be opened, or is of a later version.
     """
 
     def __init__(self, url: str, seconds: float = 30.0) -> None:
@@ -91,10 +89,7 @@ class Database:
 
 def audience(connection: Connection, groups: Sequence[str]) -> str:
     """The text for a list of groups in `published_in`. It is also registered under each group, for SQL to find it.
-
-    Raises:
-        StorageError: there are too many groups.
-    """
+    StorageError if there are too many groups."""
     text = json.dumps(list(groups))
     if len(text) > _MOST_GROUPS_BYTES:
         raise StorageError(

@@ -61,11 +61,7 @@ _MOST_SIGN_UPS = 60  # a minute from an address
 
 
 class Library:
-    """The data of a server: database and files. Thread-safe.
-
-    Raises:
-        StorageError: the directory or the database cannot be used.
-    """
+    """The data of a server: database and files. Thread-safe. StorageError if they cannot be used."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -93,10 +89,8 @@ class Library:
         return None if chosen else password
 
     def adopt(self) -> int:
-        """Catalogs a `FileStorage` in the directory as the admin's; returns the number of new recordings.
-
-        Files stay where they are. Changes there while the server runs are noticed at its next start.
-        """
+        """Catalogs a `FileStorage` in the directory as the admin's; returns the number of new recordings. Files stay
+        where they are. Changes there while the server runs are noticed at its next start."""
         with self.database.reading() as connection:
             coming = set(pending(connection, seconds=0))
             admin = accounts.caller_named(connection, _ADMIN)
@@ -144,12 +138,8 @@ class Library:
         return True
 
     def sign_in(self, username: str, password: str, address: str) -> dict[str, Any]:
-        """Tokens for a user, see `Tokens.pair`.
-
-        Raises:
-            SignInError: the name or the password is wrong.
-            TooManyError: it was wrong too often.
-        """
+        """Tokens for a user, see `Tokens.pair`. SignInError for a wrong name or password, TooManyError if it was wrong
+        too often."""
         # Failures are counted by user and address: failures at another address must not lock the user out.
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
         with self.database.reading() as connection:
@@ -162,13 +152,8 @@ class Library:
         raise SignInError("Incorrect username or password")
 
     def create_user(self, caller: Caller, name: str, password: str, address: str) -> None:
-        """Creates a user. It takes the right to, or a server that is open to sign-ups.
-
-        Raises:
-            StorageError: the name or the password is not valid.
-            ConflictError: a user or a group has or had this name.
-            TooManyError: there were too many sign-ups from this address.
-        """
+        """Creates a user. It takes the right to, or a server that is open to sign-ups; TooManyError if there were too
+        many from this address. Raises as `accounts.hash_password` and `accounts.create_user` do."""
         if not caller.may(Right.USER_CREATE):
             if not self.settings.open_signup:
                 caller.demand(Right.USER_CREATE)
@@ -209,12 +194,7 @@ class Library:
 
     def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
         """A new upload, or the caller's unfinished upload of the same bytes; the name of the recording if the caller
-        has stored it already.
-
-        Raises:
-            FullError: the caller's quota is used up.
-            TooManyUploadsError: the caller has too many unfinished uploads.
-        """
+        has stored it already. FullError if the caller's quota is used up."""
         with self.database.writing() as connection:
             known = arrivals.stored_already(connection, caller, digest)
             if known is not None:
@@ -391,11 +371,8 @@ class Library:
                 settle(connection, name)
 
     def delete_user(self, caller: Caller, name: str) -> None:
-        """Deletes a user, and what only they could see; nothing happens if there is no such user.
-
-        Raises:
-            DeniedError: it is another user, and the caller lacks the right to delete users, or a right of theirs.
-        """
+        """Deletes a user, and what only they could see; nothing happens if there is no such user. DeniedError if it is
+        another user, and the caller lacks the right to delete users, or a right of theirs."""
         caller.demand(Right.USER_DELETE, name)
         with self.database.writing() as connection:
             accounts.demand_over(connection, caller, name)

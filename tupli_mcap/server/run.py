@@ -42,12 +42,10 @@ class Listening:
 
 
 def run(settings: Settings, listening: Listening, tell: Callable[[str, str | None], None]) -> None:
-    """Serves until a signal stops the process; finishes running requests.
+    """Serves until a signal stops the process; finishes running requests. StorageError if the directory, its database
+    or the address cannot be used.
 
     tell: called with the address, and the admin's password if it is new and random (else None).
-
-    Raises:
-        StorageError: the directory, its database or the address cannot be used.
     """
     with _bound(listening) as bound:
         library = Library(settings)

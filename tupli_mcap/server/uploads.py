@@ -74,11 +74,8 @@ class Incoming:
         self._hash = hashlib.sha256() if self.offset == 0 else None
 
     def write(self, pieces: Iterable[bytes]) -> None:
-        """Appends bytes.
-
-        Raises:
-            FullError: the disk is full. All bytes of the upload are deleted: they would keep it full for everybody.
-        """
+        """Appends bytes. FullError if the disk is full; then all bytes of the upload are deleted: they would keep it
+        full for everybody."""
         begun = self.offset
         with os_errors("cannot write", self.upload.path):
             try:
@@ -102,11 +99,8 @@ class Incoming:
             self._hash.update(piece)
 
     def verify(self) -> None:
-        """Checks the bytes of a complete upload, and writes them to the disk.
-
-        Raises:
-            ChecksumError: the bytes do not have the announced SHA-256.
-        """
+        """Checks the bytes of a complete upload, and writes them to the disk. ChecksumError if they do not have the
+        announced SHA-256."""
         with os_errors("cannot write", self.upload.path):
             os.fsync(self._file.fileno())
             found = self._hash or self._read()
@@ -130,11 +124,8 @@ class Uploads:
     def begin(
         self, connection: Connection, caller: Caller, length: int, digest: str, *, sent_before: int, most: int
     ) -> Upload:
-        """A new upload, or the user's unfinished upload of the same bytes.
-
-        Raises:
-            TooManyUploadsError: the user has `most` unfinished uploads.
-        """
+        """A new upload, or the user's unfinished upload of the same bytes. TooManyUploadsError if the user has `most`
+        of them."""
         own = select(UPLOAD).where(UPLOAD.c.user == caller.name)
         same = own.where(UPLOAD.c.digest == digest, UPLOAD.c.length == length)
         known = connection.execute(same).first()

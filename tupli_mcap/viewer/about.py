@@ -30,11 +30,8 @@ _MOST_CARDS, _MOST_UNSEEN = 5, 20
 def send_about(
     stream: Any, recordings: Sequence[Recording], chosen: Sequence[Chosen], shown: str, unseen: Sequence[str]
 ) -> None:
-    """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`.
-
-    Args:
-        chosen: episodes whose bars are marked.
-    """
+    """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`. The bars
+    of the `chosen` ones are marked."""
     import rerun as rr
 
     texts = [card(recording) for recording in recordings[:_MOST_CARDS]]

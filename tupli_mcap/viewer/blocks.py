@@ -119,13 +119,8 @@ def row_counts(recording: Recording, positions: Sequence[int]) -> Array:
 
 
 def blocks_of(recording: Recording, positions: Sequence[int], first: int = 0) -> Iterator[Block]:
-    """The steps of episodes, in their order, at most 65,536 rows and about 32 MiB at a time.
-
-    After the last step of each episode, a row number is reserved for its final state, known or not.
-
-    Args:
-        first: the number of the first row.
-    """
+    """The steps of episodes, in their order, at most 65,536 rows and about 32 MiB at a time. The first row has the
+    number `first`. After the last step of each episode, a row number is reserved for its final state, known or not."""
     chosen = np.asarray(positions, np.int64)
     chosen = chosen[recording.index["length"][chosen] > 0]
     for block in blocks(recording, chosen, steps=_rows_at_once(recording)):

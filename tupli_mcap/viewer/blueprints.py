@@ -22,12 +22,8 @@ _SHARES: dict[type, float] = {Words: 2.0, Infos: 2.0, Grid: 4.0, HeatMap: 6.0}
 def blueprint_of(
     scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = False, overview: bool = False
 ) -> Any:
-    """The blueprint of a scene whose panels are below each of `roots`.
-
-    Args:
-        listed: whether the list of recordings is open.
-        overview: whether the returns of all episodes are at the top.
-    """
+    """The blueprint of a scene whose panels are below each of `roots`. listed: whether the list of recordings is open.
+    overview: whether the returns of all episodes are at the top."""
     import rerun.blueprint as rrb
 
     axis = _newest() if scene.grows else _time_axis(linked=scene.linked)

@@ -29,11 +29,7 @@ def _widget_installed() -> bool:
 
 
 class Display:
-    """Episodes as the result of a cell.
-
-    Args:
-        width, height: of the viewer (pixels); by default as wide as the cell.
-    """
+    """Episodes as the result of a cell. width, height: of the viewer (pixels); by default as wide as the cell."""
 
     def __init__(self, plans: Iterable[Plan], width: int | None = None, height: int | None = None) -> None:
         self._width: int | Literal["auto"] = width or "auto"

@@ -156,11 +156,7 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
 
 
 def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
-    """The Rerun recordings that show the chosen episodes.
-
-    Raises:
-        RecordingError: there are too many episodes for this form.
-    """
+    """The Rerun recordings that show the chosen episodes. RecordingError if there are too many for this form."""
     total = sum(len(item.positions) for item in chosen)
     if form == "apart":
         if total > _MOST_APART:

@@ -26,11 +26,8 @@ _ANSWER = 0.25  # seconds for one that listens to answer
 
 
 def viewer_program() -> Path:
-    """The program `rerun`: that of the installed rerun-sdk, else one of the same version on the PATH.
-
-    Raises:
-        ViewerError: there is none, or it has another version than rerun-sdk.
-    """
+    """The program `rerun`: that of the installed rerun-sdk, else one of the same version on the PATH. ViewerError if
+    there is none."""
     sdk = rerun_sdk().__version__
     again = f"install it with pip install --force-reinstall rerun-sdk=={sdk}"
     spec = importlib.util.find_spec("rerun_cli")
@@ -51,11 +48,7 @@ def viewer_program() -> Path:
 
 
 def run_quietly(program: Path, *arguments: str) -> str:
-    """Runs a program; returns what it prints.
-
-    Raises:
-        ViewerError: it cannot be run, or fails.
-    """
+    """Runs a program; returns what it prints. ViewerError if it cannot be run, or fails."""
     try:
         done = subprocess.run(
             [program, *arguments], capture_output=True, text=True, errors="replace", check=False, timeout=600
@@ -92,11 +85,8 @@ def answers(host: str, port: int) -> bool:
 
 
 def start(program: Path, *arguments: str, log: IO[bytes] | int) -> subprocess.Popen[bytes]:
-    """Starts the viewer in a session of its own, so that Ctrl-C reaches this process only.
-
-    Raises:
-        ViewerError: it cannot be run.
-    """
+    """Starts the viewer in a session of its own, so that Ctrl-C reaches this process only. ViewerError if it cannot be
+    run."""
     environment = os.environ | {"RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
     try:
         return subprocess.Popen(
@@ -112,11 +102,8 @@ def start(program: Path, *arguments: str, log: IO[bytes] | int) -> subprocess.Po
 
 
 def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path) -> None:
-    """Returns once the viewer listens.
-
-    Raises:
-        ViewerError: it ends before that, or takes longer than half a minute. The message quotes its last output.
-    """
+    """Returns once the viewer listens. ViewerError, which quotes its last output, if it ends before that, or takes
+    longer than half a minute."""
     until = time.monotonic() + _PATIENCE
     left = list(ports)
     while left and time.monotonic() < until and process.poll() is None:
@@ -142,11 +129,8 @@ def scratch() -> Iterator[Path]:
 
 @contextlib.contextmanager
 def web_viewer(program: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[bytes], int, int]]:
-    """The web viewer within the block: its process, the port that takes data, the port of its page.
-
-    Raises:
-        ViewerError: it does not start.
-    """
+    """The web viewer within the block: its process, the port that takes data, the port of its page. ViewerError if it
+    does not start."""
     data, page = free_port(), free_port()
     ports = ["--serve-web", "--port", str(data), "--web-viewer-port", str(page)]
     with scratch() as folder, (folder / "log").open("wb") as log:

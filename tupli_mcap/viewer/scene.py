@@ -92,11 +92,8 @@ class _Material(NamedTuple):
 
 
 def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = False) -> Scene:
-    """The panels for some episodes of a recording.
-
-    Args:
-        apart: give each dimension its own view, in which several episodes are overlaid.
-    """
+    """The panels for some episodes of a recording. apart: give each dimension its own view, in which several episodes
+    are overlaid."""
     layout = recording.layout
     rows = int(recording.index["length"][np.asarray(positions, np.int64)].sum())
     scene = Scene(rewards=[Rewards(layout.reward)], rows=rows)
@@ -120,13 +117,8 @@ def live_scene(
     *,
     apart: bool,
 ) -> Scene:
-    """The panels for a running rollout.
-
-    Args:
-        sample: columns of its first steps.
-        infos: keys of numbers in infos.
-        apart: give each dimension its own view, in which several sub-environments are overlaid.
-    """
+    """The panels for a running rollout. sample: columns of its first steps. infos: keys of numbers in infos. apart:
+    give each dimension its own view, in which several sub-environments are overlaid."""
     scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
     if camera is not None:
         scene.beside.append(Camera(camera, f"/camera/{escaped(camera)}", f"camera {camera}"))

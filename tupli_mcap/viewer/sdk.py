@@ -19,11 +19,7 @@ class ViewerError(TupliError):
 
 
 def rerun_sdk() -> Any:
-    """The module `rerun`.
-
-    Raises:
-        MissingExtraError: the extra `rerun` is not installed, or its rerun-sdk is too old.
-    """
+    """The module `rerun`. MissingExtraError if the extra `rerun` is not installed, or its rerun-sdk is too old."""
     try:
         import rerun
     except ImportError as err:

@@ -12,14 +12,9 @@ from tupli_mcap.arrays import Array
 
 
 class Times:
-    """The positions of rows on the timelines.
-
-    Args:
-        step: number of the step.
-        wall: wall clock (ns).
-        step_seconds: duration of a step in the environment (s); None if unknown: then this timeline is left out.
-        seams: the first rows of episodes that follow another one.
-    """
+    """The positions of rows on the timelines: numbers of steps, and wall clock (ns). step_seconds: duration of a step
+    in the environment (s); without one, its timeline is left out. seams: the first rows of episodes that follow another
+    one."""
 
     def __init__(
         self, step: Array, wall: Array, step_seconds: float | None, seams: Sequence[int] = ()

@@ -43,10 +43,7 @@ def to_file(
     tell: Callable[[str], None] | None = None,
 ) -> Path:
     """Writes a `.rrd` with its blueprint, as a whole or not at all. `tell` is called with the command that opens it.
-
-    Raises:
-        RecordingError: its name does not end in .rrd, it exists and `overwrite` is False, or it cannot be written.
-    """
+    RecordingError if its name does not end in .rrd, it exists (without `overwrite`), or it cannot be written."""
     goal = Path(target)
     if goal.suffix != ".rrd":
         raise RecordingError(
@@ -66,11 +63,7 @@ def to_file(
 
 
 def check_new(goal: Path, *, overwrite: bool) -> None:
-    """Checks that a file can be made.
-
-    Raises:
-        RecordingError: it exists and not `overwrite`, or there is no directory for it.
-    """
+    """Raises RecordingError if a file exists (without `overwrite`), or there is no directory for it."""
     if goal.exists() and not overwrite:
         raise RecordingError(f"{goal} exists; choose another path, or pass overwrite=True (--force)")
     if not goal.parent.is_dir():
@@ -102,11 +95,8 @@ def _write(plan: Plan, path: Path, blueprint: Any) -> None:
 
 
 def to_viewer(plans: Iterable[Plan], url: str) -> None:
-    """Sends to a running viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
-
-    Raises:
-        ViewerError: the URL is not valid, or no viewer took the data.
-    """
+    """Sends to a running viewer, such as `rerun+http://127.0.0.1:9876/proxy`. ViewerError if the URL is not valid, or
+    no viewer took the data."""
     _await_viewer(url)
     for plan in plans:
         stream = plan.new_stream()
@@ -152,11 +142,8 @@ def _viewer_errors(url: str) -> Iterator[None]:
 
 
 def to_window(plans: Iterable[Plan]) -> int:
-    """Opens the native viewer, which stays open when this process ends; returns its process id.
-
-    Raises:
-        ViewerError: there is no display, or no viewer, or it does not start.
-    """
+    """Opens the native viewer, which stays open when this process ends; returns its process id. ViewerError if there is
+    no display, or no viewer, or it does not start."""
     program = viewer_program()
     if not has_display():
         raise ViewerError(
@@ -177,11 +164,8 @@ def to_window(plans: Iterable[Plan]) -> int:
 
 
 def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
-    """Serves the web viewer and the data on 127.0.0.1 until Ctrl-C; `tell` is called with the URL.
-
-    Raises:
-        ViewerError: there is no viewer program, or it does not start, or ends.
-    """
+    """Serves the web viewer and the data on 127.0.0.1 until Ctrl-C; `tell` is called with the URL. ViewerError if there
+    is no viewer program, or it does not start, or ends."""
     program = viewer_program()
     with scratch() as folder, stopped_by_signals():
         path = to_file(plans, folder / "replay.rrd")

@@ -134,12 +134,7 @@ class Seen(NamedTuple):
 
 
 def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:
-    """Reads what the page shows of an episode.
-
-    Raises:
-        NotFoundError: the episode is gone.
-        FormatError: its recording is damaged.
-    """
+    """Reads what the page shows of an episode. NotFoundError if it is gone."""
     episode = opened(shelf, header)
     step = min(max(0, step), len(episode) - 1)
     return Seen(episode, curves_of(episode), cameras_of(episode), step, values_at(episode, step))

@@ -107,11 +107,7 @@ def end(response: Response) -> None:
 
 
 def shelf_of(request: Request, visit: Visit) -> LibraryShelf:
-    """The shelf of what the caller may see.
-
-    Raises:
-        SignInNeededError: nobody is signed in, and the server has no guests.
-    """
+    """The shelf of what the caller may see. SignInNeededError if nobody is signed in, and the server has no guests."""
     if not visit.is_signed_in and not visit.library.settings.guests:
         raise SignInNeededError("sign in to see what is here")
     address = f"{request.url.scheme}://{request.url.netloc}"

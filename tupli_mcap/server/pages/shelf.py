@@ -71,11 +71,8 @@ class LibraryShelf:
         return self._kept.get((place, numbers), lambda size: self._cut(some, size), of)
 
     def _readable(self, recording: str) -> tuple[str, tuple[int, ...] | None]:
-        """The place of a recording, and the episodes of it that the caller may read; None for all.
-
-        Raises:
-            NotFoundError: there is no such recording, or the caller may read none of its episodes.
-        """
+        """The place of a recording, and the episodes of it that the caller may read; None for all. NotFoundError if
+        there are none."""
         file = select(FILE.c.place, FILE.c.episodes).where(FILE.c.path == escape_text(recording))
         numbers = select(EPISODE.c.episode).join(RECORDING, of_one_recording()).order_by(EPISODE.c.episode)
         with self._library.database.reading() as connection:

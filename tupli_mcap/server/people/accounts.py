@@ -55,12 +55,8 @@ def prepare(connection: Connection) -> None:
 
 
 def create_user(connection: Connection, name: str, hashed: str) -> None:
-    """Creates a user with the hash of a password, see `hash_password`.
-
-    Raises:
-        StorageError: the name is not valid.
-        ConflictError: a user or a group has or had this name.
-    """
+    """Creates a user with the hash of a password, see `hash_password`. StorageError if the name is not valid,
+    ConflictError if a user or a group has or had it."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise StorageError(
             f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
@@ -79,11 +75,8 @@ def verify_password(connection: Connection, name: str, password: str) -> bool:
 
 
 def change_password(connection: Connection, name: str, hashed: str) -> None:
-    """Changes a user's password to one of this hash, and ends all sign-ins and tokens of the user.
-
-    Raises:
-        NotFoundError: there is no such user.
-    """
+    """Changes a user's password to one of this hash, and ends all sign-ins and tokens of the user. NotFoundError if
+    there is no such user."""
     changed = connection.execute(
         update(USER).where(USER.c.name == name).values(password=hashed, epoch=USER.c.epoch + 1)
     )
@@ -93,10 +86,8 @@ def change_password(connection: Connection, name: str, hashed: str) -> None:
 
 
 def delete_user(connection: Connection, name: str) -> bool:
-    """Deletes a user with all tokens and memberships; returns whether there was one.
-
-    The name cannot be used again: another user of this name would own what this user stored.
-    """
+    """Deletes a user with all tokens and memberships; returns whether there was one. The name cannot be used again:
+    another user of this name would own what this user stored."""
     gone = connection.execute(delete(USER).where(USER.c.name == name)).rowcount
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.user == name))
     _revoke(connection, name)
@@ -158,11 +149,8 @@ def _with_memberships(
 
 
 def hash_password(password: str, shortest: int) -> str:
-    """The hash of a new password. Takes a while, for which others would wait in a writing transaction.
-
-    Raises:
-        StorageError: the password has fewer than `shortest` characters, or too many.
-    """
+    """The hash of a new password. Takes a while, for which others would wait in a writing transaction. StorageError if
+    the password has fewer than `shortest` characters, or too many."""
     if not isinstance(password, str) or not shortest <= len(password) <= _MOST_PASSWORD:
         found = f"{len(password)} characters" if isinstance(password, str) else "no text"
         raise StorageError(
@@ -197,12 +185,8 @@ def _alike(name: str) -> str:
 
 
 def create_group(connection: Connection, caller: Caller, name: str, description: str | None) -> None:
-    """Creates a group with the caller as its admin.
-
-    Raises:
-        ConflictError: a user or a group has or had this name.
-        StorageError: the name is not valid, or the caller has created too many groups.
-    """
+    """Creates a group with the caller as its admin. ConflictError if a user or a group has or had the name,
+    StorageError if it is not valid, or the caller has created too many groups."""
     caller.demand(Right.GROUP_CREATE)
     if not caller.may(Right.ROLE_MANAGEMENT):
         demand_few(connection, caller.name, "create_group", _MOST_GROUPS)
@@ -229,11 +213,8 @@ def list_groups(connection: Connection, caller: Caller) -> list[dict[str, str | 
 
 
 def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, object]:
-    """A group with its description and members (`[{user, roles}]`).
-
-    Raises:
-        NotFoundError: there is no such group, or the caller may not see it.
-    """
+    """A group with its description and members (`[{user, roles}]`). NotFoundError if there is none that the caller may
+    see."""
     _known(connection, caller, name)
     description = connection.execute(select(GROUP.c.description).where(GROUP.c.name == name)).scalar()
     roles: dict[str, list[str]] = {}
@@ -352,11 +333,8 @@ def list_roles(connection: Connection) -> list[dict[str, object]]:
 
 
 def delete_role(connection: Connection, caller: Caller, name: str) -> None:
-    """Deletes a role, and takes it from all who have it; nothing happens if there is no such role.
-
-    Raises:
-        DeniedError: it is a default role, or the caller may not manage roles.
-    """
+    """Deletes a role, and takes it from all who have it; nothing happens if there is no such role. DeniedError for a
+    default role."""
     caller.demand(Right.ROLE_MANAGEMENT)
     if name in DEFAULT_ROLES:
         raise DeniedError(f"role {name} is one that the server needs; it cannot be deleted")

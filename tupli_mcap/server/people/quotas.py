@@ -34,11 +34,8 @@ def quota_of(connection: Connection, settings: Settings, user: str) -> int | Non
 
 
 def set_quota(connection: Connection, user: str, size: int | None) -> None:
-    """Gives a user a quota of their own (bytes); None for the quota of the settings.
-
-    Raises:
-        NotFoundError: there is no such user.
-    """
+    """Gives a user a quota of their own (bytes); None for the quota of the settings. NotFoundError if there is no such
+    user."""
     if not connection.execute(update(USER).where(USER.c.name == user).values(quota=size)).rowcount:
         raise NotFoundError("User does not exist")
 

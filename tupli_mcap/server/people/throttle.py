@@ -42,11 +42,8 @@ class Turns:
 
     @contextlib.asynccontextmanager
     async def turn(self, caller: Caller, address: str) -> AsyncIterator[None]:
-        """The turn of a request, which ends with the block. Guests are told apart by their addresses.
-
-        Raises:
-            TooManyError: too many requests of this caller wait already.
-        """
+        """The turn of a request, which ends with the block. Guests are told apart by their addresses. TooManyError if
+        too many requests of this caller wait already."""
         user = f"guest at {address}" if caller.is_guest else caller.name
         if self._asked[user] >= self._most + _MOST_WAITING:
             raise TooManyError(1, "too many requests at a time; wait for the answers to earlier ones")
@@ -83,12 +80,9 @@ def demand_few_failures(connection: Connection, most: Mapping[str, int]) -> None
 
 
 def note_attempt(connection: Connection, most: Mapping[str, int], *, failed: bool) -> None:
-    """Notes the end of an attempt, in the transaction that does what it was made for. Of attempts at the same time,
-    those that end after too many have failed are refused, right or wrong: they tell nothing of a password.
-
-    Raises:
-        TooManyError: a key has failed too often, see `demand_few_failures`.
-    """
+    """Notes the end of an attempt, in the transaction that does what it was made for. Raises as `demand_few_failures`
+    does: of attempts at the same time, those that end after too many have failed are refused, right or wrong, and tell
+    nothing of a password."""
     demand_few_failures(connection, most)
     if failed:
         now = int(time.time())

@@ -62,11 +62,8 @@ class Tokens:
         }
 
     def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
-        """A new pair for a refresh token; None if it was used before, which ends the whole sign-in.
-
-        Raises:
-            SignInError: it is not valid, or has expired.
-        """
+        """A new pair for a refresh token; None if it was used before, which ends the whole sign-in. SignInError if it
+        is not valid, or has expired."""
         table = REFRESH_TOKEN
         found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
         if found is None or found.expires < time.time():
@@ -79,10 +76,7 @@ class Tokens:
 
     def access_for(self, connection: Connection, refresh: str) -> str:
         """An access token for a refresh token that is not exchanged: PyTupli's client always keeps the same.
-
-        Raises:
-            SignInError: it is not valid, was used, or has expired.
-        """
+        SignInError if it is not valid, was used, or has expired."""
         found = _of_refresh_token(connection, refresh)
         if found is None:
             raise SignInError("Could not validate credentials")
@@ -112,11 +106,7 @@ class Tokens:
         connection.execute(delete(table).where(table.c.family == family))
 
     def caller(self, connection: Connection, token: str) -> Caller:
-        """The caller of an access token or an API token.
-
-        Raises:
-            SignInError: it is not valid, has expired, or was revoked.
-        """
+        """The caller of an access token or an API token. SignInError if it is not valid, expired or revoked."""
         if token.startswith(_API_PREFIX):
             return _of_api_token(connection, token)
         told = self._told(token, "access")
@@ -155,11 +145,7 @@ class Tokens:
         return [{str(key): value for key, value in row._mapping.items()} for row in rows]
 
     def delete_api_token(self, connection: Connection, caller: Caller, number: str) -> None:
-        """Revokes one of the caller's tokens.
-
-        Raises:
-            NotFoundError: the caller has no such token.
-        """
+        """Revokes one of the caller's tokens. NotFoundError if the caller has no such token."""
         own = (API_TOKEN.c.id == number, API_TOKEN.c.user == caller.name)
         if not connection.execute(delete(API_TOKEN).where(*own)).rowcount:
             raise NotFoundError("there is no such token")
@@ -173,11 +159,8 @@ class Tokens:
         return self._signed("ticket", self._settings.ticket_seconds, **told, **what)
 
     def of_ticket(self, connection: Connection, ticket: str) -> tuple[Caller, dict[str, Any]]:
-        """The caller who was given a ticket, and what it opens.
-
-        Raises:
-            SignInError: it is not valid, has expired, or was revoked.
-        """
+        """The caller who was given a ticket, and what it opens. SignInError if it is not valid, has expired, or was
+        revoked."""
         told = self._told(ticket, "ticket")
         found = caller_named(connection, told["sub"]) or guest(connection)
         if not found.is_guest:

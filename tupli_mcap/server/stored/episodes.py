@@ -81,11 +81,7 @@ def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | 
 
 
 def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
-    """The file of a recording.
-
-    Raises:
-        NotFoundError: there is no such recording, or the caller may read none of its episodes.
-    """
+    """The file of a recording. NotFoundError if there is none of which the caller may read an episode."""
     for each in names_of(name):
         found = connection.execute(select(FILE).where(FILE.c.path == escape_text(each))).first()
         if found is not None:
@@ -123,13 +119,8 @@ def publish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Lets a group see the caller's own episodes that match a filter: all, or none. Doing it twice changes nothing.
-
-    only: see `find_episodes`.
-
-    Returns:
-        How many they are.
-    """
+    """Lets a group see the caller's own episodes that match a filter: all, or none; returns how many. Doing it twice
+    changes nothing. only: see `find_episodes`."""
     found = []
     for header in find_episodes(connection, caller, filter, only=only):
         if header.created_by != caller.name:
@@ -151,14 +142,8 @@ def unpublish(
     *,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Hides episodes from a group. The owner may, and whoever has the right to delete in that group, who hides all
-    episodes of an id.
-
-    only: see `find_episodes`.
-
-    Returns:
-        How many they are.
-    """
+    """Hides episodes from a group; returns how many. The owner may, and whoever has the right to delete in that group,
+    who hides all episodes of an id. only: see `find_episodes`."""
     copies = caller.may(Right.EPISODE_DELETE, group)
     found = []
     for header in find_episodes(connection, caller, filter, only=only, copies=copies):
@@ -181,11 +166,8 @@ def publish_one(
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
     """Deletes the readable episodes that match a filter; returns how many, and the names of files to delete. A caller
-    who may delete what others have stored deletes all episodes of an id.
-
-    Raises:
-        DeniedError: an episode is somebody else's, and the caller may not delete it; then none is deleted.
-    """
+    who may delete what others have stored deletes all episodes of an id. DeniedError if one is somebody else's, and the
+    caller may not delete it; then none is deleted."""
     may = caller.may(Right.EPISODE_DELETE)
     doomed = []
     for header in find_episodes(connection, caller, filter, copies=may):

@@ -143,11 +143,8 @@ class Items:
         ]
 
     def delete_artifact(self, connection: Connection, caller: Caller, uri: str, *, force: bool) -> None:
-        """Deletes the caller's own artifact; with the right to, also one that others have published.
-
-        Raises:
-            StorageError: a benchmark of its owners needs it, and `force` is not given.
-        """
+        """Deletes the caller's own artifact; with the right to, also one that others have published. StorageError if a
+        benchmark of its owners needs it, unless `force`."""
         doomed = self._doomed(connection, caller, "artifact", uri)
         owners = [row.created_by for row in doomed]
         if not force:
@@ -264,11 +261,7 @@ class Items:
 
     def _doomed(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
         """The items to delete: the caller's own one, or else, with the right to, all readable ones of this id.
-
-        Raises:
-            NotFoundError: there is no such item that the caller may read.
-            DeniedError: the caller may read it, but not delete it.
-        """
+        NotFoundError if there is none, DeniedError if the caller may read it, but not delete it."""
         found = self._visible(connection, caller, kind, uri)
         if found and found[0].created_by == caller.name:
             return found[:1]

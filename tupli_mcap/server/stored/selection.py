@@ -63,13 +63,8 @@ class Selected(NamedTuple):
 def select_episodes(
     connection: Connection, caller: Caller, items: Items, query: EpisodeQuery
 ) -> list[Selected]:
-    """The episodes of a query that the caller may read.
-
-    Raises:
-        NotFoundError: there are none.
-        StorageError: they are of more recordings than one answer can hold.
-        FilterError: a filter names an unknown key.
-    """
+    """The episodes of a query that the caller may read. NotFoundError if there are none, StorageError if they are of
+    more recordings than one answer can hold."""
     if query.episodes is not None and len(query.recordings or ()) != 1:
         raise StorageError(
             "expected numbers of episodes (`episodes`) with the name of one recording (`recordings`)"
@@ -100,12 +95,8 @@ def select_episodes(
 
 @contextlib.contextmanager
 def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]]:
-    """Opens the selected episodes; their recordings are closed at the end of the block.
-
-    Raises:
-        NotFoundError: some have been deleted meanwhile.
-        RecordingError, FormatError: a file is gone, or damaged.
-    """
+    """Opens the selected episodes; their recordings are closed at the end of the block. NotFoundError if all have been
+    deleted meanwhile; RecordingError, FormatError if a file is gone, or damaged."""
     with contextlib.ExitStack() as stack:
         excerpts = []
         for name, place, numbers in selected:

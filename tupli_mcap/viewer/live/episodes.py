@@ -53,13 +53,8 @@ class _Shown:
 
 
 class EpisodeNews:
-    """The starts and ends of episodes since the last look.
-
-    Args:
-        topics: the channels.
-        new_rows: returns the rows of a channel that were not looked at.
-        seen: how many rows of each channel were looked at.
-    """
+    """The starts and ends of episodes since the last look. `new_rows` returns the rows of a channel that were not
+    looked at; `seen` has how many of each were."""
 
     def __init__(
         self, topics: Mapping[str, int], new_rows: Callable[[int], range], seen: MutableMapping[int, int]

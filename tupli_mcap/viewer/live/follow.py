@@ -134,11 +134,8 @@ def _unread(channel: int, first: int, stop: int) -> Piece:
 
 class Follower:
     """Reads what a recorder has committed since the last look. Rows before offset `begin` of the file are left out.
-
-    Attributes:
-        is_over: the recorder has finished, so the next look finds the rest.
-        steps: the step channels of the sub-environments whose steps are read.
-    """
+    `is_over`: the recorder has finished, so the next look finds the rest. `steps`: the step channels of the
+    sub-environments whose steps are read."""
 
     def __init__(
         self, source: PathSource, metadata: Mapping[str, str], evidence: Evidence, begin: int
@@ -290,11 +287,8 @@ class Follower:
 
 
 def follow(path: Path, uuid: str, begin: int) -> Follower | None:
-    """A follower of the recording with this UUID; None while it has no layout, or while another file is at its path.
-
-    Args:
-        begin: where in the file this session begins.
-    """
+    """A follower of the recording with this UUID, from offset `begin` of its file on; None while it has no layout, or
+    while another file is at its path."""
     try:
         source = PathSource(path)
     except RecordingError:  # no step was recorded

@@ -23,11 +23,7 @@ _FAREWELL = 0.2  # seconds for clients to take the last messages, which a stoppi
 
 
 class FoxgloveView:
-    """Publishes what is recorded, on the channels that a client has subscribed to.
-
-    Raises:
-        RuntimeError: the port is taken.
-    """
+    """Publishes what is recorded, on the channels that clients subscribed to. RuntimeError if the port is taken."""
 
     def __init__(self, target: Target, title: str) -> None:
         self._context = foxglove.Context()

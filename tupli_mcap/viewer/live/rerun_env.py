@@ -56,12 +56,8 @@ class _NewestMap:
 
 
 class LiveEnv:
-    """Sends the steps of sub-environment `env`, numbered through all its episodes.
-
-    Args:
-        scene: the panels that all sub-environments have.
-        place: the root that they are below; `on` gives it a stream.
-        share: how many sub-environments are shown, which share what is sent at a time.
+    """Sends the steps of sub-environment `env`, numbered through all its episodes, to the panels of `scene` below
+    `place`, which `on` gives a stream. share: how many sub-environments are shown, which share what is sent at a time.
     """
 
     def __init__(
@@ -104,10 +100,8 @@ class LiveEnv:
         self._rows = new.first + len(new)
 
     def catch_up(self, end: int) -> None:
-        """Numbers rows from here on so that the last one known of is before `end`.
-
-        A sub-environment with shorter episodes has fewer rows, since a reset makes none.
-        """
+        """Numbers rows from here on so that the last one known of is before `end`. A sub-environment with shorter
+        episodes has fewer rows, since a reset makes none."""
         self._shift = max(self._shift, end - self._rows)
 
     def on(self, stream: Any) -> None:

@@ -22,15 +22,9 @@ _STARTING = 20.0  # seconds for a viewer that we have started to answer
 
 
 class RerunView:
-    """Connects to a Rerun viewer, or starts one and connects to it.
+    """Connects to a Rerun viewer, or starts one and connects to it. ViewerError if there is no viewer program to start.
 
-    Args:
-        title: the name of the rollout.
-        warn: called once if no viewer answers, and once if one is gone.
-
-    Raises:
-        MissingExtraError: the rerun-sdk that is installed is too old.
-        ViewerError: there is no viewer program to start.
+    title: the name of the rollout. warn: called once if no viewer answers, or if one is gone.
     """
 
     def __init__(self, target: Target, title: str, warn: Callable[[str], None]) -> None:

@@ -29,11 +29,7 @@ class Target(NamedTuple):
 
 
 def parse_target(text: str) -> Target:
-    """The viewer that `live=` names.
-
-    Raises:
-        RecordingError: it names none.
-    """
+    """The viewer that `live=` names. RecordingError if it names none."""
     if text == "rerun":
         return Target("rerun", LOCAL, RERUN_PORT)
     if text == "foxglove":
