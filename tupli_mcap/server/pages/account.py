@@ -10,7 +10,6 @@ from fastapi.responses import JSONResponse
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute
-from tupli_mcap.server.database import audit
 from tupli_mcap.server.pages.forms import form_page, tried
 from tupli_mcap.server.pages.session import Code, Member, Visit, begin
 from tupli_mcap.server.people import accounts
@@ -31,10 +30,7 @@ def show(request: Request, visit: Member) -> Response:
 def change_password(request: Request, visit: Code, old: _Text = "", new: _Text = "") -> Response:
     """Changes the user's password; every other sign-in ends."""
     library, name = visit.library, visit.caller.name
-
-    def change() -> None:
-        library.change_password(visit.caller, name, new, old=old)
-
+    change = partial(library.change_password, visit.caller, name, new, old=old)
     response = tried(change, partial(_page, request, visit), "/account")
     if response.status_code == 303:
         with library.database.writing() as connection:
@@ -55,7 +51,6 @@ def create_token(
     library = visit.library
     try:
         with library.database.writing() as connection:
-            audit(connection, visit.caller.name, "create_api_token", name)
             made = library.tokens.create_api_token(connection, visit.caller, name, scope, days)
     except TupliError as err:
         status, text = told(err)
@@ -66,12 +61,7 @@ def create_token(
 @router.post("/account/tokens/delete")
 def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
     """Revokes a token for a machine."""
-
-    def change() -> None:
-        with visit.library.database.writing() as connection:
-            visit.library.tokens.delete_api_token(connection, visit.caller, token)
-            audit(connection, visit.caller.name, "delete_api_token", token)
-
+    change = partial(visit.change, visit.library.tokens.delete_api_token, token)
     return tried(change, partial(_page, request, visit), "/account")
 
 

@@ -39,10 +39,7 @@ def create_user(request: Request, visit: Code, username: _Text = "", password: _
 @router.post("/users/delete")
 def delete_user(request: Request, visit: Code, username: _Text = "") -> Response:
     """Deletes a user, and what only they could see; the name cannot be used again."""
-
-    def change() -> None:
-        visit.library.delete_user(visit.caller, username)
-
+    change = partial(visit.library.delete_user, visit.caller, username)
     return tried(change, partial(_users, request, visit), "/users")
 
 
@@ -67,11 +64,7 @@ def show_groups(request: Request, visit: Member) -> Response:
 @router.post("/groups")
 def create_group(request: Request, visit: Code, name: _Text = "", description: _Text = "") -> Response:
     """Creates a group with the user as its admin."""
-
-    def change() -> None:
-        with visit.library.database.writing() as connection:
-            accounts.create_group(connection, visit.caller, name, description or None)
-
+    change = partial(visit.change, accounts.create_group, name, description or None)
     sent = {"name": name, "description": description}
     return tried(change, partial(_groups, request, visit, sent=sent), address("group", name=name))
 
@@ -98,11 +91,7 @@ def add_member(
     request: Request, visit: Code, name: _Text = "", user: _Text = "", role: _Text = "member"
 ) -> Response:
     """Gives a user a role in a group."""
-
-    def change() -> None:
-        with visit.library.database.writing() as connection:
-            accounts.add_members(connection, visit.caller, name, [(user, [role])])
-
+    change = partial(visit.change, accounts.add_members, name, [(user, [role])])
     again = partial(_group, request, visit, name, sent={"user": user, "role": role})
     return tried(change, again, address("group", name=name))
 
@@ -110,22 +99,14 @@ def add_member(
 @router.post("/group/members/delete")
 def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text = "") -> Response:
     """Takes a user out of a group."""
-
-    def change() -> None:
-        with visit.library.database.writing() as connection:
-            accounts.remove_members(connection, visit.caller, name, [user])
-
+    change = partial(visit.change, accounts.remove_members, name, [user])
     return tried(change, partial(_group, request, visit, name), address("group", name=name))
 
 
 @router.post("/group/delete")
 def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
     """Deletes a group; its name cannot be used again."""
-
-    def change() -> None:
-        with visit.library.database.writing() as connection:
-            accounts.delete_group(connection, visit.caller, name)
-
+    change = partial(visit.change, accounts.delete_group, name)
     return tried(change, partial(_group, request, visit, name), "/groups")
 
 

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Annotated, Final, NamedTuple
 from urllib.parse import urlsplit
 
@@ -38,6 +38,11 @@ class Visit(NamedTuple):
     def is_signed_in(self) -> bool:
         """Whether the caller is signed in, and no guest."""
         return bool(self.session)
+
+    def change(self, work: Callable[..., object], *args: object) -> None:
+        """Calls `work(connection, caller, *args)` in a writing transaction."""
+        with self.library.database.writing() as connection:
+            work(connection, self.caller, *args)
 
 
 def _known_visit(request: Request) -> Visit:

@@ -22,6 +22,7 @@ from sqlalchemy import Connection, delete, func, insert, or_, select, update
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.server.database import audit
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.people.accounts import caller_named, guest
 from tupli_mcap.server.settings import Settings
@@ -135,6 +136,7 @@ class Tokens:
         expires = None if days is None else now + days * 24 * 3600
         told = {"id": number, "name": name, "scope": scope, "created_at": now, "expires": expires}
         connection.execute(insert(API_TOKEN).values(**told, digest=_digest(token), user=caller.name))
+        audit(connection, caller.name, "create_api_token", name)
         return {**told, "token": token}
 
     def list_api_tokens(self, connection: Connection, caller: Caller) -> list[dict[str, Any]]:
@@ -149,6 +151,7 @@ class Tokens:
         own = (API_TOKEN.c.id == number, API_TOKEN.c.user == caller.name)
         if not connection.execute(delete(API_TOKEN).where(*own)).rowcount:
             raise NotFoundError("there is no such token")
+        audit(connection, caller.name, "delete_api_token", number)
 
     # --- tickets ---
 
