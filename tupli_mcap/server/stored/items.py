@@ -64,7 +64,7 @@ class Items:
         caller.demand(Right.BENCHMARK_CREATE, caller.name)
         uri, document, _ = document_of(query)
         own = self._own(connection, caller, "benchmark", uri)
-        if own is None:
+        if not own:
             needs: Sequence[str] = ()
             if document.get("environment") is not None:
                 needs = artifacts_of(unpack(query.serialized).record, "the benchmark")
@@ -79,8 +79,7 @@ class Items:
             own = self._add(
                 connection, caller, "benchmark", header, content=query.serialized, needs=needs, size=size
             )
-            audit(connection, caller.name, "store_benchmark", uri)
-        return _told(connection, caller, BenchmarkHeader, own)[0]
+        return _told(connection, caller, BenchmarkHeader, *own)[0]
 
     def load_benchmark(self, connection: Connection, caller: Caller, uri: str) -> Benchmark:
         """As `TupliStorage.load_benchmark`; NotFoundError also if the caller may not read it."""
@@ -110,16 +109,15 @@ class Items:
         caller.demand(Right.ARTIFACT_CREATE, caller.name)
         uri = sha256(data)
         own = self._own(connection, caller, "artifact", uri)
-        if own is None:
+        if not own:
             item = ArtifactMetadataItem.create_new(**dict(metadata), id=uri, hash=uri, created_by=caller.name)
             own = self._add(connection, caller, "artifact", item, size=len(data))
-            audit(connection, caller.name, "store_artifact", uri)
-        return _told(connection, caller, ArtifactMetadataItem, own)[0]
+        return _told(connection, caller, ArtifactMetadataItem, *own)[0]
 
     def has_artifact(self, connection: Connection, caller: Caller, data: bytes) -> bool:
         """Whether a caller, who may store artifacts, has stored these bytes already."""
         caller.demand(Right.ARTIFACT_CREATE, caller.name)
-        return self._own(connection, caller, "artifact", sha256(data)) is not None
+        return bool(self._own(connection, caller, "artifact", sha256(data)))
 
     def load_artifact(self, connection: Connection, caller: Caller, uri: str) -> ArtifactMetadataItem:
         """The metadata of a readable artifact; its bytes are kept under `artifact_key`."""
@@ -174,7 +172,9 @@ class Items:
 
     def publish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
         """Lets a group see the caller's own item. Doing it twice changes nothing."""
-        row = self._owned(connection, caller, kind, uri)
+        row = self._find(connection, caller, kind, uri)
+        if row.created_by != caller.name:
+            raise DeniedError(f"{kind} {uri} is somebody else's; only its owner may publish it")
         groups = published_in(json.loads(row.published_in), group)
         demand_audience(connection, caller, _CREATE[kind], group)
         self._set_audience(connection, row, groups)
@@ -206,14 +206,14 @@ class Items:
         content: str | None = None,
         needs: Sequence[str] = (),
         size: int,
-    ) -> Row[Any]:
+    ) -> Sequence[Row[Any]]:
         header = json.dumps(plain(item))
         size += len(header)
         quotas.demand_room(connection, self._settings, caller, size)
         row = {
             "kind": kind,
             "id": item.id,
-            "created_by": item.created_by,
+            "created_by": caller.name,
             "published_in": audience(connection, item.published_in),
             "header": header,
             "content": content,
@@ -221,12 +221,13 @@ class Items:
             "size": size,
         }
         connection.execute(insert(ITEM).values(**row))
-        own = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == item.id, ITEM.c.created_by == item.created_by)
-        return connection.execute(own).one()
+        audit(connection, caller.name, f"store_{kind}", item.id)
+        return self._own(connection, caller, kind, item.id)
 
-    def _own(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any] | None:
+    def _own(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Sequence[Row[Any]]:
+        """The caller's item of an id, if there is one."""
         own = _COLUMNS.where(ITEM.c.kind == kind, ITEM.c.id == uri, ITEM.c.created_by == caller.name)
-        return connection.execute(own).first()
+        return connection.execute(own).all()
 
     def _visible(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> list[Row[Any]]:
         """The readable items of an id, the caller's own one first."""
@@ -243,12 +244,6 @@ class Items:
                 f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() names them all"
             )
         return found[0]
-
-    def _owned(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any]:
-        row = self._find(connection, caller, kind, uri)
-        if row.created_by != caller.name:
-            raise DeniedError(f"{kind} {uri} is somebody else's; only its owner may publish it")
-        return row
 
     def _readable(self, connection: Connection, caller: Caller, kind: Kind) -> list[Row[Any]]:
         """One item for each readable id: the caller's own, or else the oldest."""
