@@ -38,7 +38,6 @@ def set_up() -> None:
                 structlog.stdlib.ExtraAdder(),
                 structlog.processors.TimeStamper(fmt="iso", utc=True),
                 structlog.processors.format_exc_info,
-                _without_secrets,
                 _harmless,
             ],
             processors=[structlog.stdlib.ProcessorFormatter.remove_processors_meta, shown],
@@ -51,16 +50,11 @@ def set_up() -> None:
     logging.captureWarnings(True)
 
 
-def _without_secrets(_logger: object, _method: str, event: MutableMapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: _SECRET.sub(lambda found: f"{found[1] or ''}…", value) if isinstance(value, str) else value
-        for key, value in event.items()
-    }
-
-
 def _harmless(_logger: object, _method: str, event: MutableMapping[str, Any]) -> dict[str, Any]:
-    """Escapes control characters, except line breaks of a traceback."""
-    return {
-        key: _CONTROL.sub(lambda found: repr(found[0])[1:-1], value) if isinstance(value, str) else value
-        for key, value in event.items()
-    }
+    """Leaves out secrets, and escapes control characters, except line breaks of a traceback."""
+    return {key: _shown(value) if isinstance(value, str) else value for key, value in event.items()}
+
+
+def _shown(text: str) -> str:
+    known = _SECRET.sub(lambda found: f"{found[1] or ''}…", text)
+    return _CONTROL.sub(lambda found: repr(found[0])[1:-1], known)

@@ -39,12 +39,11 @@ class Metrics:
 
     def text(self, connection: Connection) -> bytes:
         """The counters of all processes of the server, and the current amounts of stored data."""
-        registry = CollectorRegistry()
+        counted, kept = self._registry, CollectorRegistry()
         if os.environ.get(_SHARED):
-            MultiProcessCollector(registry)  # type: ignore[no-untyped-call]
-        kept = CollectorRegistry()
+            counted = CollectorRegistry()
+            MultiProcessCollector(counted)  # type: ignore[no-untyped-call]
         kept.register(_Kept(connection))
-        counted = registry if os.environ.get(_SHARED) else self._registry
         return generate_latest(counted) + generate_latest(kept)
 
 
