@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import socket
 import webbrowser
@@ -73,13 +74,9 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
 
 
 def _listen(port: int) -> socket.socket:
-    listening = socket.socket()
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((_HOST, port))
+        return socket.create_server((_HOST, port), backlog=100)
     except OSError as err:
         raise StorageError(
-            f"port {port} cannot be used: {err.strerror or err}; choose another with --port, or leave it out"
+            f"port {port} cannot be used: {os.strerror(err.errno or 0)}; choose another with --port, or leave it out"
         ) from err
-    listening.listen(100)
-    return listening

@@ -118,7 +118,8 @@ def over_time(
         return Markup("")
     ticks = _ticks(float(finite.min()), float(finite.max()))
     up = (min(ticks[0], float(finite.min())), max(ticks[-1], float(finite.max())))
-    across = _ends(np.concatenate([line[0] for line in [*given, *([points] if points else [])]]))
+    at = np.concatenate([line[0] for line in [*given, *([points] if points else [])]])
+    across = float(at.min()), float(at.max())
     parts = [_PATH.format("band", _band(given[0][0], *band, across, up))] if band else []
     parts += [_PATH.format("dots", _dots(*points, across, up))] if points else []
     parts += [_PATH.format(f"line s{i % 8}", line_path(*line, across, up)) for i, line in enumerate(given)]
@@ -140,7 +141,7 @@ def _drawing(inside: Markup, kind: str, label: str = "") -> Markup:
 
 
 def _gridline(tick: float, up: tuple[float, float]) -> Markup:
-    y = 100 * (1 - _scaled_one(tick, up))
+    y = 100 * (1 - float(_scaled(np.array(tick), up)))
     return Markup(
         '<line class="grid" x1="0" x2="100%" y1="{0:.1f}%" y2="{0:.1f}%"/>'
         '<text class="tick" x="0" y="{0:.1f}%" dy="-3">{1}</text>'
@@ -174,10 +175,6 @@ def _ticks(low: float, high: float) -> list[float]:
     return [i * step for i in range(first, last + 1)] or [low]
 
 
-def _ends(values: Array) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
-
-
 def _scaled(values: Array, ends: tuple[float, float]) -> Array:
     low, high = ends
     if not high > low:
@@ -185,7 +182,3 @@ def _scaled(values: Array, ends: tuple[float, float]) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):
         scaled: Array = (np.asarray(values, np.float64) - low) / (high - low)
     return scaled
-
-
-def _scaled_one(value: float, ends: tuple[float, float]) -> float:
-    return float(_scaled(np.array([value]), ends)[0])

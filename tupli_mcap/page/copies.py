@@ -51,20 +51,14 @@ def streamed(
 
 def in_pieces(pieces: Generator[bytes], media: str, **headers: str) -> StreamingResponse:
     """An answer that is made while it is sent. Errors of its first piece are raised; later ones end the connection."""
-    first = next(pieces)
-    return _Streamed(_after(first, pieces), media_type=media, headers=headers)
-
-
-def _after(first: bytes, pieces: Generator[bytes]) -> Generator[bytes]:
-    yield first
-    yield from pieces
+    return _Streamed(pieces, media_type=media, headers=headers)
 
 
 class _Streamed(StreamingResponse):
     """An answer that closes its generator when it ends, also if the client disconnects."""
 
     def __init__(self, pieces: Generator[bytes], **more: Any) -> None:
-        super().__init__(pieces, **more)
+        super().__init__(itertools.chain([next(pieces)], pieces), **more)
         self._pieces = pieces
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

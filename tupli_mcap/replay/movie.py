@@ -7,7 +7,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -157,7 +157,7 @@ def _write_mp4(path: Path, first: Picture, rest: Iterator[Picture], fps: float) 
         stream.pix_fmt = "yuv420p"  # the format that all players and browsers support
         if codec == "libx264":
             stream.options = {"crf": "18", "movflags": "+faststart"}
-        for picture in _with(first, rest):
+        for picture in chain([first], rest):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(_even(picture)), format="rgb24")
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
@@ -168,11 +168,6 @@ def _even(picture: Picture) -> Picture:
     column."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _with(first: Picture, rest: Iterator[Picture]) -> Iterator[Picture]:
-    yield first
-    yield from rest
 
 
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
@@ -151,21 +152,9 @@ def _neighbours(
     of: list[Any] = [of_dataset(dataset)] if dataset else []
     if not (dataset or filter or sort):
         of = [of_recording(header.recording)]
-    at = After(header.recording, header.episode)
-    found = (
-        next(
-            find_episodes(
-                connection,
-                wanted,
-                limit=1,
-                after=at,
-                only=seen_episodes(shelf, connection),
-                of=seen_recordings(shelf, *of),
-                sort=order,
-                backwards=backwards,
-            ),
-            None,
-        )
-        for backwards in (True, False)
-    )
-    return Neighbours(*(None if item is None else item.id for item in found))
+    find = partial(
+        find_episodes, connection, wanted, limit=1, after=After(header.recording, header.episode), sort=order,
+        only=seen_episodes(shelf, connection), of=seen_recordings(shelf, *of),
+    )  # fmt: skip
+    before, after = (next(find(backwards=backwards), None) for backwards in (True, False))
+    return Neighbours(None if before is None else before.id, None if after is None else after.id)
