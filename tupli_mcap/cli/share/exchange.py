@@ -272,22 +272,7 @@ def publish(
     those that match); if it is somebody else's, only your episodes. --filter alone publishes
     your matching episodes, of any benchmark or none.
     """
-    from tupli_mcap.storage.exchange import publish_benchmark, publish_own
-
-    chosen = _chosen(benchmark, filter_text)
-    verb = "would publish" if dry_run else "published"
-    with server_at(url) as client:
-        uri = None if benchmark is None else full_id(client, benchmark)
-        _check_own(client, uri, chosen)
-        if uri is not None:
-            episodes, is_own = publish_benchmark(client, uri, group, chosen, dry_run=dry_run)
-            shared = counted(episodes, "episode")
-            what = f"{uri[:8]} with {shared}" if is_own else f"{shared} of {uri[:8]}"
-            line = f"{verb} {what} in {group}"
-        elif chosen is not None:
-            episodes = publish_own(client, group, chosen, dry_run=dry_run)
-            line = f"{verb} {counted(episodes, 'episode')} in {group}"
-        _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
+    _turn(benchmark, group, filter_text, url, hide=False, dry_run=dry_run, as_json=as_json)
 
 
 def unpublish(
@@ -304,42 +289,44 @@ def unpublish(
     artifacts stay visible, as other benchmarks may need them. With --filter, it hides only your
     episodes that match.
     """
-    from tupli_mcap.storage.exchange import unpublish_benchmark, unpublish_own
-
-    chosen = _chosen(benchmark, filter_text)
-    verb = "would hide" if dry_run else "hid"
-    with server_at(url) as client:
-        uri = None if benchmark is None else full_id(client, benchmark)
-        _check_own(client, uri, chosen)
-        if uri is not None:
-            episodes, is_whole = unpublish_benchmark(client, uri, group, chosen, dry_run=dry_run)
-            hidden = counted(episodes, "episode")
-            rest = f"{uri[:8]} and {hidden} of yours" if is_whole else f"{hidden} of {uri[:8]}"
-        elif chosen is not None:
-            episodes = unpublish_own(client, group, chosen, dry_run=dry_run)
-            rest = counted(episodes, "episode")
-        line = f"{verb} {rest} from {group}"
-        _tell_published(uri, group, episodes, line, dry_run=dry_run, as_json=as_json)
+    _turn(benchmark, group, filter_text, url, hide=True, dry_run=dry_run, as_json=as_json)
 
 
-def _chosen(benchmark: str | None, filter_text: str | None) -> BaseFilter | None:
-    """The filter of `publish` and `unpublish`, which need it or a benchmark."""
+def _turn(
+    benchmark: str | None,
+    group: str,
+    filter_text: str | None,
+    url: str | None,
+    *,
+    hide: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Publishes or hides a benchmark and the user's episodes of it, or those that match a filter."""
+    from tupli_mcap.schema import FilterEQ
+    from tupli_mcap.storage import exchange
+
     if benchmark is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID or --filter")
-    return filter_of(filter_text)
-
-
-def _check_own(client: TupliAPIClient, uri: str | None, chosen: BaseFilter | None) -> None:
-    """Checks the keys of a filter of `publish` or `unpublish` among the user's own episodes."""
-    from tupli_mcap.schema import FilterEQ
-
-    if chosen is not None:
-        own = FilterEQ(key="created_by", value=client.whoami().username)
-        _check_keys([client], chosen, own if uri is None else own & FilterEQ(key="benchmark_id", value=uri))
-
-
-def _tell_published(
-    uri: str | None, group: str, episodes: int, line: str, *, dry_run: bool, as_json: bool
-) -> None:
+    chosen = filter_of(filter_text)
+    with server_at(url) as client:
+        uri = None if benchmark is None else full_id(client, benchmark)
+        if chosen is not None:
+            own = FilterEQ(key="created_by", value=client.whoami().username)
+            _check_keys(
+                [client], chosen, own if uri is None else own & FilterEQ(key="benchmark_id", value=uri)
+            )
+        if uri is not None:
+            turn = exchange.unpublish_benchmark if hide else exchange.publish_benchmark
+            episodes, is_own = turn(client, uri, group, chosen, dry_run=dry_run)
+            count = counted(episodes, "episode")
+            both = f"{uri[:8]} and {count} of yours" if hide else f"{uri[:8]} with {count}"
+            what = both if is_own else f"{count} of {uri[:8]}"
+        elif chosen is not None:
+            turn_own = exchange.unpublish_own if hide else exchange.publish_own
+            episodes = turn_own(client, group, chosen, dry_run=dry_run)
+            what = counted(episodes, "episode")
+    would, did, where = ("hide", "hid", "from") if hide else ("publish", "published", "in")
     told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes}
+    line = f"{f'would {would}' if dry_run else did} {what} {where} {group}"
     print_result(told, line, as_json=as_json)
