@@ -251,77 +251,29 @@ def _help(
         say(*found.get_help(its).split("\n"))
 
 
-_COMMANDS: dict[str, dict[str, Callable[..., None]]] = {
-    "Record": {"record": record.record},
-    "Look": {
-        "ls": lists.ls,
-        "info": info.info,
-        "episodes": lists.episodes,
-        "view": replay.replay,
-        "browse": serve.browse,
-        "plot": render.plot,
-        "render": render.render,
-    },
-    "Check": {"doctor": doctor.doctor, "verify": verify.verify},
-    "Edit": {
-        "tag": edit.tag,
-        "edit": edit.edit,
-        "filter": edit.filter_,
-        "delete": storage.delete,
-        "restore": storage.restore,
-        "trim": edit.trim,
-        "merge": edit.merge,
-        "split": edit.split,
-        "recover": edit.recover,
-    },
-    "Share": {
-        "bundle": bundle.bundle,
-        "import": bundle.import_,
-        "export": bundle.export,
-        "trust": trust.trust,
-        "untrust": trust.untrust,
-    },
-    "Server": {
-        "serve": serve.serve,
-        "login": account.login,
-        "logout": account.logout,
-        "whoami": account.whoami,
-        "signup": account.signup,
-        "password": account.password,
-        "push": exchange.push,
-        "pull": exchange.pull,
-        "publish": exchange.publish,
-        "unpublish": exchange.unpublish,
-        "backup-server": serve.backup_server,
-        "restore-server": serve.restore_server,
-    },
-    "People": {
-        "list-users": people.list_users,
-        "delete-user": people.delete_user,
-        "list-groups": people.list_groups,
-        "read-group": people.read_group,
-        "create-group": people.create_group,
-        "delete-group": people.delete_group,
-        "add-members": people.add_group_members,
-        "remove-members": people.remove_group_members,
-        "list-roles": people.list_roles,
-        "create-role": people.create_role,
-        "delete-role": people.delete_role,
-        "list-tokens": people.list_tokens,
-        "create-token": people.create_token,
-        "delete-token": people.delete_token,
-    },
-    "Storage": {
-        "list-benchmarks": storage.list_benchmarks,
-        "list-artifacts": storage.list_artifacts,
-        "list-episodes": storage.list_episodes,
-        "rename": storage.rename,
-        "compact": storage.compact,
-        "reindex": storage.reindex,
-        "declare-key": storage.declare_key,
-    },
-    "Help": {"help": _help, "version": _version},
+_FUNCTIONS: dict[str, list[Callable[..., None]]] = {
+    "Record": [record.record],
+    "Look": [lists.ls, info.info, lists.episodes, replay.view, serve.browse, render.plot, render.render],
+    "Check": [doctor.doctor, verify.verify],
+    "Edit": [edit.tag, edit.edit, edit.filter_, storage.delete, storage.restore, edit.trim, edit.merge,
+        edit.split, edit.recover],
+    "Share": [bundle.bundle, bundle.import_, bundle.export, trust.trust, trust.untrust],
+    "Server": [serve.serve, account.login, account.logout, account.whoami, account.signup, account.password,
+        exchange.push, exchange.pull, exchange.publish, exchange.unpublish, serve.backup_server,
+        serve.restore_server],
+    "People": [people.list_users, people.delete_user, people.list_groups, people.read_group,
+        people.create_group, people.delete_group, people.add_members, people.remove_members,
+        people.list_roles, people.create_role, people.delete_role, people.list_tokens,
+        people.create_token, people.delete_token],
+    "Storage": [storage.list_benchmarks, storage.list_artifacts, storage.list_episodes, storage.rename,
+        storage.compact, storage.reindex, storage.declare_key],
+    "Help": [_help, _version],
+}  # fmt: skip
+_COMMANDS = {
+    title: {each.__name__.strip("_").replace("_", "-"): each for each in functions}
+    for title, functions in _FUNCTIONS.items()
 }
+"""By their titles in `--help`, the commands by name, which is that of their function."""
 _EXAMPLES: dict[str, Sequence[str]] = {
     "record": (
         "record CartPole-v1 -o run.mcap --steps 10000 --seed 1",
@@ -434,7 +386,7 @@ _ASKING = {*_COMMANDS["Server"], *_COMMANDS["People"]} - {"serve", "backup-serve
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
         app.command(_name, cls=_Command)(_command)
-app.command("replay", cls=_Command, hidden=True)(replay.replay)  # the earlier name of `view`
+app.command("replay", cls=_Command, hidden=True)(replay.view)  # the earlier name of `view`
 
 
 def main() -> None:

@@ -37,7 +37,7 @@ _Layout = Annotated[
 ]
 
 
-def replay(
+def view(
     sources: Sources,
     episode: Episodes = None,
     filter_text: FilterText = None,

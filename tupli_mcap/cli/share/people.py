@@ -1,6 +1,6 @@
 """Commands for the people of a server: users, groups, roles, and tokens for machines.
 
-Each calls the method of the same name of `TupliAPIClient`.
+Each calls a method of `TupliAPIClient`.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def delete_group(group: Group, url: Url = None, as_json: Json = False) -> None:
         _deleted(client.url, "group", group, as_json=as_json)
 
 
-def add_group_members(
+def add_members(
     group: Group,
     users: Users,
     roles: Annotated[
@@ -116,7 +116,7 @@ def add_group_members(
         _print_group(client.add_group_members(_query(group, users, roles)), as_json=as_json)
 
 
-def remove_group_members(group: Group, users: Users, url: Url = None, as_json: Json = False) -> None:
+def remove_members(group: Group, users: Users, url: Url = None, as_json: Json = False) -> None:
     """Remove users from a group."""
     with server_at(url) as client:
         _print_group(client.remove_group_members(_query(group, users, None)), as_json=as_json)
