@@ -34,7 +34,7 @@ from tupli_mcap.cli.output import (
     short_value,
     when,
 )
-from tupli_mcap.cli.terminal import fail, terminal_width
+from tupli_mcap.cli.terminal import fail, is_roomy
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.remote import is_server, is_url
 
@@ -44,20 +44,19 @@ if TYPE_CHECKING:
     from tupli_mcap.storage import TupliStorage
     from tupli_mcap.storage.listing import ListedRecording
 
-_ROOMY = 100  # columns a terminal needs for metadata and times side by side
-_Cells = Callable[["Sequence[ListedRecording]"], list[str]]
-
 
 class _Listed(NamedTuple):
     """A column of `ls`: the value that it is sorted by, and how its cells are made."""
 
     value: Callable[[ListedRecording], Any]
     column: Column
-    cells: _Cells
+    cells: Callable[[Sequence[ListedRecording]], list[str]]
 
 
-def _each(text: Callable[[ListedRecording], str]) -> _Cells:
-    return lambda items: [text(item) for item in items]
+def _listed_by(
+    value: Callable[[ListedRecording], Any], column: Column, text: Callable[[Any], str] = str
+) -> _Listed:
+    return _Listed(value, column, lambda items: [text(value(item)) for item in items])
 
 
 def _means(items: Sequence[ListedRecording]) -> list[str]:
@@ -73,38 +72,26 @@ def _success(item: ListedRecording) -> str:
 
 
 _COLUMNS = {
-    "recording": _Listed(
-        attrgetter("path"), Column("RECORDING", shrink="start"), _each(lambda r: short_ids(r.path))
-    ),
-    "run": _Listed(attrgetter("name"), Column("RUN", shrink="end"), _each(lambda r: r.name)),
-    "environment": _Listed(
-        attrgetter("environment"), Column("ENVIRONMENT", shrink="end"), _each(lambda r: r.environment)
-    ),
-    "episodes": _Listed(
-        attrgetter("episodes"), Column("EPISODES", "right"), _each(lambda r: number(r.episodes))
-    ),
-    "steps": _Listed(attrgetter("steps"), Column("STEPS", "right"), _each(lambda r: number(r.steps))),
+    "recording": _listed_by(attrgetter("path"), Column("RECORDING", shrink="start"), short_ids),
+    "run": _listed_by(attrgetter("name"), Column("RUN", shrink="end")),
+    "environment": _listed_by(attrgetter("environment"), Column("ENVIRONMENT", shrink="end")),
+    "episodes": _listed_by(attrgetter("episodes"), Column("EPISODES", "right"), number),
+    "steps": _listed_by(attrgetter("steps"), Column("STEPS", "right"), number),
     "return": _Listed(attrgetter("return_mean"), Column("RETURN", "right"), _means),
     "success": _Listed(
-        attrgetter("success"),
-        Column("SUCCESS", "right"),
-        _each(_success),
+        attrgetter("success"), Column("SUCCESS", "right"), lambda items: [*map(_success, items)]
     ),
-    "started": _Listed(attrgetter("started"), Column("STARTED"), _each(lambda r: when(r.started))),
-    "size": _Listed(
-        attrgetter("size"),
-        Column("SIZE", "right"),
-        _each(lambda r: "" if r.size is None else bytes_of(r.size)),
+    "started": _listed_by(attrgetter("started"), Column("STARTED"), when),
+    "size": _listed_by(
+        attrgetter("size"), Column("SIZE", "right"), lambda n: "" if n is None else bytes_of(n)
     ),
-    "state": _Listed(attrgetter("state"), Column("STATE"), _each(lambda r: r.state)),
-    "split": _Listed(attrgetter("split"), Column("SPLIT"), _each(lambda r: r.split)),
-    "tags": _Listed(attrgetter("tags"), Column("TAGS", shrink="end"), _each(lambda r: ", ".join(r.tags))),
-    "settings": _Listed(
-        attrgetter("settings"), Column("SETTINGS", shrink="end"), _each(lambda r: pairs_of(r.settings or {}))
+    "state": _listed_by(attrgetter("state"), Column("STATE")),
+    "split": _listed_by(attrgetter("split"), Column("SPLIT")),
+    "tags": _listed_by(attrgetter("tags"), Column("TAGS", shrink="end"), ", ".join),
+    "settings": _listed_by(
+        attrgetter("settings"), Column("SETTINGS", shrink="end"), lambda s: pairs_of(s or {})
     ),
 }
-
-
 _MEANT = {
     "date": "started",
     "time": "started",
@@ -214,7 +201,7 @@ def _sorted(
 def _column(name: str) -> _Listed:
     if name.startswith(_SETTING):
         value = partial(_setting, name.removeprefix(_SETTING).split("."))
-        return _Listed(value, Column(name), _each(lambda r: _text(value(r))))
+        return _listed_by(value, Column(name), _text)
     if name.lower() not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
         raise typer.BadParameter(
@@ -240,7 +227,7 @@ def _setting(path: Sequence[str], item: ListedRecording) -> Any:
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
-    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    roomy = is_roomy()
     names = ["recording", *(["run", "environment"] * roomy), "episodes", "steps", "return"]
     names += ["success"] * any(item.success is not None for item in items)
     return [_COLUMNS[name] for name in [*names, *(["started"] * roomy), "size", "state"]]
@@ -375,7 +362,7 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
     several = len(recordings) > 1
     by_run = several and len({header.run.get("name", "") for header in headers}) == len(recordings)
     source = Column("RUN", shrink="end") if by_run else Column("RECORDING", shrink="start")
-    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    roomy = is_roomy()
     several_envs = any(header.env for header in headers)
     returns = numbers([header.episode_return for header in headers])
     columns = (

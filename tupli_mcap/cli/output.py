@@ -49,7 +49,11 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, emp
     _fit(columns, widths)
     lines = [_line(columns, widths, [column.title for column in columns])]
     lines += [_line(columns, widths, row) for row in cells]
-    _print_lines(lines)
+    width = terminal_width()
+    if width is not None:
+        lines = [_cut(line, width, "end") for line in lines]
+    say_styled((lines[0], "bold"))
+    say(*lines[1:])  # not by rich, which is slow for many lines
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
@@ -288,12 +292,3 @@ def _cut(text: str, width: int, end: Literal["start", "end"]) -> str:
     while cell_len(text) > width - 1:
         text = text[1:] if end == "start" else text[:-1]
     return "…" + text.lstrip("…") if end == "start" else text + "…"
-
-
-def _print_lines(lines: Sequence[str]) -> None:
-    """Prints the first line in bold. The others are printed without rich, which is slow for many lines."""
-    width = terminal_width()
-    if width is not None:
-        lines = [_cut(line, width, "end") for line in lines]
-    say_styled((lines[0], "bold"))
-    say(*lines[1:])

@@ -41,13 +41,11 @@ from tupli_mcap.cli.output import (
     short_ids,
     when,
 )
-from tupli_mcap.cli.terminal import say, terminal_width
+from tupli_mcap.cli.terminal import is_roomy, say
 from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
-
-_ROOMY = 100  # columns a terminal needs for benchmarks and their environments side by side
 
 
 def list_benchmarks(
@@ -70,7 +68,7 @@ def list_benchmarks(
     if as_json:
         print_json([header.model_dump() for header in headers])
         return
-    roomy = (terminal_width() or _ROOMY) >= _ROOMY
+    roomy = is_roomy()
     columns = (
         Column("ID"),
         Column("NAME", shrink="end"),

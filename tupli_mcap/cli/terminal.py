@@ -20,6 +20,7 @@ from typing import TextIO
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _UNUSUAL = re.compile(r"[^\n -~]")
+_ROOMY = 100  # columns
 _hide_bar: Callable[[], None] | None = None
 
 
@@ -27,7 +28,7 @@ def visible(text: str) -> str:
     """Replaces each character of a text that has no visible shape, line breaks too, by an escape."""
     if text.isprintable():
         return text
-    return "".join(char if _is_plain(char) else _escaped(char) for char in text)
+    return "".join(c if _is_plain(c) else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def one_line(text: str) -> str:
@@ -38,10 +39,6 @@ def one_line(text: str) -> str:
 def _is_plain(char: str) -> bool:
     """Whether a character may be printed. All blanks may; `isprintable` accepts only the usual one."""
     return char.isprintable() or unicodedata.category(char) == "Zs"
-
-
-def _escaped(char: str) -> str:
-    return char.encode("unicode_escape").decode("ascii")
 
 
 # --- stdout ---
@@ -103,6 +100,11 @@ def terminal_width() -> int | None:
         return os.get_terminal_size(sys.stdout.fileno()).columns
     except (OSError, ValueError):
         return None
+
+
+def is_roomy() -> bool:
+    """Whether a table has room for more columns than the most important ones."""
+    return (terminal_width() or _ROOMY) >= _ROOMY
 
 
 def _write(stream: TextIO, text: str) -> None:
