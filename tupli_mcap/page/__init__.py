@@ -4,10 +4,9 @@ shelf, directory    where recordings come from: the interface, and its versions 
 datasets            recordings put together by what was recorded
 routes/, answers    the addresses; pages as HTML and JSON, their headers and errors
 curves, charts      what is drawn of an episode, and how
-pictures, sparks    frames and images; small lines of many episodes
+pictures            frames, and images of states
 samples             what a whole dataset is like
 copies              chosen episodes as files
-viewer_files        the Rerun viewer, served from here
 texts               numbers and times for people
 app                 `tupli-mcap browse`
 templates/, static/ pages, their style and their script

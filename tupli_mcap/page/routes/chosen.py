@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import chain
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -15,19 +15,25 @@ from markupsafe import Markup
 from sqlalchemy import Connection
 
 from tupli_mcap import files, jsonvalue
-from tupli_mcap.errors import NotFoundError
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import of_dataset
 from tupli_mcap.page.routes.episode import FIELDS, Seen, look
-from tupli_mcap.page.shelf import find_episode, find_some, seen_episodes, seen_recordings
-from tupli_mcap.page.sparks import sparks_of
+from tupli_mcap.page.shelf import Shelf, find_episode, find_some, seen_episodes, seen_recordings
+from tupli_mcap.plots.measure import thinned_to
+from tupli_mcap.plots.statistics import drawable_numbers
+from tupli_mcap.recording import Recording
 from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
+_MOST_STEPS: Final = 400_000  # most steps that are read for the small lines of one table
+_POINTS: Final = 120
 Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
 
 
@@ -48,7 +54,7 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
     seen = [look(shelf, header, 0) for header in headers]
     steps = max(len(one.episode) for one in seen)
     groups = [(title, _compared(seen, field, steps)) for field, title in FIELDS.items()]
-    keys = list(dict.fromkeys(chain.from_iterable(header.metadata for header in headers)))
+    keys = list(dict.fromkeys(itertools.chain.from_iterable(header.metadata for header in headers)))
     facts = {"episodes": [dict(header) for header in headers]}
     return page(
         request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
@@ -77,7 +83,7 @@ def _overlaid(name: str, tracks: Sequence[Track], steps: int) -> Compared:
 def sparks(shelf: Shown, uris: Ids) -> Response:
     """The small lines beside the rows of a table, as JSON: the name of their value, and by id the path of each."""
     headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
-    return Response(jsonvalue.dumps(sparks_of(shelf, headers)._asdict()), media_type="application/json")
+    return Response(jsonvalue.dumps(_sparks(shelf, headers)), media_type="application/json")
 
 
 @router.get("/download")
@@ -117,3 +123,68 @@ def film(shelf: Shown, uri: str) -> FileResponse:
     """The pictures of an episode as an MP4."""
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")
+
+
+# --- small lines ---
+
+
+def _sparks(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> dict[str, Any]:
+    """Draws the rewards of some episodes; if all rewards are equal, the first number of the states instead. Each line
+    is an SVG path (`d`) in a drawing of 1000 x 100."""
+    for column in (_rewards, _first_state):
+        found, name = _read(shelf, headers, column)
+        if len(np.unique(np.concatenate([values[:-1] for values in found.values()] or [np.empty(0)]))) > 1:
+            break
+    lines = {}
+    for uri, values in found.items():
+        known = values[np.isfinite(values)]
+        if len(known):
+            thin = thinned_to(_POINTS, values)
+            at = np.arange(len(thin), dtype=np.float64)
+            up = float(known.min()), float(known.max())
+            lines[uri] = charts.line_path(at, thin, (0.0, max(1.0, len(thin) - 1.0)), up)
+    return {"name": name if lines else "", "lines": lines}
+
+
+_Column = Callable[[Recording, Array], tuple[Any, str]]
+
+
+def _read(shelf: Shelf, headers: Sequence[EpisodeHeader], column: _Column) -> tuple[dict[str, Array], str]:
+    found: dict[str, Array] = {}
+    name, steps = "", 0
+    for recording_name, group in itertools.groupby(headers, key=lambda header: header.recording):
+        some = list(group)
+        steps += sum(header.n_tuples for header in some)
+        if steps > _MOST_STEPS:
+            break
+        try:
+            recording = shelf.open(recording_name)
+            numbers, wanted = recording.index["episode"], [header.episode for header in some]
+            positions = numbers.searchsorted(wanted)
+            if not np.array_equal(numbers[np.minimum(positions, len(numbers) - 1)], wanted):
+                continue  # the file has changed since the query
+            values, name = column(recording, positions)
+        except TupliError:
+            continue
+        if values is not None:
+            lengths = recording.index["length"][positions].astype(np.int64)
+            parts = np.split(drawable_numbers(values), np.cumsum(lengths)[:-1])
+            found |= {header.id: part for header, part in zip(some, parts, strict=True)}
+    return found, name
+
+
+def _rewards(recording: Recording, positions: Array) -> tuple[Any, str]:
+    leaf = recording.layout.reward[0]
+    if leaf.size != 1 or leaf.kind == "variable":
+        return None, ""
+    return np.asarray(leaf.get(recording.read(positions, ["rewards"]).rewards)).reshape(-1), "reward"
+
+
+def _first_state(recording: Recording, positions: Array) -> tuple[Any, str]:
+    leaf = next(
+        (leaf for leaf in recording.layout.state if leaf.kind in ("array", "scalar") and leaf.size), None
+    )
+    if leaf is None:
+        return None, ""
+    column = leaf.get(recording.read(positions, ["states"], images=False).states)
+    return np.asarray(column).reshape(len(column), -1)[:, 0], element_names(leaf, recording.labels, [0])[0]
