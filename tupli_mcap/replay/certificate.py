@@ -7,7 +7,6 @@ import functools
 import hashlib
 import importlib.metadata
 import platform
-import sys
 from pathlib import Path
 from typing import Any, Literal
 
@@ -170,19 +169,13 @@ def versions_of(env: gym.Env[Any, Any] | None) -> dict[str, str]:
     """Versions of Python, Gymnasium, NumPy and tupli-mcap, and of the packages of an environment's classes."""
     names = {"gymnasium", "numpy", "tupli-mcap"}
     while env is not None:
-        names |= _distributions(type(env).__module__.partition(".")[0])
+        names.update(_packages().get(type(env).__module__.partition(".")[0], ()))
         env = env.env if isinstance(env, gym.Wrapper) else None
     versions = {"python": platform.python_version()}
     for name in sorted(names):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return versions
-
-
-def _distributions(module: str) -> set[str]:
-    if module in sys.stdlib_module_names or module == "__main__":
-        return set()
-    return set(_packages().get(module, ()))
 
 
 @functools.cache

@@ -244,7 +244,8 @@ class Certifier:
         hints = []
         tally = found.tally
         if tally.ended is not None:
-            hints.append(_ended(tally.ended, values.length))
+            left = values.length - tally.ended - 1
+            hints.append(f"The episode ends differently here, so its last {left} steps were not compared.")
         repeats = self._repeats_itself(plan, values) if plan.starts_chain and found.error is None else None
         if repeats is False:
             hints.append(
@@ -342,8 +343,3 @@ def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:
             raise RecordingError(
                 f"{recording.name}: expected an environment with the {name} {recorded}, found {found}"
             )
-
-
-def _ended(step: int, length: int) -> str:
-    left = length - step - 1
-    return f"The episode ends differently here, so its last {left} steps were not compared."

@@ -39,7 +39,7 @@ class _Take(NamedTuple):
 
 
 class RenderedFrames:
-    """Frames by episode in a temporary file, with the methods of `NewFrames`; a context manager removes the file.
+    """Frames by episode in a temporary file, with the methods of `NewFrames`.
 
     `times` of an episode are the wall clock times of its states (ns).
     """
@@ -88,12 +88,6 @@ class RenderedFrames:
     def close(self) -> None:
         """Removes the frames."""
         self._file.close()
-
-    def __enter__(self) -> RenderedFrames:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def check_goal(goal: Path, kinds: Sequence[str], *, overwrite: bool) -> str:

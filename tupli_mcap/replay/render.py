@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -118,7 +119,8 @@ def render(
     kind = _check_target(recording, goal, overwrite=overwrite)
     check_pictures(every, width)
     chosen = _numbers(recording, episodes)
-    with RenderedFrames(CAMERA, check_format(frame_format if kind == ".mcap" else "png")) as frames:
+    form = check_format(frame_format if kind == ".mcap" else "png")
+    with contextlib.closing(RenderedFrames(CAMERA, form)) as frames:
         renderer = _Renderer(recording, trust, chosen, env, progress, frames, every, width)
         skipped = renderer.run().skipped
         order = [number for number in chosen if number in frames.counts]
@@ -199,18 +201,13 @@ class _Renderer(Certifier):
         """Frames a second of environment time."""
         return (self._fps or _FPS) / self._every
 
-    @property
-    def agreed(self) -> set[int]:
-        """The numbers of the chosen episodes that were run to their end and agree."""
-        numbers = self._recording.index["episode"]
-        found = {int(numbers[p]) for p, outcome in self._outcomes.items() if outcome is None}
-        return found & self._chosen
-
     def report(
         self, path: Path | None, chosen: list[int], skipped: Sequence[Skipped], seconds: float
     ) -> RenderReport:
         """The result of rendering into the file at `path`."""
-        index, counts, agreed = self._recording.index, self._frames.counts, self.agreed
+        index, counts = self._recording.index, self._frames.counts
+        ran = {int(index["episode"][p]) for p, outcome in self._outcomes.items() if outcome is None}
+        agreed = ran & self._chosen
         lengths = dict(zip(index["episode"].tolist(), index["length"].tolist(), strict=True))
         episodes = tuple(
             RenderedEpisode(number, lengths[number], counts.get(number, 0), number in agreed)

@@ -74,7 +74,8 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
     start = recording.episode_start(position)
     number = int(row["episode"])
     # Episodes are numbered across sub-environments, so a missing number may be of any of them.
-    gap = number != position if before is None else number - position != _shift(recording, before)
+    missing = 0 if before is None else int(recording.index[before]["episode"]) - before
+    gap = number - position != missing
     after_end = before is not None and recording.index[before]["end"] != INTERRUPTED
     # without a final state (of a repaired or hand-made file), the state of the environment after it is not known
     gap = gap or (before is not None and recording.index[before]["final_row"] < 0)
@@ -101,10 +102,6 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
         position, number, int(row["env"]), how, resets, after_end, gap,
         auto=how == "follows" and plain and after_end,
     )  # fmt: skip
-
-
-def _shift(recording: Recording, position: int) -> int:
-    return int(recording.index[position]["episode"]) - position
 
 
 def up_to_last(plans: list[EpisodePlan], chosen: Collection[int]) -> list[EpisodePlan]:

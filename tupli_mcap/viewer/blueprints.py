@@ -52,11 +52,7 @@ def blueprint_of(
     right += [(_stack(beside, roots, axis, "beside"), _share(beside, len(roots), False))] if beside else []
     right += [(panel.view(roots, axis), 4.0) for panel in scene.rewards]
     right.append((rrb.Tabs(card, *([] if overview else [returns]), lengths, name="about"), 3.0))
-    columns = [
-        rrb.Vertical(*(view for view, _ in column), row_shares=[share for _, share in column])
-        for column in (left, right)
-        if column
-    ]
+    columns = [_column(views) for views in (left, right) if views]
     return rrb.Blueprint(
         rrb.Horizontal(*columns, column_shares=([1, 1] if pictures and crowded else [3, 2])[-len(columns) :]),
         rrb.BlueprintPanel(state=rrb.PanelState.Expanded if listed else rrb.PanelState.Collapsed),
@@ -93,9 +89,7 @@ def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) 
     if maps:
         shown, title = pages.pop(0) if others else ([], name)
         pages.insert(0, (shown + _below(maps, roots, axis), title))
-    columns = [
-        rrb.Vertical(*views, row_shares=shares, name=title) for views, shares, title in map(_unzipped, pages)
-    ]
+    columns = [_column(views, title) for views, title in pages]
     return columns[0] if len(columns) == 1 else rrb.Tabs(*columns, name=name)
 
 
@@ -109,8 +103,10 @@ def _below(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> list[tup
     return [(rrb.Grid(*views, grid_columns=2), _SHARE * ((len(views) + 1) // 2))]
 
 
-def _unzipped(page: tuple[list[tuple[Any, float]], str]) -> tuple[list[Any], list[float], str]:
-    return [view for view, _ in page[0]], [share for _, share in page[0]], page[1]
+def _column(views: Sequence[tuple[Any, float]], name: str | None = None) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Vertical(*(view for view, _ in views), row_shares=[share for _, share in views], name=name)
 
 
 def _height(panel: Panel, episodes: int) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-import importlib
+import importlib.util
 import sys
 from collections.abc import Iterable
 from typing import Any, Literal
@@ -20,21 +20,13 @@ def in_notebook() -> bool:
     return shell is not None and hasattr(shell, "kernel")
 
 
-def _widget_installed() -> bool:
-    try:
-        importlib.import_module("rerun_notebook")
-    except ImportError:
-        return False
-    return True
-
-
 class Display:
     """Episodes as the result of a cell. width, height: of the viewer (pixels); by default as wide as the cell."""
 
     def __init__(self, plans: Iterable[Plan], width: int | None = None, height: int | None = None) -> None:
         self._width: int | Literal["auto"] = width or "auto"
         self._height = height or _HEIGHT
-        installed = _widget_installed()
+        installed = importlib.util.find_spec("rerun_notebook") is not None
         self._facts: list[tuple[str, str]] = []
         self._streams: list[tuple[Any, Any]] = []
         for plan in plans:
