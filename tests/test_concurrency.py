@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import os
 import shutil
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
 import pytest
+from tool_modules import tool
 
 from tupli_mcap import FileStorage, Recording, TupliDataset, TupliEnvWrapper
 from tupli_mcap.errors import NotFoundError, StorageError
@@ -24,18 +21,7 @@ from tupli_mcap.schema import F, FilterEQ
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.catalog.place import catalog_path
 
-TOOL = Path(__file__).parents[1] / "tools" / "concurrency.py"
-
-
-@functools.cache
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("concurrency_tool", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+TOOL = tool("concurrency")
 
 
 def rollout(env: TupliEnvWrapper, episodes: int = 1) -> None:
@@ -67,7 +53,7 @@ def env(storage: FileStorage) -> TupliEnvWrapper:
 
 class TestMany:
     def test_lose_nothing(self, tmp_path: Path) -> None:
-        figures = tool().run(tmp_path, seconds=4, seed=3, writers=8, others=3)
+        figures = TOOL.run(tmp_path, seconds=4, seed=3, writers=8, others=3)
         assert figures["killed writers"] + figures["killed others"] > 0
         assert figures["steps acknowledged"] > 100
         assert figures["episodes in the end"] > 0
@@ -82,24 +68,24 @@ class TestMany:
         ],
     )
     def test_would_be_told_of(self, tmp_path: Path, harm: str, match: str) -> None:
-        place = tool().prepare(tmp_path, 1, 1)
+        place = TOOL.prepare(tmp_path, 1, 1)
         storage, ledger = FileStorage(place.storage), place.ledger
-        env = TupliEnvWrapper(tool().Told(1), storage, place.benchmarks[0], metadata_callback=tool().Named())
+        env = TupliEnvWrapper(TOOL.Told(1), storage, place.benchmarks[0], metadata_callback=TOOL.Named())
         state, _ = env.reset(options={"length": 3})
         for _ in range(3):
-            state, *_ = env.step(tool().action_of(state))
-        ledger.note("steps-1", tool()._STEP.pack(0, 3, 1))
+            state, *_ = env.step(TOOL.action_of(state))
+        ledger.note("steps-1", TOOL._STEP.pack(0, 3, 1))
         if harm != "forget the lock":
             env.close()
-            assert tool().verify(place)["steps acknowledged"] == 3
+            assert TOOL.verify(place)["steps acknowledged"] == 3
         if harm == "lose a recording":
             next(place.storage.rglob("*.mcap")).unlink()
         elif harm == "lose a step":
-            ledger.note("steps-1", tool()._STEP.pack(0, 4, 1))
+            ledger.note("steps-1", TOOL._STEP.pack(0, 4, 1))
         elif harm == "bring back":
             ledger.note("deleted", "1 0")
-        with pytest.raises(tool().WrongError, match=match):
-            tool().verify(place)
+        with pytest.raises(TOOL.WrongError, match=match):
+            TOOL.verify(place)
         env.close()
 
 

@@ -6,11 +6,9 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import json
 import re
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from tool_modules import tool
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError
@@ -45,16 +44,6 @@ EARLIER = sorted(  # of earlier writers
 UNFINISHED = [name for name in NAMES if name.startswith("unfinished")]
 UNCOMPRESSED = [name for name in NAMES if name not in ("constant_zstd", "constant_lz4")]
 COLUMNS = ("states", "actions", "rewards", "terminals", "timeouts")
-
-
-def load_tool() -> Any:
-    spec = importlib.util.spec_from_file_location("make_golden", ROOT / "tools" / "make_golden.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["make_golden"] = module  # dataclasses and pickles look their module up
-    spec.loader.exec_module(module)
-    return module
 
 
 def expected(name: str, directory: Path = GOLDEN) -> list[dict[str, Any]]:
@@ -113,7 +102,7 @@ def assert_same(found: list[dict[str, Any]], wanted: list[dict[str, Any]]) -> No
 
 
 def test_there_is_one_for_each_feature_and_all_are_small() -> None:
-    assert set(NAMES) == set(load_tool().FEATURES)
+    assert set(NAMES) == set(tool("make_golden").FEATURES)
     assert sum(path.stat().st_size for path in GOLDEN.iterdir() if path.is_file()) < 512 * 1024
 
 
@@ -122,7 +111,7 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
     with Recording(place(name, tmp_path)) as recording:
         assert recording.complete == (name not in UNFINISHED)
         assert_same(list(as_read(recording)), expected(name))
-        number = list(load_tool().FEATURES).index(name)
+        number = list(tool("make_golden").FEATURES).index(name)
         assert int(recording.uuid, 16) == 1 + number or name == "rewritten"
         assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
 
@@ -276,7 +265,7 @@ def parts(path: Path) -> list[bytes]:
 @pytest.mark.parametrize("name", UNCOMPRESSED)
 @pytest.mark.filterwarnings("ignore:.*is declared float32:UserWarning")
 def test_the_writer_writes_the_same_bytes(name: str, tmp_path: Path) -> None:
-    load_tool().make(name, tmp_path)
+    tool("make_golden").make(name, tmp_path)
     hint = "the format changed: say so in schemas/README.md and run tools/make_golden.py"
     assert (tmp_path / f"{name}.json").read_text() == (GOLDEN / f"{name}.json").read_text()
     if name in UNFINISHED:
@@ -289,7 +278,7 @@ def test_the_writer_writes_the_same_bytes(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "every"), [("frames", 2), ("unfinished_frames", 1)])
 def test_frames_show_what_was_drawn(name: str, every: int, tmp_path: Path) -> None:
-    painting = load_tool().painting
+    painting = tool("make_golden").painting
     with Recording(place(name, tmp_path)) as recording:
         assert recording.cameras == ("render",)
         for number, episode in enumerate(recording.episodes):
@@ -304,7 +293,7 @@ def test_frames_show_what_was_drawn(name: str, every: int, tmp_path: Path) -> No
 def test_attachments_and_benchmark() -> None:
     with Recording(GOLDEN / "constant_zstd.mcap") as recording:
         assert recording.benchmark_id == "b" * 64
-        assert recording.created_ns == load_tool().START_NS
+        assert recording.created_ns == tool("make_golden").START_NS
         assert list(recording.attachments) == ["benchmark.json", "note"]
         assert recording.read_attachment("note") == b"golden"
         assert recording.benchmark.record.name == "Pole-v0"

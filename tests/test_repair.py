@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from gymnasium import spaces
 from mcap.opcode import Opcode
 from mcap.writer import Writer
 from test_golden import NAMES, as_read, assert_same, expected, place
+from tool_modules import tool
 from typer.testing import CliRunner
 
 from tupli_mcap import (
@@ -410,21 +410,12 @@ def test_a_journal_is_found_by_the_uuid_in_damaged_metadata(name: str, tmp_path:
     assert verify_recording(report.target or "").problems == []
 
 
-def damage_tool() -> Any:
-    spec = importlib.util.spec_from_file_location("damage", Path(__file__).parents[1] / "tools" / "damage.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.mark.parametrize("kind", ["flip", "cut", "zero", "swap"])
 @pytest.mark.parametrize("name", ["bundle", "dict_with_images", "unfinished", "variable", "vector_same_step"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_damage_anywhere(name: str, kind: str, tmp_path: Path) -> None:
     """A sample of `tools/damage.py`: what is saved is true, what is missing is said, what is written is good."""
-    found, tried = damage_tool().sweep(name, kind, place(name, tmp_path).stat().st_size // 7, tmp_path)
+    found, tried = tool("damage").sweep(name, kind, place(name, tmp_path).stat().st_size // 7, tmp_path)
     assert tried >= 7
     assert not found
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import html
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 import httpx
 import pytest
 from page_fuzz import MARK, Browser, wrong
 from persons import Person
 from serving import serving
+from tool_modules import tool
 
 from tupli_mcap import Recording
 from tupli_mcap.server.people import accounts
@@ -20,17 +18,6 @@ from tupli_mcap.server.routes import items
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.wire import answer
 from tupli_mcap.wrappers.rollout import record_rollouts
-
-TOOL = Path(__file__).parents[1] / "tools" / "server_fuzz.py"
-
-
-@functools.cache
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("server_fuzz", TOOL)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.sampled(0, keep=["postgresql"])
@@ -40,7 +27,7 @@ def test_every_route_answers_as_the_document_says(
 ) -> None:
     if engine == "postgresql":
         request.getfixturevalue("postgres")  # skips where it is not installed
-    with tool().fuzzer(engine, tmp_path, seed=1) as fuzzer:
+    with tool("server_fuzz").fuzzer(engine, tmp_path, seed=1) as fuzzer:
         fuzzer.run(1)
         fuzzer.run_pages(4)
     assert fuzzer.findings == {}
@@ -53,7 +40,7 @@ def test_a_failure_and_an_answer_of_another_shape_are_found(
     def broken(_: object) -> list[str]:
         raise RuntimeError("a defect")
 
-    with tool().fuzzer("sqlite", tmp_path, seed=1) as fuzzer:
+    with tool("server_fuzz").fuzzer("sqlite", tmp_path, seed=1) as fuzzer:
         monkeypatch.setattr(accounts, "list_users", broken)
         fuzzer.run(5, only="GET /v1/users")
         monkeypatch.setattr(items, "paged", lambda *_: answer(["no page"]))

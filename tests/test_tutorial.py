@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +13,7 @@ import pandas as pd
 import pytest
 from gymnasium.wrappers import TimeLimit
 from serving import PASSWORD, serving
+from tool_modules import tool
 
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.dataset import NumpyTupleParser, TupliDataset
@@ -24,18 +23,11 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import TupliAPIClient, TupliStorage, storage_at
 
 pytestmark = pytest.mark.sampled(1)  # each with a directory or with a server
-SOURCE = Path(__file__).parents[1] / "tools" / "tutorial.py"
 
 
 @pytest.fixture(scope="module")
 def tutorial() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("tutorial", SOURCE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["tutorial"] = module  # pickles look their module up
-    spec.loader.exec_module(module)
-    return module
+    return tool("tutorial")
 
 
 @pytest.fixture
