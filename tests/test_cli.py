@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from commands import Result, run
 from environments import Scripted
 from gymnasium.envs.classic_control import CartPoleEnv
 from mcap.writer import Writer
@@ -51,28 +52,6 @@ from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
-
-
-class Result:
-    """What a command printed, and its exit code."""
-
-    def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
-
-    @property
-    def json(self) -> Any:
-        """The result in the one document that --json prints."""
-        assert (self.code, self.err) == (0, "")
-        document = json.loads(self.out)
-        assert list(document) == ["version", "command", "result"]
-        return document["result"]
-
-
-def run(*args: object) -> Result:
-    result = CliRunner().invoke(app, [str(arg) for arg in args])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return Result(result.exit_code, result.stdout, result.stderr)
 
 
 def ok(*args: object) -> str:

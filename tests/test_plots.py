@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from commands import run
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from PIL import Image
@@ -934,13 +935,6 @@ def test_the_users_matplotlib_stays_as_it_is(tiny: Path) -> None:
 
 
 # --- the command ---
-
-
-def run(*args: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, [str(arg) for arg in args])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.stdout, result.stderr
 
 
 def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,15 +12,14 @@ import av
 import gymnasium as gym
 import numpy as np
 import pytest
+from commands import run
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519
 from drawing import Drawing, Drifting, drawn
 from environments import Sampler
 from PIL import Image
-from typer.testing import CliRunner
 
 from tupli_mcap import RecordEpisodes, Recording, verify_recording
-from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import MissingExtraError, RecordingError, UntrustedError
 from tupli_mcap.recording import rewrite_recording
@@ -81,11 +80,6 @@ def a_key(path: Path) -> SigningKey:
     key = ed25519.Ed25519PrivateKey.generate()
     path.write_bytes(key.private_bytes(ser.Encoding.PEM, ser.PrivateFormat.PKCS8, ser.NoEncryption()))
     return SigningKey(path)
-
-
-def run(*args: Any) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, [str(arg) for arg in args])
-    return result.exit_code, result.stdout, result.stderr
 
 
 REAL = [

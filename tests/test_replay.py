@@ -13,13 +13,13 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from commands import run
 from crafted import set_flags
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519
 from environments import Sampler
 from gymnasium.envs.classic_control import CartPoleEnv
 from sample_spaces import SPACES, space_id
-from typer.testing import CliRunner
 
 from tupli_mcap import (
     EpisodeData,
@@ -34,7 +34,6 @@ from tupli_mcap import (
     trust,
     write_recording,
 )
-from tupli_mcap.cli.app import app
 from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.repair.recover import recover_recording
@@ -661,13 +660,6 @@ def test_several_episodes_may_differ(tmp_path: Path) -> None:
 
 
 # --- the command line ---
-
-
-def run(*args: object) -> tuple[int, str, str]:
-    result = CliRunner().invoke(app, [str(arg) for arg in args])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.stdout, result.stderr
 
 
 def test_verify_replay(tmp_path: Path) -> None:
