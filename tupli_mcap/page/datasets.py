@@ -75,15 +75,11 @@ class Dataset:
 
     @property
     def return_least(self) -> float | None:
-        return min(
-            (item.return_least for item in self.recordings if item.return_least is not None), default=None
-        )
+        return min((r.return_least for r in self.recordings if r.return_least is not None), default=None)
 
     @property
     def return_most(self) -> float | None:
-        return max(
-            (item.return_most for item in self.recordings if item.return_most is not None), default=None
-        )
+        return max((r.return_most for r in self.recordings if r.return_most is not None), default=None)
 
     @property
     def success(self) -> tuple[int, int]:

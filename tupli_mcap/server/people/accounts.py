@@ -298,13 +298,9 @@ def remove_members(connection: Connection, caller: Caller, group: str, users: Se
 
 def _known(connection: Connection, caller: Caller, group: str) -> None:
     """Raises NotFoundError for a group that does not exist, or that the caller may not see."""
-    there = connection.execute(select(PRINCIPAL.c.kind).where(PRINCIPAL.c.name == group)).scalar()
-    is_group = group == GLOBAL or (
-        there == "group" and connection.execute(select(GROUP.c.name).where(GROUP.c.name == group)).first()
-    )
-    if not is_group or not caller.may(Right.GROUP_READ, group):
-        if is_group and any(caller.may(right, group) for right in (Right.GROUP_UPDATE, Right.GROUP_DELETE)):
-            return
+    is_group = group == GLOBAL or connection.execute(select(GROUP).where(GROUP.c.name == group)).first()
+    rights = (Right.GROUP_READ, Right.GROUP_UPDATE, Right.GROUP_DELETE)
+    if not is_group or not any(caller.may(right, group) for right in rights):
         raise NotFoundError("Group not found")
 
 
