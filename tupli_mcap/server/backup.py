@@ -84,7 +84,7 @@ def back_up(settings: Settings, target: Path) -> Copied:
     for suffix in ("-wal", "-shm"):
         kept.sqlite.with_name(kept.sqlite.name + suffix).unlink(missing_ok=True)
     new.replace(kept.sqlite)
-    known = {target / file.name for file in contents.files}
+    known = {target / name for name in contents.files}
     for path in [*(target / "artifacts").rglob("*"), *(target / "recordings").rglob("*")]:
         if path.is_file() and path not in known:
             path.unlink()  # of an earlier backup
@@ -154,37 +154,32 @@ def _go_on_counting(connection: Connection, table: str) -> None:
 # --- files ---
 
 
-class _File(NamedTuple):
-    name: str
-    digest: str
-
-
 class _Contents(NamedTuple):
     users: int
-    files: list[_File]
     recordings: int
     bytes: int
+    files: dict[str, str]  # SHA-256 by name
 
 
 def _contents(database: Database) -> _Contents:
     with database.reading() as connection:
         users = connection.execute(select(func.count()).select_from(USER)).scalar_one()
         places = connection.execute(select(FILE.c.place, FILE.c.digest).order_by(FILE.c.place))
-        files = [_File(unescape_text(place), digest) for place, digest in places]
+        files = {unescape_text(place): digest for place, digest in places}
         ids = select(ITEM.c.id).where(ITEM.c.kind == "artifact").distinct().order_by(ITEM.c.id)
-        artifacts = [_File(artifact_key(uri), uri) for uri in connection.execute(ids).scalars()]
+        artifacts = {artifact_key(uri): uri for uri in connection.execute(ids).scalars()}
         size = sum(
             int(connection.execute(select(func.coalesce(func.sum(column), 0))).scalar_one())
             for column in (FILE.c.size, ITEM.c.size)
         )
-    return _Contents(users, [*files, *artifacts], len(files), size)
+    return _Contents(users, len(files), size, files | artifacts)
 
 
 def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path) -> Copied:
     """Copies the files that the target lacks. LostError if the source lacks one."""
     total = copied = 0
     with progress(contents.bytes, "copying", in_bytes=True) as bar:
-        for name, digest in contents.files:
+        for name, digest in contents.files.items():
             size = source.size(name)
             if size is None:
                 raise LostError(f"{name} is gone, and the database names it")

@@ -55,9 +55,9 @@ def change(
             found = find_dataset(shelf, connection, dataset)
             whole = wanted is None and _turn_benchmark(connection, visit, found, group, published=published)
             own: BaseFilter = FilterEQ(key="created_by", value=visit.caller.name)
-            turn = episodes.publish if published else episodes.unpublish
             wanted = own if wanted is None else own & wanted
-            changed = turn(connection, visit.caller, wanted, group, only=of_dataset(found.key))
+            of = of_dataset(found.key)
+            changed = episodes.publish(connection, visit.caller, wanted, group, published=published, only=of)
             if not changed and filter.strip():
                 raise StorageError(
                     "none of your episodes of this dataset matches the filter; give another one"

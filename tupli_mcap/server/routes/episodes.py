@@ -75,9 +75,9 @@ def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Bod
 @router.post("/publish")
 def publish_episodes(library: Served, caller: Writer, told: Annotated[Shown, Body()]) -> Response:
     """Publishes the episodes of a filter in a group, or unpublishes them: all, or none; `{"episodes": how many}`."""
-    change = episodes.publish if told.published else episodes.unpublish
     with library.database.writing() as connection:
-        return answer({"episodes": change(connection, caller, told.filter, told.group)})
+        count = episodes.publish(connection, caller, told.filter, told.group, published=told.published)
+    return answer({"episodes": count})
 
 
 @router.post("/keys")

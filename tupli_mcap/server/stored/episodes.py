@@ -117,41 +117,30 @@ def publish(
     filter: BaseFilter | None,
     group: str,
     *,
+    published: bool = True,
     only: ColumnElement[bool] | None = None,
 ) -> int:
-    """Lets a group see the caller's own episodes that match a filter: all, or none; returns how many. Doing it twice
-    changes nothing. only: see `find_episodes`."""
-    found = []
-    for header in find_episodes(connection, caller, filter, only=only):
-        if header.created_by != caller.name:
-            raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
-        found.append(header)
-    if found:
-        published_in([], group)
-        demand_audience(connection, caller, Right.EPISODE_CREATE, group)
-    _set_audiences(connection, found, lambda groups: published_in(groups, group))
-    _note(connection, caller, "publish_episodes", found, f" in {group}")
-    return len(found)
-
-
-def unpublish(
-    connection: Connection,
-    caller: Caller,
-    filter: BaseFilter | None,
-    group: str,
-    *,
-    only: ColumnElement[bool] | None = None,
-) -> int:
-    """Hides episodes from a group; returns how many. The owner may, and whoever has the right to delete in that group,
-    who hides all episodes of an id. only: see `find_episodes`."""
-    copies = caller.may(Right.EPISODE_DELETE, group)
+    """Lets a group see the caller's own episodes that match a filter, or hides them: all, or none; returns how many.
+    Doing it twice changes nothing. Who has the right to delete in the group may hide what others have published there,
+    and hides all episodes of an id. only: see `find_episodes`."""
+    copies = not published and caller.may(Right.EPISODE_DELETE, group)
     found = []
     for header in find_episodes(connection, caller, filter, only=only, copies=copies):
+        if published and header.created_by != caller.name:
+            raise DeniedError(f"episode {header.id} is somebody else's; only its owner may publish it")
         if header.created_by != caller.name:
             caller.demand(Right.EPISODE_DELETE, group)
         found.append(header)
-    _set_audiences(connection, found, lambda groups: [name for name in groups if name != group])
-    _note(connection, caller, "unpublish_episodes", found, f" from {group}")
+    if published and found:
+        published_in([], group)
+        demand_audience(connection, caller, Right.EPISODE_CREATE, group)
+
+    def changed(groups: list[str]) -> list[str]:
+        return published_in(groups, group) if published else [name for name in groups if name != group]
+
+    _set_audiences(connection, found, changed)
+    action, where = ("publish_episodes", "in") if published else ("unpublish_episodes", "from")
+    _note(connection, caller, action, found, f" {where} {group}")
     return len(found)
 
 
@@ -159,8 +148,7 @@ def publish_one(
     connection: Connection, caller: Caller, uri: str, group: str, *, published: bool = True
 ) -> None:
     """Publishes one episode in a group, or unpublishes it. Raises NotFoundError if there is none of this id."""
-    change = publish if published else unpublish
-    if not change(connection, caller, FilterEQ(key="id", value=uri), group):
+    if not publish(connection, caller, FilterEQ(key="id", value=uri), group, published=published):
         raise no_episode(uri)
 
 
