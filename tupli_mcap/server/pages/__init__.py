@@ -1,12 +1,11 @@
 """The pages of a server: those of `tupli_mcap.page` for signed-in users, and pages about people.
 
 shelf      the shelf of what a caller may read
-session    sign-in by a cookie, and protection of forms
+session    sign-in by a cookie; forms and their protection
 entrance   `/`, signing in and out
 account    `/account`: the password, tokens for machines
 people     `/users`, `/groups`
 sharing    `/share`: who sees a dataset; `/upload`
-forms      helpers of pages with forms
 """
 
 from tupli_mcap.server.pages import account, entrance, people, sharing

@@ -10,8 +10,7 @@ from fastapi.responses import JSONResponse
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute
-from tupli_mcap.server.pages.forms import form_page, tried
-from tupli_mcap.server.pages.session import Code, Member, Visit, begin
+from tupli_mcap.server.pages.session import Code, Member, Visit, begin, form_page, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.wire import told
 

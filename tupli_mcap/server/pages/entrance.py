@@ -13,8 +13,7 @@ from tupli_mcap.page.answers import PageRoute, page
 from tupli_mcap.page.routes import lists
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages import session
-from tupli_mcap.server.pages.forms import done
-from tupli_mcap.server.pages.session import Code, Visitor
+from tupli_mcap.server.pages.session import Code, Visitor, done
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.wire import told
 

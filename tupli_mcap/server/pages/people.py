@@ -9,8 +9,7 @@ from fastapi import APIRouter, Form, Request, Response
 
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.schema import Right
-from tupli_mcap.server.pages.forms import form_page, tried
-from tupli_mcap.server.pages.session import Code, Member, Visit
+from tupli_mcap.server.pages.session import Code, Member, Visit, form_page, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import GLOBAL
 

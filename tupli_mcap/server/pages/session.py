@@ -1,4 +1,4 @@
-"""Sign-in by a cookie, and protection of forms against pages of other sites.
+"""Sign-in by a cookie, pages with forms, and their protection against pages of other sites.
 
 1. Signing in puts a refresh token into a cookie that scripts cannot read. Browsers send it from other sites only when
    the user follows a link. Signing out, a new password and the deletion of the user revoke it.
@@ -10,18 +10,22 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncIterator, Callable
-from typing import Annotated, Final, NamedTuple
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Annotated, Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from fastapi import Depends, Form, Request, Response
+from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from tupli_mcap.page.answers import SignInNeededError
+from tupli_mcap.errors import TupliError
+from tupli_mcap.page.answers import SignInNeededError, page
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages.shelf import LibraryShelf
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError
+from tupli_mcap.server.wire import told
 
 COOKIE: Final = "tupli_mcap_session"
 
@@ -124,3 +128,41 @@ async def shown(request: Request) -> AsyncIterator[LibraryShelf]:
     """The shelf of what the caller may see, see `shelf_of`; it is their turn within the block."""
     async with contextlib.asynccontextmanager(_visit)(request) as visit:
         yield shelf_of(request, visit)
+
+
+# --- pages with forms ---
+
+
+def form_page(
+    request: Request,
+    visit: Visit,
+    template: str,
+    facts: Mapping[str, Any],
+    *,
+    wrong: str = "",
+    status: int = 200,
+    sent: Mapping[str, str] | None = None,
+    **more: Any,
+) -> Response:
+    """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
+    response = page(
+        request, template, facts, status=status, shelf=shelf_of(request, visit), code=visit.code, wrong=wrong,
+        sent=defaultdict(str, sent or {}), me=visit.caller, **more,
+    )  # fmt: skip
+    response.headers["Cache-Control"] = "no-store"
+    return response
+
+
+def tried(change: Callable[[], None], again: Callable[[str, int], Response], address: str) -> Response:
+    """Makes a change, and redirects to an address; if the change is refused, shows the page `again`."""
+    try:
+        change()
+    except TupliError as err:
+        status, text = told(err)
+        return again(text, status)
+    return done(address)
+
+
+def done(address: str) -> Response:
+    """Redirects to another page, which the browser fetches with GET."""
+    return RedirectResponse(address, 303)

@@ -15,8 +15,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
-from tupli_mcap.server.pages.forms import form_page, tried
-from tupli_mcap.server.pages.session import Code, Member, Visit, shelf_of
+from tupli_mcap.server.pages.session import Code, Member, Visit, form_page, shelf_of, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import DeniedError, known_audiences, readable
 from tupli_mcap.server.stored import episodes
