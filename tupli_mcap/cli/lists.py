@@ -150,7 +150,6 @@ def ls(
 
 
 def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]:
-    """The recordings of one source."""
     from tupli_mcap.storage.listing import list_recordings, listed_of
 
     if is_server(source):
@@ -297,7 +296,6 @@ def list_stored(
     limit: int | None,
     as_json: bool,
 ) -> None:
-    """Prints the episodes of a storage."""
     from tupli_mcap import open as open_dataset
 
     wanted = filter_of(filter_text)
@@ -350,7 +348,6 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
 
 
 def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
-    """Print episodes as a table or as JSON."""
     if as_json:
         from tupli_mcap.schema import EpisodeHeader
         from tupli_mcap.schema.facts import filter_keys, path_in

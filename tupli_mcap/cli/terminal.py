@@ -74,7 +74,6 @@ def _json_escaped(char: str) -> str:
 
 
 def flush() -> None:
-    """Flush stdout."""
     sys.stdout.flush()
 
 
@@ -138,7 +137,6 @@ def say_interrupted(message: str) -> None:
 
 
 def print_traceback(err: BaseException) -> None:
-    """Print the traceback of an exception on stderr."""
     lines = "".join(traceback.format_exception(err)).rstrip("\n").split("\n")
     _write(sys.stderr, "".join(f"{visible(line)}\n" for line in lines))
 

@@ -57,7 +57,6 @@ class Curves:
     notes: Sequence[str]
 
     def of(self, field: str) -> list[Track]:
-        """The tracks of a field."""
         return [track for track in self.tracks if track.field == field]
 
 

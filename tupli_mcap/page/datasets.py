@@ -168,7 +168,6 @@ def dataset_filter(key: str) -> str:
 
 
 def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:
-    """The dataset of an episode."""
     found = select(RECORDING.c.benchmark_id, RECORDING.c.environment).where(of_recording(header.recording))
     benchmark_id, environment = connection.execute(found).one()
     return find_dataset(shelf, connection, _key(unescape_text(benchmark_id), unescape_text(environment)))

@@ -116,8 +116,6 @@ class DirectoryShelf(_OpenToAll):
 
 
 class FileShelf(_OpenToAll):
-    """One recording."""
-
     def __init__(self, path: Path) -> None:
         super().__init__()
         self._path = path.absolute()

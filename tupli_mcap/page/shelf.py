@@ -108,7 +108,6 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
 
 
 def find_episode(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader:
-    """One episode by its id; see `find_some`."""
     return find_some(shelf, connection, [uri])[0]
 
 

@@ -98,7 +98,6 @@ class Certifier:
         self._any_options: bool | None = None
 
     def run(self) -> Certificate:
-        """Runs and compares the episodes."""
         captured = self._record is not None and self._record.pickle is not None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the environment gave its warnings when it was recorded
@@ -124,7 +123,6 @@ class Certifier:
         return None
 
     def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
-        """Whether to stop after this outcome."""
         return False
 
     def _replayer(self, *, plain: bool = False) -> Replayer:
@@ -143,7 +141,6 @@ class Certifier:
                 self._replay(everything)
 
     def _replay(self, plans: list[EpisodePlan]) -> None:
-        """Runs episodes in order, in one environment."""
         replayer = self._replayer(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:

@@ -89,7 +89,6 @@ class Checker:
         self._flags = (columns.terminals.tolist(), columns.timeouts.tolist())
 
     def state(self, step: int, state: Any, tally: Tally) -> None:
-        """Compares the state of a step."""
         self._compare(step, state, self._states, tally)
 
     def result(self, step: int, moment: Moment, tally: Tally) -> bool:
@@ -107,7 +106,6 @@ class Checker:
         return bool(moment.terminal) == terminals[i] and bool(moment.timeout) == timeouts[i]
 
     def final_state(self, step: int, recorded: Any, state: Any, tally: Tally) -> None:
-        """Compares the state after the last step."""
         prepared = []
         for leaf in self._layout.state:
             value = leaf.get(recorded)

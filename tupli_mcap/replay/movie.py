@@ -31,8 +31,6 @@ _CODECS = ("libx264", "h264", "mpeg4")
 
 
 class _Take(NamedTuple):
-    """A frame in the temporary file."""
-
     step: int
     offset: int
     size: int
@@ -86,7 +84,6 @@ class RenderedFrames:
                 yield decode_picture(frame.data, f"frame of step {step}")
 
     def close(self) -> None:
-        """Removes the frames."""
         self._file.close()
 
 

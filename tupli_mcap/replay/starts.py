@@ -105,7 +105,6 @@ def _plan(recording: Recording, position: int, before: int | None, captured: boo
 
 
 def up_to_last(plans: list[EpisodePlan], chosen: Collection[int]) -> list[EpisodePlan]:
-    """The plans up to the last chosen episode."""
     last = max((i for i, plan in enumerate(plans) if plan.number in chosen), default=-1)
     return plans[: last + 1]
 

@@ -230,7 +230,6 @@ class Library:
         return name
 
     def forget_upload(self, upload: Upload) -> None:
-        """Deletes an upload."""
         with self.database.writing() as connection:
             self.uploads.forget(connection, upload)
 
@@ -406,7 +405,6 @@ class Library:
         self.blobs.size("artifacts/none")
 
     def close(self) -> None:
-        """Close the database."""
         self.database.close()
 
 

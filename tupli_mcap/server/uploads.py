@@ -60,7 +60,6 @@ class Upload(NamedTuple):
 
     @property
     def offset(self) -> int:
-        """The number of received bytes."""
         return self.path.stat().st_size if self.path.exists() else 0
 
 

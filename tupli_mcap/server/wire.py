@@ -155,7 +155,6 @@ def artifact_metadata(data: str | bytes) -> ArtifactMetadata:
 
 
 def listed(items: Iterable[BaseModel], following: str | None = None) -> Response:
-    """A page of items."""
     return answer({"items": list(items), "next": following})
 
 

@@ -110,7 +110,6 @@ def _column(views: Sequence[tuple[Any, float]], name: str | None = None) -> Any:
 
 
 def _height(panel: Panel, episodes: int) -> float:
-    """A panel's share of the height of its column."""
     if isinstance(panel, Lanes):
         return min(_LANES + _LANE * episodes, _MOST_LANES)
     return _SHARES.get(type(panel), _SHARE)

@@ -65,7 +65,6 @@ class Plan(NamedTuple):
 
     @property
     def blueprint(self) -> Any:
-        """The blueprint of the parts."""
         roots = list(dict.fromkeys(part.root for part in self.parts))
         return blueprint_of(self.parts[0].scene, roots, listed=self.listed, overview=self._shows_some_of_many)
 
@@ -76,7 +75,6 @@ class Plan(NamedTuple):
 
     @property
     def recordings(self) -> list[Recording]:
-        """The recordings of its episodes."""
         return list({id(part.chosen.recording): part.chosen.recording for part in self.parts}.values())
 
     @property

@@ -76,7 +76,6 @@ def free_port() -> int:
 
 
 def answers(host: str, port: int) -> bool:
-    """Whether something listens there."""
     try:
         socket.create_connection((host, port), _ANSWER).close()
     except OSError:

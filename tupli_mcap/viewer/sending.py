@@ -26,7 +26,6 @@ class Times:
 
     @cached_property
     def columns(self) -> list[Any]:
-        """The time columns, for `send_columns`."""
         import rerun as rr
 
         columns = [
@@ -38,7 +37,6 @@ class Times:
         return columns
 
     def at(self, rows: Array) -> Times:
-        """The times of some of the rows."""
         return Times(self._step[rows], self._wall[rows], self._step_seconds)
 
     def moved(self, steps: int) -> Times:

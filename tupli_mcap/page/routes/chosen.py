@@ -120,7 +120,6 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
 
 @router.get("/episode/{uri}/film.mp4")
 def film(shelf: Shown, uri: str) -> FileResponse:
-    """The pictures of an episode as an MP4."""
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")
 

@@ -56,7 +56,6 @@ def _viewer_page(request: Request, shelf: Shelf, uris: list[str]) -> Response:
 
 @router.get("/viewer/{number}/{name}")
 def file(number: str, name: str) -> FileResponse:
-    """A file of the viewer."""
     if name not in _NAMES or number != _viewer_version():
         raise NotFoundError("there is no such file of the viewer")
     kept = {"Content-Encoding": "gzip", "Cache-Control": "private, max-age=31536000, immutable"}

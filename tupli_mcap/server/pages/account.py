@@ -59,7 +59,6 @@ def create_token(
 
 @router.post("/account/tokens/delete")
 def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
-    """Revokes a token for a machine."""
     change = partial(visit.change, visit.library.tokens.delete_api_token, token)
     return tried(change, partial(_page, request, visit), "/account")
 

@@ -70,7 +70,6 @@ def sign_in(
 
 @router.post("/sign-out")
 def sign_out(visit: Code) -> Response:
-    """Ends the sign-in."""
     with visit.library.database.writing() as connection:
         visit.library.tokens.end(connection, visit.session)
     response = done("/sign-in")

@@ -20,14 +20,11 @@ _Sent = dict[str, str] | None
 
 @router.get("/users")
 def show_users(request: Request, visit: Member) -> Response:
-    """All users."""
     return _users(request, visit)
 
 
 @router.post("/users")
 def create_user(request: Request, visit: Code, username: _Text = "", password: _Text = "") -> Response:
-    """Makes a user."""
-
     def change() -> None:
         visit.caller.demand(Right.USER_CREATE)
         visit.library.create_user(visit.caller, username, password, "")
@@ -56,7 +53,6 @@ def _users(
 
 @router.get("/groups")
 def show_groups(request: Request, visit: Member) -> Response:
-    """The groups that the user may see."""
     return _groups(request, visit)
 
 
@@ -81,7 +77,6 @@ def _groups(
 
 @router.get("/group")
 def show_group(request: Request, visit: Member, name: str) -> Response:
-    """A group and its members."""
     return _group(request, visit, name)
 
 
@@ -89,7 +84,6 @@ def show_group(request: Request, visit: Member, name: str) -> Response:
 def add_member(
     request: Request, visit: Code, name: _Text = "", user: _Text = "", role: _Text = "member"
 ) -> Response:
-    """Gives a user a role in a group."""
     change = partial(visit.change, accounts.add_members, name, [(user, [role])])
     again = partial(_group, request, visit, name, sent={"user": user, "role": role})
     return tried(change, again, address("group", name=name))
@@ -97,7 +91,6 @@ def add_member(
 
 @router.post("/group/members/delete")
 def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text = "") -> Response:
-    """Takes a user out of a group."""
     change = partial(visit.change, accounts.remove_members, name, [user])
     return tried(change, partial(_group, request, visit, name), address("group", name=name))
 

@@ -137,6 +137,5 @@ def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str,
 
 @router.get("/upload")
 def show_upload(request: Request, visit: Member) -> Response:
-    """The page for uploading recordings."""
     visit.caller.demand(Right.EPISODE_CREATE, visit.caller.name)
     return form_page(request, visit, "upload.html", {"most_bytes": visit.library.settings.max_upload})

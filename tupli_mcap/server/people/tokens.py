@@ -94,7 +94,6 @@ class Tokens:
         return hmac.new(self._secret, f"form {_digest(refresh)}".encode(), hashlib.sha256).hexdigest()
 
     def is_form_code(self, refresh: str, code: str) -> bool:
-        """Whether a form has sent the right code."""
         return hmac.compare_digest(self.form_code(refresh).encode(), code.encode())
 
     def _access(self, user: str, epoch: int, family: str) -> str:

@@ -27,7 +27,6 @@ class NewSteps(NamedTuple):
         return len(self.facts.time)
 
     def newest(self, count: int) -> NewSteps:
-        """The last `count` steps."""
         skip = max(0, len(self) - count)
         rows = None if self.rows is None else self.rows[skip:]
         facts = StepFacts._make([*(column[skip:] for column in self.facts[:-1]), self.facts.bad])

@@ -105,7 +105,6 @@ class LiveEnv:
         self._shift = max(self._shift, end - self._rows)
 
     def on(self, stream: Any) -> None:
-        """Sends to this stream from now on."""
         self._place = self._place._replace(stream=stream)
 
     def declare(self) -> None:
@@ -128,7 +127,6 @@ class LiveEnv:
             heat_map.send(self._place, newest)
 
     def send_infos(self, found: Sequence[NewInfo]) -> None:
-        """Sends the numbers among infos."""
         if not found or self._infos is None:
             return
         rows = np.array([info.row for info in found]) + self._shift
@@ -178,7 +176,6 @@ class LiveEnv:
                     panel.send(self._place, block, self._times(rows, times))
 
     def send_frames(self, follower: Follower) -> None:
-        """Sends the newest frames."""
         for panel in self._cameras:
             found = follower.frames(self._env, self._images)
             if found:

@@ -65,7 +65,6 @@ class LivePanels:
         return True
 
     def _look(self, follower: Follower) -> None:
-        """Reads new steps and infos."""
         steps, ended = follower.look()
         self._steps += steps
         self._infos += follower.infos(MOST_INFOS)
@@ -96,7 +95,6 @@ class LivePanels:
         self._next_overview = 0.0
 
     def send(self, stream: Any, follower: Follower) -> None:
-        """Sends new steps and infos."""
         self._look(follower)
         steps, self._steps, infos, self._infos = self._steps, [], self._infos, []
         self._align(steps)

@@ -24,7 +24,6 @@ class Target(NamedTuple):
     url: str = ""
 
     def answers(self) -> bool:
-        """True if something listens there."""
         return answers(self.host.strip("[]"), self.port)
 
 
