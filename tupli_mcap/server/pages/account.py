@@ -5,46 +5,41 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Form, Request, Response
+from fastapi import APIRouter, Form, Response
 from fastapi.responses import JSONResponse
 
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute
-from tupli_mcap.server.pages.session import Code, Member, Visit, begin, form_page, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.wire import told
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
-_Days = Annotated[int, Form()]
 
 
 @router.get("/account")
-def show(request: Request, visit: Member) -> Response:
+def show(visit: Member) -> Response:
     """The user's account and tokens, with forms to change them."""
-    return _page(request, visit)
+    return _page(visit)
 
 
 @router.post("/account/password")
-def change_password(request: Request, visit: Code, old: _Text = "", new: _Text = "") -> Response:
+def change_password(visit: Code, old: _Text = "", new: _Text = "") -> Response:
     """Changes the user's password; every other sign-in ends."""
     library, name = visit.library, visit.caller.name
     change = partial(library.change_password, visit.caller, name, new, old=old)
-    response = tried(change, partial(_page, request, visit), "/account")
+    response = tried(change, partial(_page, visit), "/account")
     if response.status_code == 303:
         with library.database.writing() as connection:
             pair = library.tokens.pair(connection, name)
-        begin(request, response, pair["refresh_token"], library.settings.refresh_seconds)
+        visit.begin(response, pair["refresh_token"])
     return response
 
 
 @router.post("/account/tokens")
 def create_token(
-    request: Request,
-    visit: Code,
-    name: _Text = "",
-    scope: _Text = "read",
-    days: _Days = 90,
+    visit: Code, name: _Text = "", scope: _Text = "read", days: Annotated[int, Form()] = 90
 ) -> Response:
     """Creates a token for a machine, and shows it once."""
     library = visit.library
@@ -53,14 +48,14 @@ def create_token(
             made = library.tokens.create_api_token(connection, visit.caller, name, scope, days)
     except TupliError as err:
         status, text = told(err)
-        return _page(request, visit, text, status, sent={"name": name, "scope": scope, "days": str(days)})
-    return _page(request, visit, made=made)
+        return _page(visit, text, status, sent={"name": name, "scope": scope, "days": str(days)})
+    return _page(visit, made=made)
 
 
 @router.post("/account/tokens/delete")
-def delete_token(request: Request, visit: Code, token: _Text = "") -> Response:
+def delete_token(visit: Code, token: _Text = "") -> Response:
     change = partial(visit.change, visit.library.tokens.delete_api_token, token)
-    return tried(change, partial(_page, request, visit), "/account")
+    return tried(change, partial(_page, visit), "/account")
 
 
 @router.post("/account/access")
@@ -72,7 +67,6 @@ def access(visit: Code) -> Response:
 
 
 def _page(
-    request: Request,
     visit: Visit,
     wrong: str = "",
     status: int = 200,
@@ -84,4 +78,4 @@ def _page(
         tokens = visit.library.tokens.list_api_tokens(connection, visit.caller)
         memberships = accounts.memberships_of(connection, visit.caller.name)
     facts = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
-    return form_page(request, visit, "account.html", facts, wrong=wrong, status=status, sent=sent, made=made)
+    return visit.page("account.html", facts, wrong, status, sent=sent, made=made)

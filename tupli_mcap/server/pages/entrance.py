@@ -11,9 +11,7 @@ import tupli_mcap
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute, page
 from tupli_mcap.page.routes import lists
-from tupli_mcap.server.library import Library
-from tupli_mcap.server.pages import session
-from tupli_mcap.server.pages.session import Code, Visitor, done
+from tupli_mcap.server.pages.session import COOKIE, Code, Visit, Visitor, done
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.wire import told
 
@@ -29,20 +27,19 @@ def root(
     browser = "text/html" in request.headers.get("accept", "") or "format" in request.query_params
     if not browser:
         return JSONResponse({"name": "tupli-mcap", "version": tupli_mcap.__version__})
-    return lists.datasets(request, session.shelf_of(request, visit), q, number)
+    return lists.datasets(request, visit.shelf(), q, number)
 
 
 @router.get("/sign-in")
-def show_sign_in(request: Request, visit: Visitor, next: str = "/") -> Response:
+def show_sign_in(visit: Visitor, next: str = "/") -> Response:
     """The form for name and password."""
     if visit.is_signed_in:
         return done(_local(next))
-    return _sign_in_page(request, visit.library, next)
+    return _sign_in_page(visit, next)
 
 
 @router.post("/sign-in")
 def sign_in(
-    request: Request,
     visit: Visitor,
     username: Annotated[str, Form()] = "",
     password: Annotated[str, Form()] = "",
@@ -52,19 +49,18 @@ def sign_in(
     """Signs in; if the server is open to sign-ups, it may create the user first."""
     library = visit.library
     try:
-        if not session.is_own_origin(request):
+        if not visit.is_own_origin:
             raise DeniedError("this form is not of this server; open its page and sign in there")
-        address = request.client.host if request.client else ""
         if new and not library.settings.open_signup:
             raise DeniedError("only an administrator makes users here")
         if new:
-            library.create_user(visit.caller, username, password, address)
-        pair = library.sign_in(username, password, address)
+            library.create_user(visit.caller, username, password, visit.address)
+        pair = library.sign_in(username, password, visit.address)
     except TupliError as err:
         status, text = told(err)
-        return _sign_in_page(request, library, following, text, status, new=new, username=username)
+        return _sign_in_page(visit, following, text, status, new=new, username=username)
     response = done(_local(following))
-    session.begin(request, response, pair["refresh_token"], library.settings.refresh_seconds)
+    visit.begin(response, pair["refresh_token"])
     return response
 
 
@@ -73,13 +69,12 @@ def sign_out(visit: Code) -> Response:
     with visit.library.database.writing() as connection:
         visit.library.tokens.end(connection, visit.session)
     response = done("/sign-in")
-    session.end(response)
+    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="lax")
     return response
 
 
 def _sign_in_page(
-    request: Request,
-    library: Library,
+    visit: Visit,
     following: str,
     wrong: str = "",
     status: int = 200,
@@ -88,8 +83,8 @@ def _sign_in_page(
     username: str = "",
 ) -> Response:
     response = page(
-        request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),
-        open_signup=library.settings.open_signup, new=new, username=username,
+        visit.request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),
+        open_signup=visit.library.settings.open_signup, new=new, username=username,
     )  # fmt: skip
     response.headers["Cache-Control"] = "no-store"
     return response

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Form, Request, Response
+from fastapi import APIRouter, Form, Response
 
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.schema import Right
-from tupli_mcap.server.pages.session import Code, Member, Visit, form_page, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import GLOBAL
 
@@ -19,92 +19,80 @@ _Sent = dict[str, str] | None
 
 
 @router.get("/users")
-def show_users(request: Request, visit: Member) -> Response:
-    return _users(request, visit)
+def show_users(visit: Member) -> Response:
+    return _users(visit)
 
 
 @router.post("/users")
-def create_user(request: Request, visit: Code, username: _Text = "", password: _Text = "") -> Response:
+def create_user(visit: Code, username: _Text = "", password: _Text = "") -> Response:
     def change() -> None:
         visit.caller.demand(Right.USER_CREATE)
         visit.library.create_user(visit.caller, username, password, "")
 
-    return tried(change, partial(_users, request, visit, sent={"username": username}), "/users")
+    return tried(change, partial(_users, visit, sent={"username": username}), "/users")
 
 
 @router.post("/users/delete")
-def delete_user(request: Request, visit: Code, username: _Text = "") -> Response:
+def delete_user(visit: Code, username: _Text = "") -> Response:
     """Deletes a user, and what only they could see; the name cannot be used again."""
     change = partial(visit.library.delete_user, visit.caller, username)
-    return tried(change, partial(_users, request, visit), "/users")
+    return tried(change, partial(_users, visit), "/users")
 
 
-def _users(
-    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None
-) -> Response:
+def _users(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     visit.caller.demand(Right.USER_READ)
     with visit.library.database.reading() as connection:
         users = accounts.list_users(connection, visit.caller)
     may = {"create": visit.caller.may(Right.USER_CREATE), "delete": visit.caller.may(Right.USER_DELETE)}
-    return form_page(
-        request, visit, "users.html", {"users": users}, wrong=wrong, status=status, sent=sent, may=may
-    )
+    return visit.page("users.html", {"users": users}, wrong, status, sent=sent, may=may)
 
 
 @router.get("/groups")
-def show_groups(request: Request, visit: Member) -> Response:
-    return _groups(request, visit)
+def show_groups(visit: Member) -> Response:
+    return _groups(visit)
 
 
 @router.post("/groups")
-def create_group(request: Request, visit: Code, name: _Text = "", description: _Text = "") -> Response:
+def create_group(visit: Code, name: _Text = "", description: _Text = "") -> Response:
     """Creates a group with the user as its admin."""
     change = partial(visit.change, accounts.create_group, name, description or None)
     sent = {"name": name, "description": description}
-    return tried(change, partial(_groups, request, visit, sent=sent), address("group", name=name))
+    return tried(change, partial(_groups, visit, sent=sent), address("group", name=name))
 
 
-def _groups(
-    request: Request, visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None
-) -> Response:
+def _groups(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     with visit.library.database.reading() as connection:
         groups = accounts.list_groups(connection, visit.caller)
         own = accounts.memberships_of(connection, visit.caller.name)
-    return form_page(
-        request, visit, "groups.html", {"groups": groups}, wrong=wrong, status=status, sent=sent, own=own
-    )
+    return visit.page("groups.html", {"groups": groups}, wrong, status, sent=sent, own=own)
 
 
 @router.get("/group")
-def show_group(request: Request, visit: Member, name: str) -> Response:
-    return _group(request, visit, name)
+def show_group(visit: Member, name: str) -> Response:
+    return _group(visit, name)
 
 
 @router.post("/group/members")
-def add_member(
-    request: Request, visit: Code, name: _Text = "", user: _Text = "", role: _Text = "member"
-) -> Response:
+def add_member(visit: Code, name: _Text = "", user: _Text = "", role: _Text = "member") -> Response:
     change = partial(visit.change, accounts.add_members, name, [(user, [role])])
-    again = partial(_group, request, visit, name, sent={"user": user, "role": role})
+    again = partial(_group, visit, name, sent={"user": user, "role": role})
     return tried(change, again, address("group", name=name))
 
 
 @router.post("/group/members/delete")
-def remove_member(request: Request, visit: Code, name: _Text = "", user: _Text = "") -> Response:
+def remove_member(visit: Code, name: _Text = "", user: _Text = "") -> Response:
     change = partial(visit.change, accounts.remove_members, name, [user])
-    return tried(change, partial(_group, request, visit, name), address("group", name=name))
+    return tried(change, partial(_group, visit, name), address("group", name=name))
 
 
 @router.post("/group/delete")
-def delete_group(request: Request, visit: Code, name: _Text = "") -> Response:
+def delete_group(visit: Code, name: _Text = "") -> Response:
     """Deletes a group; its name cannot be used again."""
     change = partial(visit.change, accounts.delete_group, name)
-    return tried(change, partial(_group, request, visit, name), "/groups")
+    return tried(change, partial(_group, visit, name), "/groups")
 
 
-def _group(
-    request: Request, visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent: _Sent = None
-) -> Response:
+def _group(visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     with visit.library.database.reading() as connection:
         group = accounts.members_of(connection, visit.caller, name)
         roles = [role["role"] for role in accounts.list_roles(connection)]
@@ -113,6 +101,4 @@ def _group(
         "update": caller.may(Right.GROUP_UPDATE, name),
         "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
     }
-    return form_page(
-        request, visit, "group.html", group, wrong=wrong, status=status, sent=sent, may=may, roles=roles
-    )
+    return visit.page("group.html", group, wrong, status, sent=sent, may=may, roles=roles)

@@ -31,22 +31,69 @@ COOKIE: Final = "tupli_mcap_session"
 
 
 class Visit(NamedTuple):
-    """The caller, the refresh token of the sign-in (empty for a guest), and the code for forms."""
+    """A request for a page: its caller, refresh token of the sign-in (empty for a guest), and code for forms."""
 
+    request: Request
     library: Library
     caller: Caller
-    session: str
-    code: str
+    session: str = ""
+    code: str = ""
 
     @property
     def is_signed_in(self) -> bool:
         """Whether the caller is signed in, and no guest."""
         return bool(self.session)
 
+    @property
+    def address(self) -> str:
+        """The address of the caller's machine."""
+        return self.request.client.host if self.request.client else ""
+
+    @property
+    def is_own_origin(self) -> bool:
+        """Whether a form is from a page of this server, according to the browser's headers."""
+        headers = self.request.headers
+        site, origin = headers.get("sec-fetch-site"), headers.get("origin")
+        if site is not None:
+            return site in ("same-origin", "none")
+        return origin is None or urlsplit(origin).netloc == headers.get("host")
+
+    def shelf(self) -> LibraryShelf:
+        """The shelf of what the caller may see. SignInNeededError for a guest, if the server has no guests."""
+        if not self.is_signed_in and not self.library.settings.guests:
+            raise SignInNeededError("sign in to see what is here")
+        url, kept = self.request.url, self.request.app.state.kept
+        return LibraryShelf(self.library, self.caller, f"{url.scheme}://{url.netloc}", kept)
+
     def change(self, work: Callable[..., object], *args: object) -> None:
         """Calls `work(connection, caller, *args)` in a writing transaction."""
         with self.library.database.writing() as connection:
             work(connection, self.caller, *args)
+
+    def page(
+        self,
+        template: str,
+        facts: Mapping[str, Any],
+        wrong: str = "",
+        status: int = 200,
+        *,
+        sent: Mapping[str, str] | None = None,
+        **more: Any,
+    ) -> Response:
+        """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
+        response = page(
+            self.request, template, facts, status=status, shelf=self.shelf(), code=self.code, wrong=wrong,
+            sent=defaultdict(str, sent or {}), me=self.caller, **more,
+        )  # fmt: skip
+        response.headers["Cache-Control"] = "no-store"
+        return response
+
+    def begin(self, response: Response, refresh_token: str) -> None:
+        """Sets the cookie of a sign-in."""
+        response.set_cookie(
+            COOKIE, refresh_token, max_age=self.library.settings.refresh_seconds, httponly=True, samesite="lax",
+            secure=self.request.url.scheme == "https", path="/",
+        )  # fmt: skip
 
 
 def _known_visit(request: Request) -> Visit:
@@ -55,17 +102,16 @@ def _known_visit(request: Request) -> Visit:
     with library.database.reading() as connection:
         caller = library.tokens.of_session(connection, session) if session else None
         if caller is None:
-            return Visit(library, accounts.guest(connection), "", "")
+            return Visit(request, library, accounts.guest(connection))
     request.state.user = caller.name  # for the log
-    return Visit(library, caller, session, library.tokens.form_code(session))
+    return Visit(request, library, caller, session, library.tokens.form_code(session))
 
 
 async def _visit(request: Request) -> AsyncIterator[Visit]:
     visit = await run_in_threadpool(_known_visit, request)
     with contextlib.suppress(SignInNeededError):
-        request.state.shelf = shelf_of(request, visit)  # for error pages
-    address = request.client.host if request.client else ""
-    async with request.app.state.turns.turn(visit.caller, address):
+        request.state.shelf = visit.shelf()  # for error pages
+    async with request.app.state.turns.turn(visit.caller, visit.address):
         yield visit
 
 
@@ -83,8 +129,8 @@ Member = Annotated[Visit, Depends(_member)]
 """A visit by a signed-in user."""
 
 
-async def _checked(request: Request, visit: Member, code: Annotated[str, Form()] = "") -> Visit:
-    if not is_own_origin(request) or not visit.library.tokens.is_form_code(visit.session, code):
+async def _checked(visit: Member, code: Annotated[str, Form()] = "") -> Visit:
+    if not visit.is_own_origin or not visit.library.tokens.is_form_code(visit.session, code):
         raise DeniedError("this form is out of date, or not from this sign-in; reload the page and try again")
     return visit
 
@@ -93,64 +139,11 @@ Code = Annotated[Visit, Depends(_checked)]
 """A visit by a signed-in user who has sent a form of our own page."""
 
 
-def is_own_origin(request: Request) -> bool:
-    """Whether a form is from a page of this server, according to the browser's headers."""
-    site = request.headers.get("sec-fetch-site")
-    if site is not None:
-        return site in ("same-origin", "none")
-    origin = request.headers.get("origin")
-    return origin is None or urlsplit(origin).netloc == request.headers.get("host")
-
-
-def begin(request: Request, response: Response, refresh_token: str, seconds: int) -> None:
-    """Sets the cookie of a sign-in."""
-    secure = request.url.scheme == "https"
-    response.set_cookie(
-        COOKIE, refresh_token, max_age=seconds, httponly=True, samesite="lax", secure=secure, path="/"
-    )
-
-
-def end(response: Response) -> None:
-    """Removes the cookie of the sign-in."""
-    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="lax")
-
-
-def shelf_of(request: Request, visit: Visit) -> LibraryShelf:
-    """The shelf of what the caller may see. SignInNeededError if nobody is signed in, and the server has no guests."""
-    if not visit.is_signed_in and not visit.library.settings.guests:
-        raise SignInNeededError("sign in to see what is here")
-    address = f"{request.url.scheme}://{request.url.netloc}"
-    return LibraryShelf(visit.library, visit.caller, address, request.app.state.kept)
-
-
 @contextlib.asynccontextmanager
 async def shown(request: Request) -> AsyncIterator[LibraryShelf]:
-    """The shelf of what the caller may see, see `shelf_of`; it is their turn within the block."""
+    """The shelf of what the caller may see, see `Visit.shelf`; it is their turn within the block."""
     async with contextlib.asynccontextmanager(_visit)(request) as visit:
-        yield shelf_of(request, visit)
-
-
-# --- pages with forms ---
-
-
-def form_page(
-    request: Request,
-    visit: Visit,
-    template: str,
-    facts: Mapping[str, Any],
-    *,
-    wrong: str = "",
-    status: int = 200,
-    sent: Mapping[str, str] | None = None,
-    **more: Any,
-) -> Response:
-    """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
-    response = page(
-        request, template, facts, status=status, shelf=shelf_of(request, visit), code=visit.code, wrong=wrong,
-        sent=defaultdict(str, sent or {}), me=visit.caller, **more,
-    )  # fmt: skip
-    response.headers["Cache-Control"] = "no-store"
-    return response
+        yield visit.shelf()
 
 
 def tried(change: Callable[[], None], again: Callable[[str, int], Response], address: str) -> Response:

@@ -8,14 +8,14 @@ from collections import Counter
 from functools import partial
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Form, Request, Response
+from fastapi import APIRouter, Form, Response
 from sqlalchemy import Connection, func, select
 
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
-from tupli_mcap.server.pages.session import Code, Member, Visit, form_page, shelf_of, tried
+from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import DeniedError, known_audiences, readable
 from tupli_mcap.server.stored import episodes
@@ -28,14 +28,13 @@ _Text = Annotated[str, Form()]
 
 
 @router.get("/share")
-def show(request: Request, visit: Member, dataset: str, filter: str = "") -> Response:
+def show(visit: Member, dataset: str, filter: str = "") -> Response:
     """The page of who sees a dataset, or its episodes that match a filter, with the forms to change that."""
-    return _page(request, visit, dataset, filter)
+    return _page(visit, dataset, filter)
 
 
 @router.post("/share")
 def change(
-    request: Request,
     visit: Code,
     dataset: _Text = "",
     filter: _Text = "",
@@ -47,7 +46,7 @@ def change(
 
     def work() -> None:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        shelf = shelf_of(request, visit)
+        shelf = visit.shelf()
         with visit.library.database.writing() as connection:
             if group not in _groups(connection, visit):
                 raise NotFoundError(f"you are in no group {group[:80]!r}")
@@ -65,7 +64,7 @@ def change(
                 raise DeniedError("nothing of this is yours; only the owners may publish it")
 
     again = address("share", dataset=dataset, filter=filter)
-    return tried(work, partial(_page, request, visit, dataset, filter), again)
+    return tried(work, partial(_page, visit, dataset, filter), again)
 
 
 def _turn_benchmark(
@@ -86,10 +85,8 @@ def _turn_benchmark(
     return True
 
 
-def _page(
-    request: Request, visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200
-) -> Response:
-    shelf = shelf_of(request, visit)
+def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200) -> Response:
+    shelf = visit.shelf()
 
     def ask(connection: Connection) -> tuple[Dataset, list[dict[str, Any]], list[str]]:
         found = find_dataset(shelf, connection, key)
@@ -102,7 +99,7 @@ def _page(
         "episodes": audiences,
     }
     shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter}
-    return form_page(request, visit, "share.html", facts, wrong=wrong, status=status, **shown)
+    return visit.page("share.html", facts, wrong, status, **shown)
 
 
 def _groups(connection: Connection, visit: Visit) -> list[str]:
@@ -136,6 +133,6 @@ def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str,
 
 
 @router.get("/upload")
-def show_upload(request: Request, visit: Member) -> Response:
+def show_upload(visit: Member) -> Response:
     visit.caller.demand(Right.EPISODE_CREATE, visit.caller.name)
-    return form_page(request, visit, "upload.html", {"most_bytes": visit.library.settings.max_upload})
+    return visit.page("upload.html", {"most_bytes": visit.library.settings.max_upload})
