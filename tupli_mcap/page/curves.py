@@ -10,10 +10,11 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.jsonvalue import spelled
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.plots.measure import numbers_in, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
-from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.spaces.labels import Labels, short_path
 from tupli_mcap.spaces.leaves import Leaf
@@ -68,23 +69,27 @@ def curves_of(episode: Episode) -> Curves:
     columns = recording.read_steps(episode.position, 0, read, ("states", "actions", "rewards"), images=False)
     tracks: list[Track] = []
     notes: list[str] = []
+    for field, leaf, column in numbers_of(layout, columns):
+        tracks += _tracks(field, leaf, recording.labels, column, notes)
+        if field == "reward" and leaf.size == 1:
+            so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
+            tracks.append(_track("reward", SO_FAR, np.arange(read, dtype=np.float64), so_far))
+    tracks += _info_tracks(recording, episode, read, notes)
+    if read < len(episode):
+        notes.append(f"Of its {len(episode):,} steps, the first {read:,} are shown.")
+    return Curves(tracks, read, notes)
+
+
+def numbers_of(layout: StepLayout, columns: Columns) -> Iterator[tuple[str, Leaf, Array]]:
+    """The leaves that are neither texts nor pictures: the field of each, and its values (steps, size)."""
     for field, leaves, values in (
         ("state", layout.state, columns.states),
         ("action", layout.action, columns.actions),
         ("reward", layout.reward, columns.rewards),
     ):
         for leaf in leaves:
-            if leaf.kind == "variable" or leaf.apart:  # shown as a text, or as a picture
-                continue
-            column = np.asarray(leaf.get(values)).reshape(read, leaf.size)
-            tracks += _tracks(field, leaf, recording.labels, column, notes)
-            if field == "reward" and leaf.size == 1:
-                so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
-                tracks.append(_track("reward", SO_FAR, np.arange(read, dtype=np.float64), so_far))
-    tracks += _info_tracks(recording, episode, read, notes)
-    if read < len(episode):
-        notes.append(f"Of its {len(episode):,} steps, the first {read:,} are shown.")
-    return Curves(tracks, read, notes)
+            if leaf.kind != "variable" and not leaf.apart:
+                yield field, leaf, np.asarray(leaf.get(values)).reshape(len(columns), leaf.size)
 
 
 def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:

@@ -11,6 +11,7 @@ from sqlalchemy import Connection, func, select
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
+from tupli_mcap.page.curves import numbers_of
 from tupli_mcap.page.datasets import Dataset, of_dataset
 from tupli_mcap.page.shelf import Shelf, seen_episodes
 from tupli_mcap.plots.statistics import LeafValues
@@ -130,22 +131,12 @@ def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array
     lengths = recording.index["length"][positions].astype(np.int64)
     fitting = max(1, int(np.searchsorted(np.cumsum(lengths), most, side="right")))
     positions, lengths = positions[:fitting], lengths[:fitting]
+    fields = ("states", "actions", "rewards")
     if len(positions) == 1 and lengths[0] > most:
-        columns = recording.read_steps(
-            int(positions[0]), 0, most, ("states", "actions", "rewards"), images=False
-        )
+        columns = recording.read_steps(int(positions[0]), 0, most, fields, images=False)
     else:
-        columns = recording.read(positions, ("states", "actions", "rewards"), images=False)
-    found = {}
-    for leaves, values in (
-        (layout.state, columns.states),
-        (layout.action, columns.actions),
-        (layout.reward, columns.rewards),
-    ):
-        for leaf in leaves:
-            if leaf.kind != "variable" and not leaf.apart:
-                column = np.asarray(leaf.get(values))
-                found[leaf.name] = column.reshape(len(column), leaf.size)
+        columns = recording.read(positions, fields, images=False)
+    found = {leaf.name: column for _, leaf, column in numbers_of(layout, columns)}
     return found, len(columns), len(positions)
 
 
