@@ -100,7 +100,7 @@ def start(program: Path, *arguments: str, log: IO[bytes] | int) -> subprocess.Po
         raise ViewerError(f"the viewer {program} cannot be run: {err.strerror or err}") from err
 
 
-def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path) -> None:
+def _wait_for(process: subprocess.Popen[bytes], ports: list[int], log: Path) -> None:
     """Returns once the viewer listens. ViewerError, which quotes its last output, if it ends before that, or takes
     longer than half a minute."""
     until = time.monotonic() + _PATIENCE
@@ -120,10 +120,19 @@ def wait_for_ports(process: subprocess.Popen[bytes], ports: list[int], log: Path
 
 
 @contextlib.contextmanager
-def scratch() -> Iterator[Path]:
-    """A temporary directory for the viewer's file and log."""
+def started(program: Path, ports: list[int], *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """The viewer's process, which listens at these ports; it is ended if the block fails. ViewerError if it does not
+    start."""
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
-        yield Path(folder)
+        path = Path(folder) / "log"
+        with path.open("wb") as log:
+            process = start(program, *arguments, log=log)
+        try:
+            _wait_for(process, ports, path)
+            yield process
+        except BaseException:
+            end(process)
+            raise
 
 
 @contextlib.contextmanager
@@ -132,13 +141,9 @@ def web_viewer(program: Path, *arguments: str) -> Iterator[tuple[subprocess.Pope
     does not start."""
     data, page = free_port(), free_port()
     ports = ["--serve-web", "--port", str(data), "--web-viewer-port", str(page)]
-    with scratch() as folder, (folder / "log").open("wb") as log:
-        process = start(program, *ports, *arguments, log=log)
-        try:
-            wait_for_ports(process, [data, page], folder / "log")
-            yield process, data, page
-        finally:
-            end(process)
+    with started(program, [data, page], *ports, *arguments) as process:
+        yield process, data, page
+        end(process)
 
 
 @contextlib.contextmanager

@@ -18,15 +18,12 @@ from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
     LOCAL,
-    end,
     free_port,
     has_display,
     run_quietly,
-    scratch,
-    start,
+    started,
     stopped_by_signals,
     viewer_program,
-    wait_for_ports,
     web_viewer,
 )
 from tupli_mcap.viewer.sdk import ViewerError
@@ -151,14 +148,9 @@ def to_window(plans: Iterable[Plan]) -> int:
             "--save FILE.rrd (viewer.save)"
         )
     port = free_port()
-    with scratch() as folder, (folder / "log").open("wb") as log:
-        process = start(program, "--port", str(port), "--hide-welcome-screen", "--expect-data-soon", log=log)
-        try:
-            wait_for_ports(process, [port], folder / "log")
-            to_viewer(plans, f"rerun+http://{LOCAL}:{port}/proxy")
-        except BaseException:
-            end(process)
-            raise
+    options = ["--port", str(port), "--hide-welcome-screen", "--expect-data-soon"]
+    with started(program, [port], *options) as process:
+        to_viewer(plans, f"rerun+http://{LOCAL}:{port}/proxy")
     process.returncode = 0  # keeps Popen from warning that the process still runs
     return process.pid
 
@@ -167,8 +159,8 @@ def to_browser(plans: Iterable[Plan], tell: Callable[[str], None]) -> None:
     """Serves the web viewer and the data on 127.0.0.1 until Ctrl-C; `tell` is called with the URL. ViewerError if there
     is no viewer program, or it does not start, or ends."""
     program = viewer_program()
-    with scratch() as folder, stopped_by_signals():
-        path = to_file(plans, folder / "replay.rrd")
+    with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder, stopped_by_signals():
+        path = to_file(plans, Path(folder) / "replay.rrd")
         with (
             contextlib.suppress(KeyboardInterrupt),
             web_viewer(program, "--server-memory-limit", "100%", str(path)) as (process, data, page),
