@@ -19,7 +19,7 @@ from tupli_mcap.page.routes import PAGES
 from tupli_mcap.server import pages
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages.session import shown
-from tupli_mcap.server.people.throttle import Turns
+from tupli_mcap.server.people.limits import Turns
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes import (
     accounts,

@@ -39,7 +39,7 @@ from tupli_mcap.server.database import (
     pending,
     settle,
 )
-from tupli_mcap.server.people import accounts, quotas, throttle
+from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
@@ -143,10 +143,10 @@ class Library:
         # Failures are counted by user and address: failures at another address must not lock the user out.
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
         with self.database.reading() as connection:
-            throttle.demand_few_failures(connection, most)
+            limits.demand_few_failures(connection, most)
             right = accounts.verify_password(connection, username, password)
         with self.database.writing() as connection:
-            throttle.note_attempt(connection, most, failed=not right)
+            limits.note_attempt(connection, most, failed=not right)
             if right:
                 return self.tokens.pair(connection, username)
         raise SignInError("Incorrect username or password")
@@ -159,7 +159,7 @@ class Library:
                 caller.demand(Right.USER_CREATE)
             most = {f"sign-up at {address}": _MOST_SIGN_UPS}
             with self.database.writing() as connection:
-                throttle.note_attempt(connection, most, failed=True)
+                limits.note_attempt(connection, most, failed=True)
         hashed = accounts.hash_password(password, self.settings.min_password)
         with self.database.writing() as connection:
             accounts.create_user(connection, name, hashed)
@@ -180,11 +180,11 @@ class Library:
         most = {f"{name} by {caller.sign_in}": _MOST_OF_A_USER}
         with self.database.reading() as connection:
             accounts.demand_over(connection, caller, name)
-            throttle.demand_few_failures(connection, most)
+            limits.demand_few_failures(connection, most)
             right = old is None or accounts.verify_password(connection, name, old)
         hashed = accounts.hash_password(password, self.settings.min_password) if right else ""
         with self.database.writing() as connection:
-            throttle.note_attempt(connection, most, failed=not right)
+            limits.note_attempt(connection, most, failed=not right)
             if right:
                 accounts.demand_over(connection, caller, name)
                 accounts.change_password(connection, name, hashed)
@@ -201,7 +201,7 @@ class Library:
                 return known
             most = self.settings.max_uploads
             found = self.uploads.begin(connection, caller, length, digest, sent_before=sent_before, most=most)
-            quotas.demand_room(connection, self.settings, caller, 0)  # the upload is counted already
+            limits.demand_room(connection, self.settings, caller, 0)  # the upload is counted already
         return found
 
     def take_in(self, caller: Caller, incoming: Incoming, file: str = "") -> str:
@@ -265,7 +265,7 @@ class Library:
             arrivals.demand_short(recording)
             with self.database.writing() as connection:
                 if room:
-                    quotas.demand_room(connection, self.settings, caller, room)
+                    limits.demand_room(connection, self.settings, caller, room)
                 # before it becomes part of a path: an id in a file may hold anything
                 arrivals.demand_benchmark(connection, caller, recording.benchmark_id)
                 place = arrivals.new_place(recording.benchmark_id, file)
@@ -275,7 +275,7 @@ class Library:
                 with self.database.writing() as connection:
                     demand_pending(connection, place)
                     if room:  # once more: what the user has sent at the same time may have taken it
-                        quotas.demand_room(connection, self.settings, caller, room)
+                        limits.demand_room(connection, self.settings, caller, room)
                     name, replaced = arrivals.register(
                         connection, caller, recording, place, digest, sent_before=sent_before
                     )
@@ -336,7 +336,7 @@ class Library:
         with self.database.writing() as connection:
             if self.items.has_artifact(connection, caller, data):
                 return self.items.store_artifact(connection, caller, data, metadata)
-            quotas.demand_room(connection, self.settings, caller, len(data))
+            limits.demand_room(connection, self.settings, caller, len(data))
         try:
             while True:
                 with self.database.writing() as connection:

@@ -21,7 +21,7 @@ from sqlalchemy import Connection, Row, delete, func, insert, select
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.people.quotas import FullError
+from tupli_mcap.server.people.limits import FullError
 from tupli_mcap.server.tables import UPLOAD
 from tupli_mcap.storage.atomic import os_errors
 

@@ -31,8 +31,7 @@ from tupli_mcap.server.blobs import LostError
 from tupli_mcap.server.database import TooLongError, UnavailableError
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
-from tupli_mcap.server.people.quotas import FullError
-from tupli_mcap.server.people.throttle import TooManyError
+from tupli_mcap.server.people.limits import FullError, TooManyError
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError

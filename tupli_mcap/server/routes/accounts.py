@@ -9,7 +9,7 @@ from pydantic import BaseModel, FailFast, Field
 
 from tupli_mcap.schema import Group, Right, UserRole
 from tupli_mcap.server.database import audit
-from tupli_mcap.server.people import accounts, quotas
+from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
 
@@ -118,8 +118,8 @@ def who_am_i(library: Served, caller: Reader) -> Me:
         return Me(
             username=caller.name,
             memberships=accounts.memberships_of(connection, caller.name),
-            used=quotas.used_by(connection, caller.name),
-            quota=quotas.quota_of(connection, library.settings, caller.name),
+            used=limits.used_by(connection, caller.name),
+            quota=limits.quota_of(connection, library.settings, caller.name),
         )
 
 
@@ -151,7 +151,7 @@ def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> No
     """Sets how much a user may store."""
     caller.demand(Right.USER_UPDATE)
     with library.database.writing() as connection:
-        quotas.set_quota(connection, username, told.bytes)
+        limits.set_quota(connection, username, told.bytes)
         audit(connection, caller.name, "set_quota", f"{username}: {told.bytes}")
 
 

@@ -37,7 +37,7 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, as_told
 from tupli_mcap.server.people.accounts import ConflictError
-from tupli_mcap.server.people.throttle import Turns
+from tupli_mcap.server.people.limits import Turns
 from tupli_mcap.server.routes.accounts import Credentials
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine

@@ -26,7 +26,7 @@ from tupli_mcap.schema import (
     compile_predicate,
 )
 from tupli_mcap.server.database import audience, audit, pend
-from tupli_mcap.server.people import quotas
+from tupli_mcap.server.people import limits
 from tupli_mcap.server.people.access import (
     Caller,
     DeniedError,
@@ -209,7 +209,7 @@ class Items:
     ) -> Sequence[Row[Any]]:
         header = json.dumps(plain(item))
         size += len(header)
-        quotas.demand_room(connection, self._settings, caller, size)
+        limits.demand_room(connection, self._settings, caller, size)
         row = {
             "kind": kind,
             "id": item.id,

@@ -1,5 +1,5 @@
-"""Limits failed sign-ins, and how many requests of a user are answered at a time. Functions that take a connection work
-in the transaction of their caller."""
+"""How often a sign-in may fail, how many requests of a user are answered at a time, and how much a user may store.
+Functions that take a connection work in the transaction of their caller."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from collections import Counter
 from collections.abc import AsyncIterable, AsyncIterator, Mapping
 from typing import Final, TypeVar
 
-from sqlalchemy import Connection, delete, func, insert, select
+from sqlalchemy import Connection, delete, func, insert, select, update
 
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import NotFoundError, StorageError, TupliError
 from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.tables import FAILURE
+from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.tables import FAILURE, FILE, ITEM, UPLOAD, USER
 from tupli_mcap.storage.texts import escape_text
 
 _SECONDS: Final = 60
@@ -88,3 +89,49 @@ def note_attempt(connection: Connection, most: Mapping[str, int], *, failed: boo
         now = int(time.time())
         connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
         connection.execute(insert(FAILURE), [{"key": escape_text(key), "time": now} for key in most])
+
+
+# --- quotas ---
+
+
+class FullError(StorageError):
+    """A user's quota is used up, or the server's disk is full."""
+
+
+def used_by(connection: Connection, user: str) -> int:
+    """The bytes that a user has stored, with the final sizes of unfinished uploads."""
+    sums = (
+        select(func.coalesce(func.sum(size), 0)).where(owner == user)
+        for size, owner in (
+            (FILE.c.size, FILE.c.created_by),
+            (ITEM.c.size, ITEM.c.created_by),
+            (UPLOAD.c.length, UPLOAD.c.user),
+        )
+    )
+    return sum(int(connection.execute(each).scalar_one()) for each in sums)
+
+
+def quota_of(connection: Connection, settings: Settings, user: str) -> int | None:
+    """How many bytes a user may store; None without a limit."""
+    own: int | None = connection.execute(select(USER.c.quota).where(USER.c.name == user)).scalar()
+    return settings.quota if own is None else own
+
+
+def set_quota(connection: Connection, user: str, size: int | None) -> None:
+    """Gives a user a quota of their own (bytes); None for the quota of the settings. NotFoundError if there is no such
+    user."""
+    if not connection.execute(update(USER).where(USER.c.name == user).values(quota=size)).rowcount:
+        raise NotFoundError("User does not exist")
+
+
+def demand_room(connection: Connection, settings: Settings, caller: Caller, size: int) -> None:
+    """Raises FullError if a caller may not store so many bytes more."""
+    allowed = quota_of(connection, settings, caller.name)
+    if allowed is None:
+        return
+    used = used_by(connection, caller.name)
+    if used + size > allowed:
+        raise FullError(
+            f"{caller.name} may store {allowed} bytes, uses {used}, and cannot store {size} more; delete something, "
+            "or ask the server's admin for a larger quota"
+        )
