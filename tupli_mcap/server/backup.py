@@ -58,32 +58,33 @@ def back_up(settings: Settings, target: Path) -> Copied:
         StorageError: there is no data of a server, the directory holds something else, or a file cannot be read.
         FormatError: a file does not have the SHA-256 in the database.
     """
-    place, kept = _place_of(settings), _place_of(Settings(target))
-    if not settings.database and not place.sqlite.exists():
+    source_blobs, target_blobs = blobs_of(settings), blobs_of(Settings(target))
+    sqlite = _sqlite_of(target)
+    if not settings.database and not _sqlite_of(settings.directory).exists():
         raise StorageError(
             f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
         )
-    new = kept.sqlite.with_name("server.sqlite.new")  # also what an interrupted backup has left
-    if target.exists() and any(target.iterdir()) and not (kept.sqlite.exists() or new.exists()):
+    new = sqlite.with_name("server.sqlite.new")  # also what an interrupted backup has left
+    if target.exists() and any(target.iterdir()) and not (sqlite.exists() or new.exists()):
         raise StorageError(
             f"expected a backup or nothing in {str(target)!r}, found other files; choose another directory"
         )
-    kept.sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with contextlib.closing(Database(place.database, _UNLIMITED)) as source:
+    sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with contextlib.closing(Database(settings.database_url, _UNLIMITED)) as source:
         for attempt in range(_ATTEMPTS):
             remove_database(new)
             with contextlib.closing(Database(f"sqlite:///{new}", _UNLIMITED)) as made:
                 _copy_tables(source, made)
                 contents = _contents(made)
             try:
-                copied = _copy_files(contents, place.blobs, kept.blobs, kept.sqlite.parent)
+                copied = _copy_files(contents, source_blobs, target_blobs, sqlite.parent)
                 break
             except LostError:
                 if attempt == _ATTEMPTS - 1:
                     raise
     for suffix in ("-wal", "-shm"):
-        kept.sqlite.with_name(kept.sqlite.name + suffix).unlink(missing_ok=True)
-    new.replace(kept.sqlite)
+        sqlite.with_name(sqlite.name + suffix).unlink(missing_ok=True)
+    new.replace(sqlite)
     known = {target / name for name in contents.files}
     for path in [*(target / "artifacts").rglob("*"), *(target / "recordings").rglob("*")]:
         if path.is_file() and path not in known:
@@ -94,33 +95,27 @@ def back_up(settings: Settings, target: Path) -> Copied:
 def restore(backup: Path, settings: Settings) -> Copied:
     """Restores a backup into empty places. After an interruption, call it again. StorageError if there is no backup, or
     the target holds data already; FormatError if a file of the backup is damaged."""
-    kept, place = _place_of(Settings(backup)), _place_of(settings)
-    if not kept.sqlite.exists():
+    source_blobs, target_blobs = blobs_of(Settings(backup)), blobs_of(settings)
+    if not _sqlite_of(backup).exists():
         raise StorageError(f"expected the backup of a server in {str(backup)!r}, found none; check the path")
     settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))
         # a copy, because opening it upgrades the tables of an earlier version
         copy = folder / "server.sqlite"
-        shutil.copyfile(kept.sqlite, copy)
+        shutil.copyfile(_sqlite_of(backup), copy)
         source = stack.enter_context(contextlib.closing(Database(f"sqlite:///{copy}", _UNLIMITED)))
-        target = stack.enter_context(contextlib.closing(Database(place.database, _UNLIMITED)))
+        target = stack.enter_context(contextlib.closing(Database(settings.database_url, _UNLIMITED)))
         with target.reading() as connection:
             if connection.execute(select(USER.c.name)).first():
                 raise StorageError("the target holds a server's data already; restore into an empty place")
-        copied = _copy_files(_contents(source), kept.blobs, place.blobs, folder)
+        copied = _copy_files(_contents(source), source_blobs, target_blobs, folder)
         _copy_tables(source, target)
     return copied
 
 
-class _Place(NamedTuple):
-    database: str
-    sqlite: Path
-    blobs: Blobs
-
-
-def _place_of(settings: Settings) -> _Place:
-    return _Place(settings.database_url, settings.own / "server.sqlite", blobs_of(settings))
+def _sqlite_of(directory: Path) -> Path:
+    return Settings(directory).own / "server.sqlite"
 
 
 # --- tables ---
