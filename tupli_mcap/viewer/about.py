@@ -17,6 +17,7 @@ from tupli_mcap.recording.describe.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import plain, title_of
 from tupli_mcap.viewer.panels import PALETTE
+from tupli_mcap.viewer.sdk import pa, rr
 from tupli_mcap.viewer.sending import column_of, pooled, tensor_array
 
 _MOST_BARS = 1000
@@ -32,8 +33,6 @@ def send_about(
 ) -> None:
     """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`. The bars
     of the `chosen` ones are marked."""
-    import rerun as rr
-
     texts = [card(recording) for recording in recordings[:_MOST_CARDS]]
     if len(recordings) > _MOST_CARDS:
         texts.append(f"and {len(recordings) - _MOST_CARDS:,} more recordings")
@@ -43,8 +42,6 @@ def send_about(
     notes = f"\n\n**Not shown**\n{missing}" if unseen else ""
     document = rr.TextDocument(f"{shown}\n\n" + "\n\n".join(texts) + notes, media_type=rr.MediaType.MARKDOWN)
     stream.log("/card", document, static=True)
-    import pyarrow as pa
-
     for name in ("return", "length"):
         values = np.concatenate([recording.index[name] for recording in recordings]).astype(np.float64)
         number = rr.TimeColumn("episode", sequence=np.arange(len(values)))
@@ -58,8 +55,6 @@ def send_about(
 
 def _marks(recordings: Sequence[Recording], chosen: Sequence[Chosen]) -> Any:
     """Bars of the chosen episodes in front of the others, wide enough to be seen among many."""
-    import rerun as rr
-
     sizes = [len(recording.index) for recording in recordings]
     first = dict(zip(map(id, recordings), np.cumsum([0, *sizes]).tolist(), strict=False))
     pairs = [(item.recording, position) for item in chosen for position in item.positions]
@@ -73,8 +68,6 @@ def _marks(recordings: Sequence[Recording], chosen: Sequence[Chosen]) -> Any:
 
 def _bars(values: Any) -> Any:
     """At most a thousand bars, means of neighbours if there are more values; NaN and infinities count as 0."""
-    import rerun as rr
-
     finite = np.where(np.isfinite(values), values, 0.0)
     if len(finite) <= _MOST_BARS:
         return rr.BarChart(tensor_array([finite], ["episode"]), color=_BAR)

@@ -7,6 +7,7 @@ from typing import Any
 
 from tupli_mcap.viewer.panels import Camera, Grid, HeatMap, Infos, Lanes, Panel, Picture, Series, Words
 from tupli_mcap.viewer.scene import Scene
+from tupli_mcap.viewer.sdk import rrb
 
 _STACKED, _A_PAGE = 4, 12
 _WINDOW = 500  # rows that are shown of a running rollout
@@ -24,8 +25,6 @@ def blueprint_of(
 ) -> Any:
     """The blueprint of a scene whose panels are below each of `roots`. listed: whether the list of recordings is open.
     overview: whether the returns of all episodes are at the top."""
-    import rerun.blueprint as rrb
-
     axis = _newest() if scene.grows else _time_axis(linked=scene.linked)
     pictures = [panel for panel in scene.beside if isinstance(panel, Picture | Camera)]
     beside = [panel for panel in scene.beside if not isinstance(panel, Picture | Camera)]
@@ -65,16 +64,12 @@ def blueprint_of(
 
 def _pictures(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> Any:
     """Images and cameras beside each other."""
-    import rerun.blueprint as rrb
-
     views = [panel.view(roots, axis) for panel in panels]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name="pictures")
 
 
 def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) -> Any:
     """Views below each other; many views in two columns, and on several pages. Heat maps and their lines come last."""
-    import rerun.blueprint as rrb
-
     maps = [panel for panel in panels if isinstance(panel, HeatMap)]
     wide = {panel.leaf.path for panel in maps}
     lines = [panel for panel in panels if isinstance(panel, Series) and panel.leaf.path in wide]
@@ -95,8 +90,6 @@ def _stack(panels: Sequence[Panel], roots: Sequence[str], axis: Any, name: str) 
 
 def _below(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> list[tuple[Any, float]]:
     """Views and their shares of the height; in two columns where they would be flat below each other."""
-    import rerun.blueprint as rrb
-
     views = [panel.view(roots, axis) for panel in panels]
     if len(views) <= _STACKED:
         return [(view, _height(panel, len(roots))) for view, panel in zip(views, panels, strict=True)]
@@ -104,8 +97,6 @@ def _below(panels: Sequence[Panel], roots: Sequence[str], axis: Any) -> list[tup
 
 
 def _column(views: Sequence[tuple[Any, float]], name: str | None = None) -> Any:
-    import rerun.blueprint as rrb
-
     return rrb.Vertical(*(view for view, _ in views), row_shares=[share for _, share in views], name=name)
 
 
@@ -125,8 +116,6 @@ def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
 
 def _time_axis(*, linked: bool) -> Any:
     """The time axis of plots: if linked, plots move together; else each shows all its rows."""
-    import rerun.blueprint as rrb
-
     if linked:
         return rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
     forever = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
@@ -135,8 +124,6 @@ def _time_axis(*, linked: bool) -> Any:
 
 def _newest() -> Any:
     """The time axis of growing plots: the last rows before the cursor, which follows the newest row."""
-    import rerun.blueprint as rrb
-
     window = rrb.TimeRange(
         start=rrb.TimeRangeBoundary.cursor_relative(seq=-_WINDOW),
         end=rrb.TimeRangeBoundary.cursor_relative(),

@@ -7,18 +7,17 @@ import zlib
 from collections.abc import Sequence
 
 from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.viewer.sdk import rr
 
 _LONGEST = 80  # characters of a part of an entity path
 
 
 def escaped(text: str) -> str:
     """Any text as one part of an entity path. A text that must be cut or changed gets a checksum, to stay unique."""
-    import rerun
-
     shown = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text[:_LONGEST])
     if shown != text:
         shown += f"~{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"
-    return str(rerun.escape_entity_path_part(shown or "_"))
+    return str(rr.escape_entity_path_part(shown or "_"))
 
 
 def entity_of(leaf: Leaf) -> str:

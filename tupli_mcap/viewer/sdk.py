@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import re
 import sys
 from types import ModuleType
@@ -31,6 +32,21 @@ def rerun_sdk() -> Any:
             f"expected rerun-sdk {oldest} or later, found {version or 'another package'}", "rerun"
         )
     return rerun
+
+
+class _Lazy:
+    """A module that is imported when something of it is used: it is optional, and takes long to import."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, attribute: str) -> Any:
+        return getattr(importlib.import_module(self._name), attribute)
+
+
+rr: Any = _Lazy("rerun")
+rrb: Any = _Lazy("rerun.blueprint")
+pa: Any = _Lazy("pyarrow")
 
 
 class _NoPandas:

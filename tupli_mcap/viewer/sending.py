@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.viewer.sdk import pa, rr
 
 
 class Times:
@@ -26,8 +27,6 @@ class Times:
 
     @cached_property
     def columns(self) -> list[Any]:
-        import rerun as rr
-
         columns = [
             rr.TimeColumn("step", sequence=self._step),
             rr.TimeColumn("time", timestamp=self._wall.astype("datetime64[ns]")),
@@ -79,17 +78,12 @@ class _Batch:
 
 def column_of(descriptor: Any, array: Any, width: int = 1) -> Any:
     """A component's column from an Arrow array (rows * width values)."""
-    import rerun as rr
-
     offsets = np.arange(0, len(array) + 1, width, dtype=np.int32)
     return rr.ComponentColumn(descriptor, _Batch(array), offsets=offsets)
 
 
 def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
     """Sends `values` (rows x width), one batch a row."""
-    import pyarrow as pa
-    import rerun as rr
-
     # the SDK aborts the process if an array is not contiguous or not aligned
     flat = np.require(values, np.float64, ("C", "ALIGNED")).reshape(-1)
     column = column_of(rr.Scalars.descriptor_scalars(), pa.array(flat), values.shape[1])
@@ -98,8 +92,6 @@ def send_scalars(stream: Any, entity: str, times: Times, values: Array) -> None:
 
 def send_texts(stream: Any, entity: str, times: Times, descriptor: Any, texts: Sequence[str | None]) -> None:
     """Sends one text a row; None is an empty one."""
-    import pyarrow as pa
-
     array = pa.array(texts, pa.utf8())
     stream.send_columns(entity, times.columns, [column_of(descriptor, array)])
 
@@ -113,8 +105,6 @@ def send_blobs(stream: Any, entity: str, times: Times, descriptor: Any, values: 
 
 def blob_array(data: Array, ends: Array) -> Any:
     """Cuts bytes into blobs. They must be declared as never null, or the viewer does not show them."""
-    import pyarrow as pa
-
     blob = pa.list_(pa.field("item", pa.uint8(), nullable=False))
     return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), pa.array(data), type=blob)
 
@@ -123,8 +113,6 @@ def send_tensors(
     stream: Any, entity: str, times: Times, values: Sequence[Array], names: Sequence[str]
 ) -> None:
     """Sends one tensor a row; for `values` and `names`, see `tensor_array`."""
-    import rerun as rr
-
     column = column_of(rr.Tensor.descriptor_data(), tensor_array(values, names))
     stream.send_columns(entity, times.columns, [column])
 
@@ -134,8 +122,6 @@ def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
 
     Made without a cast, since the first cast of a process makes pyarrow load its compute functions.
     """
-    import pyarrow as pa
-
     rows = len(values)
     goal = _tensor_type()
     fields = [goal.field(i) for i in range(goal.num_fields)]  # shape, names, buffer
@@ -154,15 +140,11 @@ def tensor_array(values: Sequence[Array], names: Sequence[str]) -> Any:
 
 @cache
 def _tensor_type() -> Any:
-    import rerun as rr
-
     return rr.components.TensorDataBatch(None).as_arrow_array().type
 
 
 def _tensor_buffers(values: Sequence[Array], union: Any) -> Any:
     """The buffers of tensors, a dense union of lists with one child for each dtype."""
-    import pyarrow as pa
-
     kind = {"float32": "F32", "float64": "F64", "int64": "I64", "uint8": "U8"}[values[0].dtype.name]
     ends = pa.array(np.cumsum([0, *(value.size for value in values)]).astype(np.int32))
     data = pa.array(np.concatenate([value.reshape(-1) for value in values]))

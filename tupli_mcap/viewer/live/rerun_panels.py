@@ -20,6 +20,7 @@ from tupli_mcap.viewer.live.rerun_env import MOST_INFOS, LiveEnv, columns_of
 from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.panels import PALETTE, Place, numbers_in
 from tupli_mcap.viewer.scene import live_scene
+from tupli_mcap.viewer.sdk import rr
 from tupli_mcap.viewer.sending import tensor_array
 
 _SAMPLE = 100  # steps that are looked at to decide which panels there are, and which dimensions share an axis
@@ -117,8 +118,6 @@ class LivePanels:
                 env.catch_up(end)
 
     def _send_overview(self, stream: Any, follower: Follower) -> None:
-        import rerun as rr
-
         state = "recorded" if follower.is_over else "being recorded"
         lines = [f"### {plain(self._title)}", "", state, ""]
         if follower.episodes:

@@ -13,6 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels.panel import LeafPanel, Place, flat_values, named
+from tupli_mcap.viewer.sdk import pa, rr, rrb
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
 _MOST_COLUMNS, _MOST_ROWS = 2048, 512  # of a heat map; more are pooled
@@ -40,8 +41,6 @@ class Picture(LeafPanel):
     white: float = 255.0
 
     def declare(self, place: Place) -> None:
-        import rerun as rr
-
         height, width, channels = self._tiled(np.empty((1, *self.leaf.shape), np.uint8)).shape[1:]
         model = {1: rr.ColorModel.L, 3: rr.ColorModel.RGB, 4: rr.ColorModel.RGBA}[channels]
         form = rr.components.ImageFormat(width, height, color_model=model, channel_datatype="U8")
@@ -50,8 +49,6 @@ class Picture(LeafPanel):
         place.stream.log(place.root + self.entity, image, static=True)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import rerun as rr
-
         pictures = self._tiled(self._bytes(self.leaf.get(getattr(block.columns, self.column))))
         values = np.ascontiguousarray(pictures).reshape(len(pictures), -1)
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
@@ -191,9 +188,6 @@ class Camera:
 
     def send_frames(self, place: Place, frames: Sequence[EncodedFrame], times: Times) -> None:
         """Sends one frame a row."""
-        import pyarrow as pa
-        import rerun as rr
-
         ends = np.cumsum([0, *(len(frame.data) for frame in frames)])
         blobs = blob_array(np.frombuffer(b"".join(frame.data for frame in frames), np.uint8), ends)
         kinds = pa.array([f"image/{frame.form}" for frame in frames], pa.utf8())
@@ -208,15 +202,11 @@ class Camera:
 
 
 def _side_by_side(title: str, roots: Sequence[str], entity: str) -> Any:
-    import rerun.blueprint as rrb
-
     views = [rrb.Spatial2DView(name=named(title, root), origin=root + entity) for root in roots]
     return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
 
 
 def _tensors(title: str, roots: Sequence[str], entity: str) -> Any:
-    import rerun.blueprint as rrb
-
     colors = rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest")
     views = [
         rrb.TensorView(name=named(title, root), origin=root + entity, scalar_mapping=colors, view_fit="fill")

@@ -12,6 +12,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.panels.panel import LeafPanel, Place, flat_values, plot, send_lines
+from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 _ENDS: Mapping[str, int] = {"terminal": 0xE4572EFF, "timeout": 0xF3A712FF, "interrupted": 0x9A9A9AFF}
@@ -55,12 +56,10 @@ class Rewards:
     _running: float = 0.0  # the return of an episode that goes on in the next block
 
     def declare(self, place: Place) -> None:
-        import rerun as rr
-        from rerun.components import MarkerShape
-
         for name, color in (("reward", 6), ("return", 2)):
             place.declare_series(f"/{name}", [place.series_name(name, alone=True)], place.colors(1, color))
-        shapes = (MarkerShape.Cross, MarkerShape.Diamond, MarkerShape.Square)
+        shape_of = rr.components.MarkerShape
+        shapes = (shape_of.Cross, shape_of.Diamond, shape_of.Square)
         for (name, color), shape in zip(_ENDS.items(), shapes, strict=True):
             points = rr.SeriesPoints(
                 names=[name], colors=np.array([color], np.uint32), markers=[shape], marker_sizes=[5.0]
@@ -107,8 +106,6 @@ class Rewards:
         return returns
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        import rerun.blueprint as rrb
-
         ends = [f"{root}/end/{name}" for root in roots for name in _ENDS]
         return rrb.Vertical(
             plot("return", [*(f"{root}/return" for root in roots), *ends], axis),

@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
+from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars
 
 PALETTE: Final = (
@@ -49,12 +50,9 @@ class Place(NamedTuple):
         self, entity: str, names: Sequence[str], colors: Array, *, stepped: bool = False
     ) -> None:
         """Says how to draw the scalars of an entity: as lines, or a single row as points."""
-        import rerun as rr
-        from rerun.components import AggregationPolicy, InterpolationMode, MarkerShape
-
         style: Any
         if self.single:
-            shapes = [MarkerShape.Circle] * len(names)
+            shapes = [rr.components.MarkerShape.Circle] * len(names)
             style = rr.SeriesPoints(
                 names=names, colors=colors, markers=shapes, marker_sizes=[4.0] * len(names)
             )
@@ -62,8 +60,8 @@ class Place(NamedTuple):
             style = rr.SeriesLines(
                 names=names,
                 colors=colors,
-                interpolation_mode=InterpolationMode.StepAfter if stepped else None,
-                aggregation_policy=AggregationPolicy.MinMax,
+                interpolation_mode=rr.components.InterpolationMode.StepAfter if stepped else None,
+                aggregation_policy=rr.components.AggregationPolicy.MinMax,
             )
         self.stream.log(self.root + entity, style, static=True)
 
@@ -125,8 +123,6 @@ def named(title: str, root: str) -> str:
 
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
     """A view of series over time, without a legend if that would only repeat the title."""
-    import rerun.blueprint as rrb
-
     return rrb.TimeSeriesView(
         name=title,
         origin="/",

@@ -13,6 +13,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
 from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, Place, named, plot
+from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
 _LONGEST = 2000  # characters of a text that is shown
@@ -26,15 +27,11 @@ class Lanes(LeafPanel):
     labels: Sequence[str]  # of the values from `start` on
 
     def declare(self, place: Place) -> None:
-        import rerun as rr
-
         colors = np.resize(np.array(PALETTE, np.uint32), len(self.labels))
         style = rr.StateConfiguration(values=list(self.labels), labels=list(self.labels), colors=colors)
         place.stream.log(place.root + self.entity, style, static=True)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import rerun as rr
-
         values = self.leaf.get(getattr(block.columns, self.column)).astype(np.int64)
         changed = np.ones(len(values), np.bool_)
         changed[1:] = values[1:] != values[:-1]
@@ -53,8 +50,6 @@ class Lanes(LeafPanel):
         send_texts(place.stream, place.root + self.entity, at, rr.StateChange.descriptor_state(), texts)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        import rerun.blueprint as rrb
-
         return rrb.StateTimelineView(
             name=self.title,
             origin="/",
@@ -68,8 +63,6 @@ class Words(LeafPanel):
     """A leaf of variable size: a text as it is, anything else as Python would print it."""
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import rerun as rr
-
         values = self.leaf.get(getattr(block.columns, self.column))
         texts = [_shown(value) for value in values]
         entity = place.root + self.entity
@@ -82,8 +75,6 @@ class Words(LeafPanel):
 
 def _texts(title: str, roots: Sequence[str], entity: str) -> Any:
     """The text of the moment below each root, and all of them in a log."""
-    import rerun.blueprint as rrb
-
     moments = [rrb.TextDocumentView(name=named(title, root), origin=root + entity) for root in roots]
     log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=[root + entity for root in roots])
     return rrb.Tabs(*moments, log, name=title)
@@ -109,8 +100,6 @@ class Infos:
             place.declare_series(entity, [place.series_name(key, alone=False)], place.colors(1, i))
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        import rerun as rr
-
         pairs_of: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
         seams = set(times.seams)
         breaking: set[str] = set()  # keys whose next value is of another episode than the one before
@@ -141,8 +130,6 @@ class Infos:
                 )
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        import rerun.blueprint as rrb
-
         views = []
         if self.numbers:
             views.append(
