@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from tupli_mcap import files
 from tupli_mcap.errors import StorageError
@@ -127,63 +127,55 @@ class BucketBlobs:
         self._store, self._prefix = open_store(self._url)
         # Some calls happen within a write transaction, which blocks all others: they must not wait for long.
         self._quick, _ = open_store(self._url, within=_QUICK)
+        import obstore  # which `open_store` has found
+        from obstore.exceptions import NotFoundError
+
+        self._obstore: Any = obstore
+        self._missing = NotFoundError, FileNotFoundError
 
     def write(self, name: str, data: bytes) -> None:
-        import obstore
-
         with self._asked(name):
-            obstore.put(self._store, self._key(name), data, max_concurrency=_AT_ONCE)
+            self._obstore.put(self._store, self._key(name), data, max_concurrency=_AT_ONCE)
 
     def keep(self, name: str, path: Path) -> None:
-        import obstore
-
+        options = {"chunk_size": 2 * PIECE, "max_concurrency": _AT_ONCE}
         with self._asked(name):
-            obstore.put(self._store, self._key(name), path, chunk_size=2 * PIECE, max_concurrency=_AT_ONCE)
+            self._obstore.put(self._store, self._key(name), path, **options)
 
     def place(self, name: str) -> str:
         return f"{self._url}/{name}"
 
     def size(self, name: str) -> int | None:
-        import obstore
-        from obstore.exceptions import NotFoundError
-
         with self._asked(name):
             try:
-                return int(obstore.head(self._quick, self._key(name))["size"])
-            except (NotFoundError, FileNotFoundError):
+                return int(self._obstore.head(self._quick, self._key(name))["size"])
+            except self._missing:
                 return None
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
-        import obstore
-
         with self._asked(name):
-            return bytes(obstore.get_range(self._store, self._key(name), start=start, end=stop))
+            return bytes(self._obstore.get_range(self._store, self._key(name), start=start, end=stop))
 
     def delete(self, name: str) -> None:
-        import obstore
-        from obstore.exceptions import NotFoundError
-
-        with self._asked(name), contextlib.suppress(NotFoundError, FileNotFoundError):
-            obstore.delete(self._quick, self._key(name))
+        with self._asked(name), contextlib.suppress(*self._missing):
+            self._obstore.delete(self._quick, self._key(name))
 
     def signed(self, name: str, seconds: int) -> str:
         """A URL with which everybody can read a name for so many seconds."""
-        import obstore
-
         with self._asked(name):
-            made = obstore.sign(self._store, "GET", self._key(name), timedelta(seconds=seconds))
-        return str(made)
+            within = timedelta(seconds=seconds)
+            return str(self._obstore.sign(self._store, "GET", self._key(name), within))
 
     def _key(self, name: str) -> str:
         return f"{self._prefix}/{name}" if self._prefix else name
 
     @contextlib.contextmanager
     def _asked(self, name: str) -> Iterator[None]:
-        from obstore.exceptions import BaseError, NotFoundError
+        from obstore.exceptions import BaseError
 
         try:
             yield
-        except (NotFoundError, FileNotFoundError) as err:
+        except self._missing as err:
             raise LostError(f"the server has lost {name}; restore it from a backup") from err
         except (BaseError, OSError, ValueError) as err:
             raise UnavailableError(f"{shown(self.place(name))} cannot be used: {why(str(err))}") from err
