@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
-from tupli_mcap.cli.output import Column, counted, number, print_json, print_table, print_wrapped, short_ids
+from tupli_mcap.cli.output import Column, counted, number, print_json, print_rows, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
 
 if TYPE_CHECKING:
@@ -126,12 +126,10 @@ def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, float]]:
 def _print_checks(as_json: bool) -> None:
     from tupli_mcap.doctor import CHECKS
 
-    if as_json:
-        fields = ("id", "summary", "explanation", "thresholds")
-        print_json([{name: getattr(check, name) for name in fields} for check in CHECKS.values()])
-        return
+    fields = ("id", "summary", "explanation", "thresholds")
+    told = [{name: getattr(check, name) for name in fields} for check in CHECKS.values()]
     rows = [(check.id, check.summary) for check in CHECKS.values()]
-    print_table((Column("CHECK"), Column("FINDS", shrink="end")), rows, empty="")
+    print_rows(told, (Column("CHECK"), Column("FINDS", shrink="end")), rows, empty="", as_json=as_json)
 
 
 def _print(diagnosis: Diagnosis, level: Severity) -> None:

@@ -32,6 +32,7 @@ from tupli_mcap.cli.output import (
     print_facts,
     print_json,
     print_result,
+    print_rows,
     print_table,
     print_wrapped,
 )
@@ -101,16 +102,14 @@ def split(
             f"expected one recording, found {len(found)} at {shown_name(source)}; give one of them"
         )
     parts = split_recording(found[0], output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
-    if as_json:
-        print_json({"dry_run": dry_run, "recordings": parts})
-        return
     columns = (
         Column("WOULD WRITE" if dry_run else "RECORDING", shrink="start"),
         Column("EPISODES", "right"),
         Column("STEPS", "right"),
     )
     rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
-    print_table(columns, rows, empty="nothing to split")
+    told = {"dry_run": dry_run, "recordings": parts}
+    print_rows(told, columns, rows, empty="nothing to split", as_json=as_json)
 
 
 def tag(

@@ -122,6 +122,16 @@ def print_result(result: Any, *lines: str, as_json: bool) -> None:
         say(*lines)
 
 
+def print_rows(
+    result: Any, columns: Sequence[Column], rows: Iterable[Sequence[str]], *, empty: str, as_json: bool
+) -> None:
+    """Print the result of a command as JSON, or as a table."""
+    if as_json:
+        print_json(result)
+    else:
+        print_table(columns, rows, empty=empty)
+
+
 def print_json_error(kind: str, message: str, exit_code: int) -> None:
     """Print an error as one JSON document, `{"version", "command", "error"}`, unless one was printed before."""
     if not _document.printed:

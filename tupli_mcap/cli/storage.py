@@ -37,6 +37,7 @@ from tupli_mcap.cli.output import (
     print_facts,
     print_json,
     print_result,
+    print_rows,
     print_table,
     short_ids,
     when,
@@ -65,9 +66,6 @@ def list_benchmarks(
     """
     with any_storage(place) as storage:
         headers = storage.list_benchmarks(filter_of(filter_text))
-    if as_json:
-        print_json([header.model_dump() for header in headers])
-        return
     roomy = is_roomy()
     columns = (
         Column("ID"),
@@ -88,7 +86,7 @@ def list_benchmarks(
         )
         for h in headers
     ]
-    print_table(columns, rows, empty="no benchmarks")
+    print_rows([h.model_dump() for h in headers], columns, rows, empty="no benchmarks", as_json=as_json)
 
 
 def list_artifacts(
@@ -105,9 +103,6 @@ def list_artifacts(
     """
     with any_storage(place) as storage:
         items = storage.list_artifacts(filter_of(filter_text))
-    if as_json:
-        print_json([item.model_dump() for item in items])
-        return
     columns = (
         Column("ID"),
         Column("NAME", shrink="end"),
@@ -115,7 +110,7 @@ def list_artifacts(
         Column("DESCRIPTION", shrink="end"),
     )
     rows = [(short_ids(item.id), item.name, when(item.created_at), item.description) for item in items]
-    print_table(columns, rows, empty="no artifacts")
+    print_rows([item.model_dump() for item in items], columns, rows, empty="no artifacts", as_json=as_json)
 
 
 def list_episodes(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import Json, Url, server_at
-from tupli_mcap.cli.output import Column, print_facts, print_json, print_result, print_table, when
+from tupli_mcap.cli.output import Column, print_facts, print_json, print_result, print_rows, when
 from tupli_mcap.cli.terminal import confirmed
 from tupli_mcap.errors import StorageError
 
@@ -26,12 +26,10 @@ def list_users(url: Url = None, as_json: Json = False) -> None:
     """List the users of a server, and their groups."""
     with server_at(url) as client:
         users = client.list_users()
-    if as_json:
-        held = [{membership.group: membership.roles for membership in user.memberships} for user in users]
-        print_json([{"username": u.username, "memberships": m} for u, m in zip(users, held, strict=True)])
-        return
-    groups = {u.username: ", ".join(m.group for m in u.memberships if m.group != u.username) for u in users}
-    print_table((Column("USER"), Column("GROUPS", shrink="end")), list(groups.items()), empty="no users")
+    told = [{"username": u.username, "memberships": {m.group: m.roles for m in u.memberships}} for u in users]
+    rows = [(u.username, ", ".join(m.group for m in u.memberships if m.group != u.username)) for u in users]
+    columns = (Column("USER"), Column("GROUPS", shrink="end"))
+    print_rows(told, columns, rows, empty="no users", as_json=as_json)
 
 
 def delete_user(
@@ -59,11 +57,9 @@ def list_groups(url: Url = None, as_json: Json = False) -> None:
     """List the groups of a server that you may see."""
     with server_at(url) as client:
         groups = client.list_groups()
-    if as_json:
-        print_json([group.model_dump() for group in groups])
-        return
     rows = [(group.name, group.description or "") for group in groups]
-    print_table((Column("GROUP"), Column("DESCRIPTION", shrink="end")), rows, empty="no groups")
+    columns = (Column("GROUP"), Column("DESCRIPTION", shrink="end"))
+    print_rows([each.model_dump() for each in groups], columns, rows, empty="no groups", as_json=as_json)
 
 
 def read_group(group: Group, url: Url = None, as_json: Json = False) -> None:
@@ -126,12 +122,10 @@ def list_roles(url: Url = None, as_json: Json = False) -> None:
     """List the roles on a server, and their rights."""
     with server_at(url) as client:
         roles = client.list_roles()
-    if as_json:
-        print_json([role.model_dump(mode="json") for role in roles])
-        return
+    told = [role.model_dump(mode="json") for role in roles]
     rows = [(role.role, ", ".join(role.rights), role.description or "") for role in roles]
     columns = (Column("ROLE"), Column("RIGHTS", shrink="end"), Column("DESCRIPTION", shrink="end"))
-    print_table(columns, rows, empty="no roles")
+    print_rows(told, columns, rows, empty="no roles", as_json=as_json)
 
 
 def create_role(
@@ -170,15 +164,13 @@ def list_tokens(url: Url = None, as_json: Json = False) -> None:
     """List your tokens for machines."""
     with server_at(url) as client:
         tokens = client.list_tokens()
-    if as_json:
-        print_json([token.model_dump(exclude={"token"}) for token in tokens])
-        return
+    told = [token.model_dump(exclude={"token"}) for token in tokens]
     columns = (Column("ID"), Column("NAME", shrink="end"), Column("MAY"), Column("MADE"), Column("EXPIRES"))
     rows = [
         (t.id, t.name, t.scope, when(t.created_at), "never" if t.expires is None else when(t.expires))
         for t in tokens
     ]
-    print_table(columns, rows, empty="no tokens")
+    print_rows(told, columns, rows, empty="no tokens", as_json=as_json)
 
 
 def create_token(
