@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -377,25 +378,22 @@ def _print_recovery(report: RecoveryReport) -> None:
                 if lost.episode == episode
             ]
             rows.append((str(episode), ", ".join(steps), ", ".join(pieces.get(episode, [])) or "nothing"))
-        say("")
-        columns = (
-            Column("EPISODE", "right"),
-            Column("STEPS LOST", shrink="end"),
-            Column("KEPT AS", shrink="end"),
+        _print_some(
+            [Column("EPISODE", "right"), Column("STEPS LOST", shrink="end"), Column("KEPT AS", shrink="end")],
+            rows,
         )
-        print_table(columns, rows[:_SHOWN], empty="")
-        _print_rest(len(rows))
     if report.damaged:
-        say("")
-        columns = (Column("OFFSET", "right"), Column("SIZE", "right"), Column("DAMAGE", shrink="end"))
         places = [(str(place.offset), bytes_of(place.size), place.why) for place in report.damaged]
-        print_table(columns, places[:_SHOWN], empty="")
-        _print_rest(len(places))
+        _print_some(
+            [Column("OFFSET", "right"), Column("SIZE", "right"), Column("DAMAGE", shrink="end")], places
+        )
 
 
-def _print_rest(count: int) -> None:
-    if count > _SHOWN:
-        say(f"... and {number(count - _SHOWN)} more; see --json")
+def _print_some(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
+    say("")
+    print_table(columns, rows[:_SHOWN], empty="")
+    if len(rows) > _SHOWN:
+        say(f"... and {number(len(rows) - _SHOWN)} more; see --json")
 
 
 def _summary(report: RecoveryReport) -> str:
@@ -406,14 +404,11 @@ def _summary(report: RecoveryReport) -> str:
         also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
         return f"{report.source}: {lost} could be saved{also}"
     what = f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}"
-    state = (
-        "nothing was wrong with it" if report.intact else "nothing was lost" if _lost_nothing(report) else ""
-    )
-    return f"{report.source}: {what} {where}" + (f"; {state}" if state else "")
-
-
-def _lost_nothing(report: RecoveryReport) -> bool:
-    return not _losses(report) and report.journal in ("none", "used") and not report.notes
+    if report.intact:
+        return f"{report.source}: {what} {where}; nothing was wrong with it"
+    if not _losses(report) and report.journal in ("none", "used") and not report.notes:
+        return f"{report.source}: {what} {where}; nothing was lost"
+    return f"{report.source}: {what} {where}"
 
 
 def _losses(report: RecoveryReport) -> list[str]:
@@ -431,10 +426,8 @@ def _losses(report: RecoveryReport) -> list[str]:
         if episodes:
             shown = ", ".join(str(n) for n in episodes[:_SHOWN])
             found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
-    if report.infos_lost:
-        found.append(f"lost: {counted(report.infos_lost, 'step info')}")
-    if report.frames_lost:
-        found.append(f"lost: {counted(report.frames_lost, 'frame')}")
+    for count, noun in ((report.infos_lost, "step info"), (report.frames_lost, "frame")):
+        found += [f"lost: {counted(count, noun)}"] if count else []
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
     if report.journal in _NO_JOURNAL:

@@ -127,9 +127,7 @@ def _tell(report: RenderReport, which: str, *, as_json: bool) -> None:
 
 def _print_film(path: Path, pictures: int, which: str, *, as_json: bool) -> None:
     told = {"path": path, "frames": pictures, "recorded": True, "ok": True}
-    print_result(told, f"{path}: {counted(pictures, 'recorded picture')}", as_json=as_json)
-    if not as_json:
-        say(which)
+    print_result(told, f"{path}: {counted(pictures, 'recorded picture')}", which, as_json=as_json)
 
 
 @contextlib.contextmanager

@@ -170,12 +170,11 @@ def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> No
     what = f"{counted(len(waiting), 'recording')}, {size},"
     line = f"{_verb(dry_run)} {what}" if waiting else "nothing waits to be sent"
     told = _told(client.url, dry_run, [], [str(each.path) for each in waiting], None)
-    print_result(told, f"{line} to {client.url}", as_json=as_json)
-    if not as_json:
-        say(
-            *(f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
-              for (url, name), n in client.waiting_elsewhere().items())
-        )  # fmt: skip
+    others = [
+        f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
+        for (url, name), n in client.waiting_elsewhere().items()
+    ]
+    print_result(told, f"{line} to {client.url}", *others, as_json=as_json)
 
 
 def _check_keys(
