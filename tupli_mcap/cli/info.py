@@ -179,10 +179,11 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         "are shown",
     }
     environment = d.environment or "none attached"
+    runs = [f"{run['name']} ({counted(run['episodes'], 'episode')})" for run in d.runs]
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
     return [
         ("recording", d.name),
-        *(_run_facts(d.run) if len(d.runs) == 1 else [("runs", _runs_text(d.runs))]),
+        *(_run_facts(d.run) if len(d.runs) == 1 else [("runs", _some(runs))]),
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
@@ -216,10 +217,6 @@ def _annotations_text(annotations: Sequence[dict[str, Any]]) -> str:
     return (
         f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {counted(last['episodes'], 'episode')}"
     )
-
-
-def _runs_text(runs: Sequence[dict[str, Any]]) -> str:
-    return _some([f"{run['name']} ({counted(run['episodes'], 'episode')})" for run in runs])
 
 
 def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:

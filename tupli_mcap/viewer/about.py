@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -80,11 +80,12 @@ def _bars(values: Any) -> Any:
 def card(recording: Recording) -> str:
     """A recording's facts in Markdown."""
     d = describe(recording)
+    ends = ", ".join(f"{number:,} {name}" for name, number in d.ends.items() if number)
     rows = [
         ("environment", d.environment or "not recorded"),
-        ("episodes", f"{d.episodes:,}, {_ends(d.ends)}"),
+        ("episodes", f"{d.episodes:,}, {ends or 'none has ended'}"),
+        ("steps", f"{d.steps:,}"),
     ]
-    rows += [("steps", f"{d.steps:,}")]
     for name, spread in (("return", d.returns), ("length", d.lengths)):
         if spread:
             odd = nan_text(spread.nan, d.episodes)
@@ -95,7 +96,7 @@ def card(recording: Recording) -> str:
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),
-        ("recorded", _when(d.created_ns)),
+        ("recorded", f"{datetime.fromtimestamp(d.created_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC"),
         ("file", d.name),
     ]
     lines = [f"| {plain(name)} | {plain(value)} |" for name, value in rows]
@@ -106,14 +107,6 @@ def run_title(recording: Recording) -> str:
     """The name of the run, else of the file; shortened, and without unprintable characters."""
     name = recording.readable_runs[0].name or Path(recording.name).stem
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
-
-
-def _ends(ends: Mapping[str, int]) -> str:
-    return ", ".join(f"{number:,} {name}" for name, number in ends.items() if number) or "none has ended"
-
-
-def _when(time_ns: int) -> str:
-    return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def _leaf_rows(recording: Recording) -> list[tuple[str, str]]:

@@ -113,15 +113,11 @@ def episodes(
         "before": table.before,
     }
     status = 400 if table.error else 200
-    link = functools.partial(_link, dataset=dataset, filter=filter, sort=sort)
+    link = functools.partial(address, "episodes", dataset=dataset, filter=filter, sort=sort)
     return page(
         request, "episodes.html", facts, status=status, shelf=shelf, dataset=of, table=table, filter=filter, sort=sort,
         link=link, most_compared=MOST_COMPARED, python=python_line(shelf, _both(dataset_filter(dataset), filter), sort),
     )  # fmt: skip
-
-
-def _link(**params: str) -> str:
-    return address("episodes", **params)
 
 
 def table_of(

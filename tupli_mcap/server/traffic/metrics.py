@@ -10,7 +10,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, gene
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.multiprocess import MultiProcessCollector
-from sqlalchemy import ColumnElement, Connection, func, select
+from sqlalchemy import Connection, func, select
 
 from tupli_mcap.server.tables import FILE, ITEM, PENDING, UPLOAD, USER
 from tupli_mcap.storage.catalog.tables import TALLY
@@ -62,7 +62,5 @@ class _Kept:
             ("uploads", "Uploads that are not finished.", func.count(UPLOAD.c.id)),
             ("pending_files", "Files on their way in or out.", func.count(PENDING.c.path)),
         ):
-            yield GaugeMetricFamily(f"tupli_mcap_{name}", told, self._of(value))
-
-    def _of(self, value: ColumnElement[int]) -> float:
-        return float(self._connection.execute(select(value)).scalar() or 0)
+            found = self._connection.execute(select(value)).scalar()
+            yield GaugeMetricFamily(f"tupli_mcap_{name}", told, float(found or 0))

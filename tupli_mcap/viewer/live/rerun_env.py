@@ -171,7 +171,8 @@ class LiveEnv:
                     images = np.stack([leaf.as_values(records[row]["data"]) for row in rows.tolist()])
                     rows += self._shift
                     times = steps.facts.time[rows - steps.first]
-                    part: Any = _Columns(self._nested(leaf, images), None, None)
+                    only = [images if other is leaf else None for other in self._layout.state]
+                    part: Any = _Columns(self._layout.nest_state(only), None, None)
                     block = Block(_NOTHING, part, [], rows, times)
                     panel.send(self._place, block, self._times(rows, times))
 
@@ -183,10 +184,6 @@ class LiveEnv:
                 frames = [frame for _, frame in found]
                 times = self._times(rows, np.array([frame.time_ns for frame in frames]))
                 panel.send_frames(self._place, frames, times)
-
-    def _nested(self, leaf: Leaf, values: Array) -> Any:
-        """A state of this leaf only."""
-        return self._layout.nest_state([values if other is leaf else None for other in self._layout.state])
 
     def _times(self, rows: Array, times: Array) -> Times:
         return Times(rows, times, self._seconds)
