@@ -41,19 +41,15 @@ class Shelf(Protocol):
 
     def ask(self, question: Callable[[Connection], T]) -> T:
         """Brings the catalog up to date, and returns the result of a function that reads it, in one transaction."""
-        ...
 
     def seen(self, created_by: ColumnElement[str], published_in: ColumnElement[str]) -> ColumnElement[bool]:
         """The condition, on these two columns of the queried table, for rows that the reader may see."""
-        ...
 
     def seen_episodes(self, connection: Connection) -> ColumnElement[bool]:
         """The condition on EPISODE for the episodes that the reader may see."""
-        ...
 
     def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
         """The same headers, but published only in groups of which the reader may know."""
-        ...
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
         """An open recording of the catalog; NotFoundError if there is none. Others use it at the same time: do not
@@ -61,17 +57,14 @@ class Shelf(Protocol):
 
         of: how many recordings the caller opens for one answer; they share the memory of one cache.
         """
-        ...
 
     def address_of(self, recording: str) -> str | None:
         """The path on this server where a viewer of another host may read a recording for a while; None if nowhere."""
-        ...
 
     def benchmarks(
         self, connection: Connection, filter: BaseFilter | None = None
     ) -> Sequence[BenchmarkHeader]:
         """The benchmarks that the reader may see and that match a filter; for use within `ask`."""
-        ...
 
 
 def seen_episodes(

@@ -35,27 +35,21 @@ class Blobs(Protocol):
 
     def write(self, name: str, data: bytes) -> None:
         """Keeps bytes. Writing a name again requires the same bytes."""
-        ...
 
     def keep(self, name: str, path: Path) -> None:
         """Keeps the content of a file that nobody writes to. The caller keeps the file itself."""
-        ...
 
     def place(self, name: str) -> str:
         """The path or URL with which a recording of this name is opened."""
-        ...
 
     def size(self, name: str) -> int | None:
         """The size of a name (bytes); None if there is no such name."""
-        ...
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
         """The bytes `start:stop` of an existing name."""
-        ...
 
     def delete(self, name: str) -> None:
         """Deletes a name; nothing happens if there is no such name."""
-        ...
 
 
 def blobs_of(settings: Settings) -> Blobs:

@@ -33,15 +33,12 @@ class LiveView(Protocol):
 
     def show(self, follower: Follower) -> bool:
         """Shows what is new; may take a while. Returns False if there is no viewer to see it."""
-        ...
 
     def go_on(self, path: Path) -> None:
         """Continues with another file of the same rollout."""
-        ...
 
     def close(self) -> None:
         """Disconnects from the viewer, which stays open."""
-        ...
 
 
 class _Files:

@@ -75,19 +75,15 @@ class Panel(Protocol):
     @property
     def column(self) -> str:
         """The field that it shows. Only "states" have a value after the last step of an episode."""
-        ...
 
     def declare(self, place: Place) -> None:
         """Sends what does not change."""
-        ...
 
     def send(self, place: Place, block: Block, times: Times) -> None:
         """Sends a block of steps; of "states", a block `with_finals`."""
-        ...
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         """The view on the entities below each root; `axis` is the time axis of plots."""
-        ...
 
 
 @dataclass(frozen=True)
