@@ -19,7 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from tupli_mcap import errors
 from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
 from tupli_mcap.cli.output import begin_json, print_json_error
-from tupli_mcap.cli.share import account, bundle, exchange, people, serve, trust
+from tupli_mcap.cli.share import bundle, exchange, people, serve, trust
 from tupli_mcap.cli.terminal import (
     fail,
     fetch_progress,
@@ -258,7 +258,7 @@ _FUNCTIONS: dict[str, list[Callable[..., None]]] = {
     "Edit": [edit.tag, edit.edit, edit.filter_, storage.delete, storage.restore, edit.trim, edit.merge,
         edit.split, edit.recover],
     "Share": [bundle.bundle, bundle.import_, bundle.export, trust.trust, trust.untrust],
-    "Server": [serve.serve, account.login, account.logout, account.whoami, account.signup, account.password,
+    "Server": [serve.serve, people.login, people.logout, people.whoami, people.signup, people.password,
         exchange.push, exchange.pull, exchange.publish, exchange.unpublish, serve.backup_server,
         serve.restore_server],
     "People": [people.list_users, people.delete_user, people.list_groups, people.read_group,

@@ -2,8 +2,7 @@
 
 bundle     bundle, import, export: files
 exchange   push, pull, publish, unpublish: between a directory and a server
-account    login, logout, whoami, signup, password
-people     users, groups, roles, tokens for machines
+people     login, logout, whoami, signup, password; users, groups, roles, tokens for machines
 serve      browse: on this machine; serve, backup-server, restore-server: the server
 trust      trust, untrust: whose code may run
 """
