@@ -2,14 +2,13 @@
 
 shelf      the shelf of what a caller may read
 session    sign-in by a cookie; forms and their protection
-entrance   `/`, signing in and out
-account    `/account`: the password, tokens for machines
+account    `/`, signing in and out; `/account`: the password, tokens for machines
 people     `/users`, `/groups`
 sharing    `/share`: who sees a dataset; `/upload`
 """
 
-from tupli_mcap.server.pages import account, entrance, people, sharing
+from tupli_mcap.server.pages import account, people, sharing
 
 __all__ = ["PAGES"]
 
-PAGES = (entrance.router, account.router, people.router, sharing.router)
+PAGES = (account.router, people.router, sharing.router)
