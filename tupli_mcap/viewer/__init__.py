@@ -6,8 +6,7 @@ about                 panels about recordings as a whole
 blueprints            places the panels
 names                 names of panels and dimensions, safe for Rerun
 blocks, sending       reads steps, and sends them as columns
-targets               where all of it goes: a window, a browser, a file
-notebook              the viewer in a notebook
+targets               where all of it goes: a window, a browser, a notebook, a file
 process, sdk          the viewer's program; rerun-sdk
 live/                 a rollout while it is recorded
 foxglove_layout       a layout that makes Foxglove plot a recording
@@ -24,10 +23,9 @@ from typing import Any
 from tupli_mcap.dataset.chosen import Source, chosen_from
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.notebook import Display, in_notebook
 from tupli_mcap.viewer.plan import Form, Plan, extremes_of, plans_of
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk
-from tupli_mcap.viewer.targets import to_browser, to_file, to_viewer, to_window
+from tupli_mcap.viewer.targets import Display, in_notebook, to_browser, to_file, to_viewer, to_window
 
 __all__ = ["Form", "ViewerError", "blueprint", "display", "in_notebook", "save", "send", "serve", "show"]
 
