@@ -151,9 +151,7 @@ class LiveEnv:
         columns = columns_of(self._layout, self._decoder, steps)
         for heat_map in self._maps:
             heat_map.take(columns)
-        bounds = [0, *(np.flatnonzero(np.diff(steps.facts.episode)) + 1).tolist(), len(steps)]
-        ends = _ends_of(steps, bounds)
-        block = _block(steps, columns, bounds, ends)
+        block = _block(steps, columns)
         times = Times(block.number, block.times, self._seconds, block.seams)
         for panel in self._panels:
             if not _is_apart(panel):
@@ -209,26 +207,17 @@ def columns_of(layout: StepLayout, decoder: MessageDecoder | None, steps: NewSte
     return _Columns(layout.nest_state(states), layout.nest_action(actions), layout.nest_reward(rewards))
 
 
-def _block(steps: NewSteps, columns: Any, bounds: list[int], ends: Sequence[int | None]) -> Block:
-    """The steps as a block; between two consecutive bounds lies an episode, or a part of one."""
-    pieces = [
-        Piece(begin, end, i, int(steps.facts.step[begin]), how_ended)
-        for i, ((begin, end), how_ended) in enumerate(zip(itertools.pairwise(bounds), ends, strict=True))
-    ]
-    number = np.arange(steps.first, steps.first + len(steps))
-    return Block(_NOTHING, columns, pieces, number, steps.facts.time)
-
-
-def _ends_of(steps: NewSteps, bounds: list[int]) -> list[int | None]:
-    """How the episode of each piece ends; None if it goes on after the last row."""
-    terminal, timeout = steps.facts.terminal, steps.facts.timeout
-    found: list[int | None] = []
-    for end in bounds[1:]:
-        if terminal[end - 1] or timeout[end - 1]:
-            found.append(TERMINAL if terminal[end - 1] else TIMEOUT)
-        else:
-            found.append(INTERRUPTED if end < bounds[-1] else None)
-    return found
+def _block(steps: NewSteps, columns: Any) -> Block:
+    """The steps as a block, with a piece for each episode or part of one; the last may go on after the last row."""
+    facts, count = steps.facts, len(steps)
+    bounds = [0, *(np.flatnonzero(np.diff(facts.episode)) + 1).tolist(), count]
+    pieces = []
+    for i, (begin, end) in enumerate(itertools.pairwise(bounds)):
+        how_ended = INTERRUPTED if end < count else None
+        if facts.terminal[end - 1] or facts.timeout[end - 1]:
+            how_ended = TERMINAL if facts.terminal[end - 1] else TIMEOUT
+        pieces.append(Piece(begin, end, i, int(facts.step[begin]), how_ended))
+    return Block(_NOTHING, columns, pieces, np.arange(steps.first, steps.first + count), facts.time)
 
 
 def _is_apart(panel: Panel) -> bool:
