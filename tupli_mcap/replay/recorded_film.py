@@ -75,42 +75,26 @@ def film(
         RecordingError: an episode has no such pictures, the target exists (without `overwrite`), or cannot be written.
         MissingExtraError: PyAV or Pillow is not installed.
     """
+    check_pictures(every, width)
     with tempfile.TemporaryDirectory() as folder:
         goal = Path(folder) / "film.mp4" if target is None else Path(target)
-        check_pictures(every, width)
-        count = _write(episodes, goal, camera, fps, every, width, overwrite=overwrite)
-        return Film(count, goal.suffix.lower(), None if target is None else goal, goal.read_bytes())
-
-
-def _write(
-    episodes: Sequence[Episode],
-    goal: Path,
-    camera: str | None,
-    fps: float | None,
-    every: int,
-    width: int | None,
-    *,
-    overwrite: bool,
-) -> int:
-    """Returns how many pictures there are."""
-    kind = check_goal(goal, _KINDS, overwrite=overwrite)
-    if fps is not None and not 0 < fps <= 1000:
-        raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
-    if not episodes:
-        raise RecordingError("expected episodes to film, found none")
-    recording = episodes[0].recording
-    parts = [_pictures(episode, camera) for episode in episodes]
-    count = sum(-(-(number - 1) // every) + 1 for number, _ in parts)
-    seconds = recording.labels.step_seconds
-    pictures = (
-        _scaled(picture, width)
-        for number, drawn in parts
-        for i, picture in enumerate(drawn)
-        if i % every == 0 or i == number - 1
-    )
-    with replacing(goal) as (_, path):
-        write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS) / every)
-    return count
+        kind = check_goal(goal, _KINDS, overwrite=overwrite)
+        if fps is not None and not 0 < fps <= 1000:
+            raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
+        if not episodes:
+            raise RecordingError("expected episodes to film, found none")
+        parts = [_pictures(episode, camera) for episode in episodes]
+        count = sum(-(-(number - 1) // every) + 1 for number, _ in parts)
+        seconds = episodes[0].recording.labels.step_seconds
+        pictures = (
+            _scaled(picture, width)
+            for number, drawn in parts
+            for i, picture in enumerate(drawn)
+            if i % every == 0 or i == number - 1
+        )
+        with replacing(goal) as (_, path):
+            write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS) / every)
+        return Film(count, kind, None if target is None else goal, goal.read_bytes())
 
 
 def _scaled(picture: Picture, width: int | None) -> Picture:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 
@@ -58,21 +57,16 @@ def recorded_values(recording: Recording, positions: Sequence[int]) -> Iterator[
 
 
 def _together(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
-    columns = recording.read(list(positions))
-    start = 0
+    layout, columns, start = recording.layout, recording.read(list(positions)), 0
     for position, length in zip(positions, columns.episode_lengths.tolist(), strict=True):
-        part = _cut(recording.layout, columns, start, start + length)
-        yield RecordedValues(recording, position, part, length)
+        part = slice(start, start + length)
+        own = Columns(
+            columns.episode_lengths[:0],
+            layout.nest_state([leaf.get(columns.states)[part] for leaf in layout.state]),
+            layout.nest_action([leaf.get(columns.actions)[part] for leaf in layout.action]),
+            layout.nest_reward([leaf.get(columns.rewards)[part] for leaf in layout.reward]),
+            columns.terminals[part],
+            columns.timeouts[part],
+        )
+        yield RecordedValues(recording, position, own, length)
         start += length
-
-
-def _cut(layout: StepLayout, columns: Columns, start: int, stop: int) -> Columns:
-    part = slice(start, stop)
-    return Columns(
-        columns.episode_lengths[:0],
-        layout.nest_state([leaf.get(columns.states)[part] for leaf in layout.state]),
-        layout.nest_action([leaf.get(columns.actions)[part] for leaf in layout.action]),
-        layout.nest_reward([leaf.get(columns.rewards)[part] for leaf in layout.reward]),
-        columns.terminals[part],
-        columns.timeouts[part],
-    )

@@ -257,8 +257,19 @@ def add_members(
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
     _demand_few(sum(1 + len(roles) for _, roles in members))
+    known = {role["role"] for role in list_roles(connection)}
     for user, roles in members:
-        _add_member(connection, caller, group, user, roles)
+        for role in roles:
+            if role not in known:
+                raise NotFoundError(f"Role {role} not found")
+            for right in _rights_of(connection, role):
+                caller.demand(right, group)
+        if not connection.execute(select(USER.c.name).where(USER.c.name == user)).first():
+            raise NotFoundError(f"User {user} not found")
+        held = select(MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == user, MEMBERSHIP.c.team == group)
+        for role in set(roles) - set(connection.execute(held).scalars()):
+            connection.execute(insert(MEMBERSHIP).values(user=user, team=group, role=role))
+        audit(connection, caller.name, "add_member", f"{group}: {user} {', '.join(roles)}")
 
 
 def _demand_few(found: int) -> None:
@@ -266,21 +277,6 @@ def _demand_few(found: int) -> None:
         raise StorageError(
             f"expected at most {_MOST_AT_ONCE} members and roles at a time, found {found}; send some of them"
         )
-
-
-def _add_member(connection: Connection, caller: Caller, group: str, user: str, roles: Sequence[str]) -> None:
-    known = {role["role"] for role in list_roles(connection)}
-    for role in roles:
-        if role not in known:
-            raise NotFoundError(f"Role {role} not found")
-        for right in _rights_of(connection, role):
-            caller.demand(right, group)
-    if not connection.execute(select(USER.c.name).where(USER.c.name == user)).first():
-        raise NotFoundError(f"User {user} not found")
-    held = select(MEMBERSHIP.c.role).where(MEMBERSHIP.c.user == user, MEMBERSHIP.c.team == group)
-    for role in set(roles) - set(connection.execute(held).scalars()):
-        connection.execute(insert(MEMBERSHIP).values(user=user, team=group, role=role))
-    audit(connection, caller.name, "add_member", f"{group}: {user} {', '.join(roles)}")
 
 
 def remove_members(connection: Connection, caller: Caller, group: str, users: Sequence[str]) -> None:
