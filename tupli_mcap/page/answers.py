@@ -101,18 +101,9 @@ def page(
     """A page: `facts` as JSON if the query has `format=json`, else the template filled with `facts` and `drawn`."""
     if request.query_params.get("format") == "json":
         return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
-    made = (
-        _templates()
-        .get_template(template)
-        .render(
-            request=request,
-            shelf=shelf,
-            facts=facts,
-            here=request.url.path,
-            params=request.query_params,
-            **drawn,
-        )
-    )
+    drawn |= {"request": request, "shelf": shelf, "facts": facts}
+    drawn |= {"here": request.url.path, "params": request.query_params}
+    made = _templates().get_template(template).render(drawn)
     # A text of a file may hold characters that UTF-8 cannot encode (lone surrogates).
     return Response(made.encode("utf-8", "replace"), status, media_type="text/html")
 

@@ -197,16 +197,9 @@ def _grouped(found: Iterable[Tally], benchmarks: Mapping[str, BenchmarkHeader]) 
     made = []
     for key, items in groups.items():
         header = benchmarks.get(key)
-        environment = items[0].environment if items else ""
-        made.append(
-            Dataset(
-                key=key,
-                benchmark_id=header.id if header else items[0].benchmark_id,
-                environment=environment or (header.environment if header else ""),
-                benchmark=header,
-                recordings=items,
-            )
-        )
+        benchmark_id = header.id if header else items[0].benchmark_id
+        environment = (items[0].environment if items else "") or (header.environment if header else "")
+        made.append(Dataset(key, benchmark_id, environment, header, items))
     return made
 
 

@@ -74,17 +74,15 @@ def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> S
     facts = (EPISODE.c[name] for name in ("created_at", "episode_return", "n_tuples", "success", "seed"))
     query = select(RECORDING.c.path, *facts).select_from(EPISODE.join(RECORDING, of_one_recording()))
     if dataset.episodes <= _EPISODES:
-        rows = list(
-            connection.execute(query.where(seen_episodes(shelf, connection, of_dataset(dataset.key))))
-        )
+        of = seen_episodes(shelf, connection, of_dataset(dataset.key))
+        rows = list(connection.execute(query.where(of)))
     else:
         recordings = _evenly(dataset.recordings, _RECORDINGS)
         share = _EPISODES / sum(item.episodes for item in recordings)
         rows = []
         for ids in _batches(_ids(shelf, connection, recordings, share)):
-            rows += connection.execute(
-                query.where(seen_episodes(shelf, connection, EPISODE.c.id.in_(ids)))
-            ).all()
+            of = seen_episodes(shelf, connection, EPISODE.c.id.in_(ids))
+            rows += connection.execute(query.where(of)).all()
     rows.sort(key=lambda row: row[1])
     returns, steps, success, seeds = (np.array([row[i] for row in rows], np.float64) for i in range(2, 6))
     names, ended = [unescape_text(row[0]) for row in rows], np.array([row[1] for row in rows], np.int64)

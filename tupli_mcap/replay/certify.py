@@ -311,11 +311,7 @@ class Certifier:
             if positions:
                 counts = self._counts(positions)
                 first = int(self._recording.index["episode"][positions[0]])
-                skipped.append(
-                    Skipped(
-                        kind=kind, reason=reason, episodes=counts.episodes, steps=counts.steps, first=first
-                    )
-                )
+                skipped.append(Skipped(kind=kind, reason=reason, first=first, **counts.model_dump()))
         return skipped
 
 

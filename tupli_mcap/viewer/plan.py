@@ -262,11 +262,8 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
             root = "/" + re.sub(r"[^\w-]+", "_", title)
             if root in {part.root for part in parts}:  # files of one name
                 root += f"_{len(parts)}"
-            parts.append(
-                Part(
-                    Chosen(item.recording, [position]), scene, root, title, PALETTE[len(parts) % len(PALETTE)]
-                )
-            )
+            color = PALETTE[len(parts) % len(PALETTE)]
+            parts.append(Part(Chosen(item.recording, [position]), scene, root, title, color))
     scene.rows = max(int(row_counts(*item).max()) for item in chosen)
     lines = [
         f"\n- {_episode_in_short(item.recording, position, f' of {plain(name)}' if len(chosen) > 1 else '')}"

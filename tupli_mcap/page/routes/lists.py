@@ -137,20 +137,11 @@ def table_of(
         only = seen_episodes(shelf, connection)
         of_some = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
         at = find_episode(shelf, connection, after or before) if after or before else None
-        found = list(
-            find_episodes(
-                connection,
-                wanted,
-                limit=_ROWS + 1,
-                only=only,
-                of=of_some,
-                sort=order,
-                after=None if at is None else After(at.recording, at.episode),
-                backwards=bool(before),
-            )
-        )
+        place = None if at is None else After(at.recording, at.episode)
+        find = functools.partial(find_episodes, connection, only=only, of=of_some)
+        found = list(find(wanted, limit=_ROWS + 1, sort=order, after=place, backwards=bool(before)))
         if not found and at is None and wanted is not None:
-            among = list(find_episodes(connection, None, limit=_ASKED + 1, only=only, of=of_some))
+            among = list(find(None, limit=_ASKED + 1))
             if len(among) <= _ASKED:
                 check_metadata(wanted, among)
     except FilterError as err:

@@ -114,9 +114,8 @@ def manifest(
             told = {"version": file.digest[:16]}  # the loader's cache key
             if asked.ticket is not None:
                 told["ticket"] = library.tokens.ticket(asked.caller, recording=file.name)
-            sources.append(
-                {"url": f"files/{quote(file.name)}?{urlencode(told)}", "supportsRangeRequests": True}
-            )
+            url = f"files/{quote(file.name)}?{urlencode(told)}"
+            sources.append({"url": url, "supportsRangeRequests": True})
             continue
         number = _id(each, file.digest)
         words = {"ticket": asked.ticket, "filter": filter, "benchmark_filter": benchmark_filter}
