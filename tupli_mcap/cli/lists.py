@@ -363,28 +363,28 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
     several_envs = any(header.env for header in headers)
     returns = numbers([header.episode_return for header in headers])
     columns = (
-        *([Column("ID"), source] if several else [Column("EPISODE", "right")]),
-        *([Column("ENV", "right")] if several_envs else []),
+        Column("ID") if several else Column("EPISODE", "right"),
+        source,
+        Column("ENV", "right"),
         Column("STEPS", "right"),
         Column("RETURN", "right"),
         Column("END"),
         Column("SEED", "right"),
-        *([Column("ENDED")] if roomy else []),
+        Column("ENDED"),
         Column("METADATA", shrink="end"),
     )
-    rows = []
-    for header, total in zip(headers, returns, strict=True):
-        rows.append(
-            (
-                short_ids(header.id) if several else str(header.episode),
-                *([header.run.get("name", "") if by_run else short_ids(header.recording)] if several else []),
-                *([str(header.env)] if several_envs else []),
-                number(header.n_tuples),
-                total,
-                header.end,
-                "" if header.seed is None else str(header.seed),
-                *([when(header.created_at)] if roomy else []),
-                pairs_of(header.metadata),
-            )
+    rows = [  # a column without any value is not shown
+        (
+            short_ids(h.id) if several else str(h.episode),
+            "" if not several else h.run.get("name", "") if by_run else short_ids(h.recording),
+            str(h.env) if several_envs else "",
+            number(h.n_tuples),
+            total,
+            h.end,
+            "" if h.seed is None else str(h.seed),
+            when(h.created_at) if roomy else "",
+            pairs_of(h.metadata),
         )
+        for h, total in zip(headers, returns, strict=True)
+    ]
     print_table(columns, rows, empty="no episodes")

@@ -70,7 +70,7 @@ def list_benchmarks(
     columns = (
         Column("ID"),
         Column("NAME", shrink="end"),
-        *([Column("ENVIRONMENT", shrink="end")] if roomy else []),
+        Column("ENVIRONMENT", shrink="end"),
         Column("VERSION"),
         Column("CREATED"),
         Column("DESCRIPTION", shrink="end"),
@@ -79,7 +79,7 @@ def list_benchmarks(
         (
             short_ids(h.id),
             h.metadata.name,
-            *([h.environment] if roomy else []),
+            h.environment if roomy else "",
             h.metadata.version or "",
             when(h.created_at),
             h.metadata.description,
