@@ -8,9 +8,11 @@ import importlib
 import re
 import sys
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tupli_mcap.errors import TupliError, missing_extra
+
+__all__ = ["OLDEST", "ViewerError", "import_quickly", "pa", "rerun_sdk", "rr", "rrb", "version_of"]
 
 OLDEST = (0, 39)
 
@@ -44,9 +46,12 @@ class _Lazy:
         return getattr(importlib.import_module(self._name), attribute)
 
 
-rr: Any = _Lazy("rerun")
-rrb: Any = _Lazy("rerun.blueprint")
-pa: Any = _Lazy("pyarrow")
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import rerun as rr
+    import rerun.blueprint as rrb
+else:
+    pa, rr, rrb = map(_Lazy, ("pyarrow", "rerun", "rerun.blueprint"))
 
 
 class _NoPandas:
