@@ -880,9 +880,13 @@ def test_two_continued_copies_are_told_apart(tmp_path: Path) -> None:
         (lambda dataset: tupli_mcap.open(""), "found an empty text"),
         (lambda dataset: tupli_mcap.EpisodeWriter("", SPACE, SPACE), "found an empty text"),
         (lambda dataset: dataset.split(0.5, by=3), "expected by=KEY"),
-        (lambda dataset: dataset.sample(1, seed=-1), "expected a seed from 0"),
-        (lambda dataset: dataset.loader(seed=2**70), "a seed of 64 bits"),
-        (lambda dataset: dataset.loader(batch_size=1.5), "a whole batch_size"),
+        (lambda dataset: dataset.sample(1, seed=-1), "expected a seed that is an integer from 0"),
+        (lambda dataset: dataset.sample(1, seed=1.5), "expected a seed that is an integer from 0"),  # type: ignore[arg-type]
+        (lambda dataset: dataset.split(0.5, seed=None), "expected a seed that is an integer from 0"),  # type: ignore[arg-type]
+        (lambda dataset: dataset.loader(seed=2**70), "a seed of at most"),
+        (lambda dataset: dataset.loader(num_workers=-1), "a number of workers that is an integer from 0"),
+        (lambda dataset: dataset[[0, 0, 1]].save("twice.mcap"), "expected each episode once"),
+        (lambda dataset: dataset.loader(batch_size=1.5), "a batch size that is an integer from 1"),
     ],
 )
 def test_what_means_nothing_is_one_error(dataset: Dataset, ask: Callable[[Dataset], Any], said: str) -> None:
@@ -902,3 +906,18 @@ def test_a_recording_beside_those_it_was_made_of_is_named(tmp_path: Path) -> Non
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(tupli_mcap.open([tmp_path / "b.mcap", tmp_path / "trimmed.mcap"])) == 4
+
+
+def test_numbers_of_infos_keep_their_digits_in_tables(tmp_path: Path) -> None:
+    with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:
+        writer.begin()
+        for value in (np.int64(2**60 + 1), None, 2**60 + 3):
+            info = {} if value is None else {"id": value, "wave": 1 + 2j}
+            writer.step([0], [0], reward=0.0, info=info, timeout=value == 2**60 + 3)
+        writer.end([0])
+    dataset = tupli_mcap.open(tmp_path)
+    table = dataset.to_pandas()
+    assert table["info.id"].dtype == "Int64" and table["info.id"].dropna().tolist() == [2**60 + 1, 2**60 + 3]
+    assert table["info.wave"].tolist() == [1 + 2j, None, 1 + 2j]
+    assert dataset.to_arrow()["info.id"].to_pylist() == [2**60 + 1, None, 2**60 + 3]
+    assert dataset.to_arrow()["info.wave"].to_pylist()[1] is None

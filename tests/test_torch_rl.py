@@ -64,6 +64,8 @@ def test_what_does_not_go_on_is_done(tmp_path: Path) -> None:
     following = storage[:]["next"]
     assert np.flatnonzero(following["done"]).tolist() == [7, 15, 23, 29]
     assert np.flatnonzero(following["truncated"]).tolist() == [23, 29]  # every third by timeout; interrupted
+    assert storage.get(-1)["next", "done"].item()
+    assert storage.get([-1, 0])["next", "truncated"].tolist() == [[True], [False]]
     cut = RecordedStorage(dataset.with_tuple_filter(F("step") != 3).transitions())
     assert np.flatnonzero(cut[:]["next", "truncated"])[:2].tolist() == [2, 9]
     assert np.flatnonzero(cut[:]["next", "terminated"])[:2].tolist() == [6, 13]

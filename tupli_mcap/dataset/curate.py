@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -183,9 +184,16 @@ def file_path(place: str | os.PathLike[str]) -> Path:
 
 
 def _check_new(dataset: Dataset, target: Path, *, overwrite: bool) -> None:
-    """Raises DatasetError if there is no episode, or the target exists: one of the sources, or not to be replaced."""
+    """Raises DatasetError if there is no episode, one occurs twice, or the target exists: one of the sources, or not to
+    be replaced."""
     if not dataset._chosen:
         raise DatasetError("expected episodes to save, found none")
+    ((header, times),) = Counter(header.id for header in dataset.headers).most_common(1)
+    if times > 1:
+        raise DatasetError(
+            f"expected each episode once, as a recording holds it, found {header} {times} times; "
+            "leave out repeated ones to save the others"
+        )
     if not target.exists():
         return
     sources = [dataset._open(name).path for name in dataset._chosen]

@@ -28,6 +28,7 @@ from tupli_mcap.dataset.sources import (
     JoinedSource,
     OpenRecordings,
     Source,
+    checked_whole,
     numbers_by_recording,
     place_of,
 )
@@ -256,14 +257,13 @@ class Dataset(RandomAccess):
 
     def head(self, n: int = 5) -> Dataset:
         """The first `n` episodes, or as many as there are."""
-        return self._of(self.headers[: _count(n)])
+        return self._of(self.headers[: checked_whole(n, 0, "a number of episodes")])
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
         """`n` different episodes (or as many as there are), drawn at random, in the order of drawing."""
-        if seed is not None and seed < 0:
-            raise DatasetError(f"expected a seed from 0, found {seed}")
-        drawn = np.random.default_rng(seed).permutation(len(self))[: _count(n)]
-        return self[drawn]
+        chosen = None if seed is None else checked_whole(seed, 0, "a seed")
+        drawn = np.random.default_rng(chosen).permutation(len(self))
+        return self[drawn[: checked_whole(n, 0, "a number of episodes")]]
 
     def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
         """Two datasets: about `fraction` of the episodes, and the others. No episode is in both.
@@ -277,13 +277,14 @@ class Dataset(RandomAccess):
                 values, all may fall on one side, which warns.
 
         Raises:
-            DatasetError: the fraction is not between 0 and 1, or `by` is no key.
+            DatasetError: the fraction is not between 0 and 1, the seed is no integer from 0, or `by` is no key.
             FilterError: an unknown key.
         """
         if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}")
         if not isinstance(by, str | None):
             raise DatasetError(f"expected by=KEY, such as 'run', found {by!r:.80}")
+        seed = checked_whole(seed, 0, "a seed")
         values = None if by is None else values_at(by, self.headers)
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
         for i, header in enumerate(self.headers):
@@ -429,7 +430,8 @@ class Dataset(RandomAccess):
         Episodes of one recording keep their ids; episodes of several get new ones.
 
         Raises:
-            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
+            DatasetError: there is no episode, one occurs twice, the target exists (without `overwrite`), or it is one
+                of the sources.
             RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
@@ -454,7 +456,8 @@ class Dataset(RandomAccess):
             fields: some of "rewards", "actions", "states".
 
         Raises:
-            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
+            DatasetError: there is no episode, one occurs twice, the target exists (without `overwrite`), or it is one
+                of the sources.
             SpaceError: two recordings have different spaces.
             RecordingError: the function returns values that the recording's dtype cannot hold exactly, or the target
                 cannot be written.
@@ -480,7 +483,8 @@ class Dataset(RandomAccess):
         loses its beginning has no seed, because no reset leads to its first state.
 
         Raises:
-            DatasetError: there is no episode, the target exists (without `overwrite`), or it is one of the sources.
+            DatasetError: there is no episode, one occurs twice, the target exists (without `overwrite`), or it is one
+                of the sources.
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
         return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
@@ -554,9 +558,3 @@ def _places(chosen: object, count: int) -> list[int]:
 def _same_text(value: Any) -> str:
     """One text for values that filters take for equal, such as 1 and 1.0."""
     return repr(int(value) if isinstance(value, float) and value.is_integer() else value)
-
-
-def _count(n: int) -> int:
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 0:
-        raise DatasetError(f"expected a number of episodes from 0, found {n!r:.80}")
-    return int(n)

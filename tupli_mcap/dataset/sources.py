@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
@@ -42,6 +43,13 @@ _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two b
 
 class DatasetError(TupliError, ValueError):
     """An invalid request to a dataset: batches without steps, a negative seed."""
+
+
+def checked_whole(value: object, least: int, what: str) -> int:
+    """The value, if it is an integer from `least` on. DatasetError if it is something else."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
+    return int(value)
 
 
 class Source(Protocol):

@@ -16,9 +16,8 @@ from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
-from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.query import Query
-from tupli_mcap.dataset.sources import DatasetError, FilesSource, Source, StorageSource
+from tupli_mcap.dataset.sources import FilesSource, Source, StorageSource, checked_whole
 from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
@@ -137,9 +136,9 @@ class TupliDataset(RandomAccess):
             SamplingError: a number is no integer, or too small.
         """
         made = self._with()
-        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
+        made._query.cache_bytes = checked_whole(cache_bytes, 0, "a budget in bytes")
         if threads is not None:
-            made._query.threads = checked_count(threads, 1, "a number of threads")
+            made._query.threads = checked_whole(threads, 1, "a number of threads")
         return made
 
     # --- listing and loading ---
@@ -338,7 +337,7 @@ class TupliDataset(RandomAccess):
         Raises:
             DatasetError: it is no integer from 0.
         """
-        self._seed = None if seed is None else _count(seed, 0, "a seed")
+        self._seed = None if seed is None else checked_whole(seed, 0, "a seed")
         self._random = np.random.default_rng(self._seed)
 
     def as_batch_generator(
@@ -353,7 +352,7 @@ class TupliDataset(RandomAccess):
         Raises:
             DatasetError: the batch size is no integer from 1.
         """
-        size = _count(batch_size, 1, "a batch size")
+        size = checked_whole(batch_size, 1, "a batch size")
         columns = self._query.read(FIVE if parser else SIX)
         order = self._random.permutation(len(columns["terminals"])) if shuffle else None
         return convert.batches(columns, self._query.layout, size, order, parser)
@@ -368,7 +367,7 @@ class TupliDataset(RandomAccess):
             DatasetError: the number is no integer from 0.
         """
         headers = self._query.headers
-        n = min(_count(n_samples, 0, "a number of episodes"), len(headers))
+        n = min(checked_whole(n_samples, 0, "a number of episodes"), len(headers))
         drawn = self._random.choice(len(headers), n, replace=False)
         in_order = np.sort(drawn)
         chosen = [headers[i] for i in in_order]
@@ -395,9 +394,3 @@ class TupliDataset(RandomAccess):
     def _repr_html_(self) -> str:
         _ = self._query.headers
         return display.html(type(self).__name__, self._facts())
-
-
-def _count(value: int, least: int, what: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise DatasetError(f"expected {what} that is an integer from {least}, found {value!r:.80}")
-    return int(value)

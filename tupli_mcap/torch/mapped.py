@@ -10,7 +10,8 @@ import numpy as np
 from torch import Generator
 from torch.utils.data import DataLoader, Dataset
 
-from tupli_mcap.dataset.items import Items, Samples, SamplingError
+from tupli_mcap.dataset.items import Items, Samples
+from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state, collate
 
@@ -80,16 +81,13 @@ def loader(
     remote: bool,
 ) -> DataLoader[Any]:
     """See `Dataset.loader`."""
-    try:
-        batch_size = operator.index(batch_size)
-        generator = None if seed is None else Generator().manual_seed(operator.index(seed))
-    except (TypeError, ValueError, RuntimeError, OverflowError) as err:
-        raise SamplingError(
-            f"expected a whole batch_size, and a seed of 64 bits, found {batch_size!r:.40} and {seed!r:.40}"
-        ) from err
+    checked_count(num_workers, 0, "a number of workers")
+    generator = None
+    if seed is not None:
+        generator = Generator().manual_seed(checked_count(seed, 0, "a seed", (1 << 64) - 1))
     return DataLoader(
         MapDataset(items),
-        batch_size,
+        checked_count(batch_size, 1, "a batch size"),
         shuffle,
         num_workers=num_workers,
         collate_fn=collate,

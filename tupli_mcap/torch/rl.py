@@ -59,6 +59,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         if isinstance(index, slice):
             index = np.arange(*index.indices(len(self)))
         numbers = np.asarray(index, np.int64)
+        numbers = np.where(numbers < 0, numbers + len(self), numbers)
         batch = self._read(numbers.reshape(-1))
         return batch.reshape(numbers.shape)
 

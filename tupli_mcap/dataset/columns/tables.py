@@ -122,8 +122,15 @@ def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     columns: dict[str, Any] = {}
     for key in keys:
         values = [item.get(key) for item in items]
-        some_whole = {type(value) for value in values} == {int, type(None)}
-        columns[f"{root}.{key}"] = _whole_numbers(values) if some_whole else _texts(values)
+        given = [value for value in values if value is not None]
+        if len(given) == len(values):
+            columns[f"{root}.{key}"] = _texts(values)
+        elif all(isinstance(value, int | np.integer) and not isinstance(value, bool) for value in given):
+            columns[f"{root}.{key}"] = _whole_numbers(values)
+        elif any(map(np.iscomplexobj, given)):  # pandas would make a number of None
+            columns[f"{root}.{key}"] = import_pandas().Series(values, dtype=object)
+        else:
+            columns[f"{root}.{key}"] = _texts(values)
     return columns
 
 
