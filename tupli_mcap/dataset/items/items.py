@@ -42,8 +42,10 @@ class Samples(Sequence[dict[str, Any]]):
             return [self[k] for k in range(*i.indices(self._size))]
         if not -self._size <= i < self._size:
             raise IndexError(f"expected a sample from 0 to {self._size - 1}, found {i}")
-        sample: dict[str, Any] = arrays_at(self.batch, i)
-        return sample
+        return {
+            name: column[i] if isinstance(column, np.ndarray) else arrays_at(column, i)
+            for name, column in self.batch.items()
+        }
 
 
 class Items(ABC, Generic[T]):
