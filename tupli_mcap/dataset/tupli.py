@@ -16,6 +16,7 @@ from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
+from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import FilesSource, Source, StorageSource, checked_whole
 from tupli_mcap.recording.columns.fields import FIVE
@@ -136,9 +137,9 @@ class TupliDataset(RandomAccess):
             SamplingError: a number is no integer, or too small.
         """
         made = self._with()
-        made._query.cache_bytes = checked_whole(cache_bytes, 0, "a budget in bytes")
+        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
         if threads is not None:
-            made._query.threads = checked_whole(threads, 1, "a number of threads")
+            made._query.threads = checked_count(threads, 1, "a number of threads")
         return made
 
     # --- listing and loading ---

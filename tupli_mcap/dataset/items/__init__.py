@@ -2,7 +2,8 @@
 
 steps                          the interface that items read from; steps in memory
 beside                         steps with infos and frames; infos as columns
-recorded, index, kept          reads steps from recordings; finds their chunks; caches decoded columns
+recorded, index, segments      reads steps from recordings; finds them; finds the chunks with their rows
+kept                           caches decoded columns
 items                          the base of windows, transitions and delta windows; reads them in batches, also ahead
 windows, transitions, deltas   the three kinds of items
 order, draws                   numbers of items: each once an epoch, or drawn by weight

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.segments import Segments, SegmentsBuilder
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.mcap.source import Source, open_source
 from tupli_mcap.messages.shared_dtypes import check_layouts
@@ -24,7 +25,6 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache, ChunkStore
 from tupli_mcap.recording.columns.gather import Files, image_names
 from tupli_mcap.recording.columns.read import StoredSteps
-from tupli_mcap.recording.columns.runs import Segments, SegmentsBuilder
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import uuid_of
 

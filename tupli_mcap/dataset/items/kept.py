@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items.segments import Segments
 from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
 from tupli_mcap.recording.columns.gather import Column, Rows, do_all
-from tupli_mcap.recording.columns.runs import Part, Segments
+from tupli_mcap.recording.columns.runs import Part
 
 # Threads that decode small chunks contend for the interpreter lock at each one: for few chunks, one thread is faster.
 _FEW_CHUNKS = 128

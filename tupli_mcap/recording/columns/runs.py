@@ -1,4 +1,4 @@
-"""Finds the chunks that hold rows: runs of one channel's rows, or any rows of many files, cut at the chunks."""
+"""Finds the chunks that hold runs of a channel's rows, and cuts the runs at the chunks."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
         return _of_few(runs, store)
     channels, first, steps = map(np.asarray, runs)
     chunks, begin, counts = store.locate(channels, first, steps)
-    return _by_chunk(np.zeros_like(chunks), chunks, begin, counts, np.cumsum(counts) - counts)
+    return by_chunk(np.zeros_like(chunks), chunks, begin, counts, np.cumsum(counts) - counts)
 
 
 def _of_few(runs: Runs, store: ChunkStore) -> list[Part]:
@@ -120,7 +120,8 @@ def _listed(part: Numbers) -> Sequence[int]:
     return part.tolist() if isinstance(part, np.ndarray) else part
 
 
-def _by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Array) -> list[Part]:
+def by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Array) -> list[Part]:
+    """Pieces of chunks of files, as a part for each chunk, in the order of files and chunks."""
     order = np.lexsort((begin, chunks, files))
     files, chunks, begin, steps, out = (each[order] for each in (files, chunks, begin, steps, out))
     firsts = np.flatnonzero((np.diff(chunks, prepend=-1) != 0) | (np.diff(files, prepend=-1) != 0))
@@ -129,82 +130,3 @@ def _by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Arra
         Part(int(files[a]), int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
         for a, b in zip(firsts.tolist(), ends.tolist(), strict=True)
     ]
-
-
-# ---- of several files
-
-
-class Segments(NamedTuple):
-    """Rows 0 to n - 1 that lie in chunks of several recordings.
-
-    Segment i holds the rows from `starts[i]` (int64, ascending) up to the next start: they are the rows of unit
-    `units[i]` from its row `begins[i]` on. A unit is the chunk `chunk_of` of the file `file_of`.
-    """
-
-    total: int
-    starts: Array
-    units: Array
-    begins: Array
-    file_of: Array
-    chunk_of: Array
-
-    def of(self, rows: Array) -> Array:
-        """The segment of each row."""
-        found: Array = np.searchsorted(self.starts, rows, side="right") - 1
-        return found
-
-    def parts(self, rows: Array | slice) -> list[Part]:
-        """The parts of rows in any order, one for each chunk; a slice must not be empty or go beyond the rows."""
-        if isinstance(rows, slice):
-            return self._between(rows.start, rows.stop)
-        if not len(rows):
-            return []
-        at = self.of(rows)
-        places, units = self.begins[at] + (rows - self.starts[at]), self.units[at]
-        return [
-            Part(int(self.file_of[unit]), int(self.chunk_of[unit]), places[out], None, out)
-            for unit, out in _by_value(units)
-        ]
-
-    def _between(self, first: int, stop: int) -> list[Part]:
-        low, last = self.of(np.array([first, stop - 1])).tolist()
-        high = last + 1
-        starts = np.maximum(self.starts[low:high], first)
-        ends = np.append(self.starts[low + 1 : high], stop)
-        begins, units = self.begins[low:high] + (starts - self.starts[low:high]), self.units[low:high]
-        return _by_chunk(self.file_of[units], self.chunk_of[units], begins, ends - starts, starts - first)
-
-
-def _by_value(values: Array) -> list[tuple[int, Array]]:
-    """The different values, ascending, and the places of each."""
-    if (values == values[0]).all():
-        return [(int(values[0]), np.arange(len(values)))]
-    order = np.argsort(values, kind="stable")
-    ordered = values[order]
-    cuts = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
-    firsts = ordered[np.concatenate([[0], cuts])].tolist()
-    return list(zip(firsts, np.split(order, cuts), strict=True))
-
-
-class SegmentsBuilder:
-    """Collects the segments of one file after the other."""
-
-    def __init__(self) -> None:
-        self._total = 0
-        self._parts: list[tuple[Array, Array, Array, Array]] = []  # starts, file, chunk, begin
-
-    def add(self, file: int, chunks: Array, begins: Array, steps: Array) -> None:
-        """Appends pieces of a file's chunks in their order: `steps[i]` rows of `chunks[i]` from `begins[i]` on."""
-        starts = self._total + np.cumsum(steps) - steps
-        self._parts.append((starts, np.full(len(chunks), file), chunks, begins))
-        self._total += int(steps.sum())
-
-    def build(self) -> Segments:
-        parts = [np.concatenate([np.empty(0, np.int64), *part]) for part in zip(*self._parts, strict=True)]
-        starts, files, chunks, begins = parts or [np.empty(0, np.int64)] * 4
-        # a piece that continues the one before in the same chunk belongs to its segment
-        new = (np.diff(files, prepend=-1) != 0) | (np.diff(chunks, prepend=-1) != 0)
-        new[1:] |= np.diff(begins) != np.diff(starts)
-        starts, files, chunks, begins = (each[new] for each in (starts, files, chunks, begins))
-        kinds, units = np.unique(files << 32 | chunks, return_inverse=True)
-        return Segments(self._total, starts, units.reshape(-1), begins, kinds >> 32, kinds & 0xFFFFFFFF)
