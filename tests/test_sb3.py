@@ -242,6 +242,33 @@ def test_both_ends_at_once_are_a_terminal(tmp_path: Path) -> None:
     assert {episode.end for episode in Recording(tmp_path / "run.mcap").episodes} == {"terminal"}
 
 
+def test_a_step_that_raises_is_followed_by_a_reset(tmp_path: Path) -> None:
+    class Fails(gym.Wrapper[Any, Any, Any, Any]):
+        fails = False
+
+        def step(self, action: Any) -> Any:
+            if self.fails:
+                raise TimeoutError("no answer")
+            return self.env.step(action)
+
+    last = Fails(Sampler(BOX, BOX))
+    venv = DummyVecEnv([lambda: Sampler(BOX, BOX), lambda: last])
+    with VecRecordEpisodes(venv, tmp_path / "run.mcap") as venv:
+        action = np.stack([BOX.sample()] * 2)
+        venv.reset()
+        venv.step(action)
+        last.fails = True
+        with pytest.raises(TimeoutError, match="no answer"):
+            venv.step(action)
+        last.fails = False
+        with pytest.raises(StepError, match="call env.reset"):
+            venv.step(action)
+        venv.reset()
+        venv.step(action)
+    found = Recording(tmp_path / "run.mcap").episodes
+    assert [(len(episode), episode.end) for episode in found] == [(1, "interrupted")] * 4
+
+
 def test_an_environment_without_final_states(tmp_path: Path) -> None:
     class Forgetful(VecEnvWrapper):
         def reset(self) -> Any:

@@ -280,6 +280,44 @@ def test_a_batch_that_cannot_be_stored(tmp_path: Path) -> None:
         env.step([2, 3, 4])
 
 
+class Fails(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment whose step raises once it is told to."""
+
+    fails = False
+
+    def step(self, action: Any) -> Any:
+        if self.fails:
+            raise TimeoutError("no answer")
+        return self.env.step(action)
+
+
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+def test_a_step_that_raises_is_followed_by_a_reset_of_all(tmp_path: Path, mode: Any) -> None:
+    """The sub-environments before the one that raises have taken the step."""
+    last, path = Fails(Sampler(SPACES["box"], SPACES["discrete"], length=4)), tmp_path / "r.mcap"
+    first = Sampler(SPACES["box"], SPACES["discrete"], length=4)
+    kwargs = {} if mode is None else {"autoreset_mode": mode}
+    env = RecordEpisodes(SyncVectorEnv([lambda: first, lambda: last], **kwargs), path)
+    with env:
+        taken = [env.reset()[0].copy(), env.step([2, 3])[0].copy()]
+        last.fails = True
+        with pytest.raises(TimeoutError, match="no answer"):
+            env.step([2, 3])
+        last.fails = False
+        with pytest.raises(StepError, match=r"could not be recorded; call env.reset\(\)"):
+            env.step([2, 3])
+        if name_of(mode) == "Disabled":
+            with pytest.raises(StepError, match=r"call env.reset\(\) without a reset_mask"):
+                env.reset(options={"reset_mask": np.array([False, True])})
+        taken += [env.reset()[0].copy(), env.step([2, 3])[0].copy()]
+    found = Recording(path).episodes
+    assert [(episode.env, episode.end) for episode in found] == [(0, "interrupted"), (1, "interrupted")] * 2
+    for episode in found:
+        state, after = taken[:2] if episode.number < 2 else taken[2:]
+        assert same(episode.states, state[[episode.env]])
+        assert same(episode.final_state, after[episode.env])
+
+
 def test_the_first_sub_environment_is_in_the_file(tmp_path: Path) -> None:
     envs = SyncVectorEnv([lambda: gym.make("CartPole-v1", sutton_barto_reward=True)] * 2)
     with RecordEpisodes(envs, tmp_path / "r.mcap") as env:

@@ -43,7 +43,8 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file describes the first
     sub-environment; if that is in another process, as far as `gymnasium.make_vec` knows it. Each sub-environment gets
     a copy of the metadata callback. With `max_bytes` or `max_seconds`, a new file begins as soon as the old one is full
-    and no sub-environment is within an episode; if one always is, at the next `reset` of all.
+    and no sub-environment is within an episode; if one always is, at the next `reset` of all. If a step raises, the
+    running episodes end as interrupted, and a `reset` of all must follow: some may have taken the step.
 
     Args:
         autoreset_mode: "NextStep", "SameStep" or "Disabled"; by default what the environment declares
@@ -129,10 +130,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         try:
             result = self.env.step(actions)
             states, rewards, terminals, timeouts, infos = result
-        except Exception:  # an environment that raises may not have made a step
-            work.state = DONE
-            raise
-        except BaseException:  # Ctrl-C: some environments may have taken it
+        except BaseException:  # some sub-environments may have taken the step
             self._recorder.refuse()
             work.state = DONE
             raise

@@ -92,9 +92,13 @@ class VectorRecorder:
 
     def reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None = None) -> None:
         """All sub-environments, or those in `mask`, start over; running episodes end as interrupted. StepError if a
-        state cannot be stored exactly."""
+        state cannot be stored exactly, or after `refuse` if `mask` leaves some out, whose states nobody knows."""
         if self._writer.closed:
             raise self._writer.why_stopped()
+        if self._refused and mask is not None and not mask.all():
+            raise StepError(
+                "the step before this reset could not be recorded; call env.reset() without a reset_mask to go on"
+            )
         self._write_pending()
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
