@@ -500,6 +500,45 @@ def test_success_is_understood(key: str, record_info: bool, tmp_path: Path) -> N
     assert "75%" in command("info", str(path))
 
 
+@pytest.mark.parametrize("kind", ["single", "sb3", *gym.vector.AutoresetMode])
+@pytest.mark.parametrize("record_info", [False, True])
+def test_an_interrupted_episode_has_no_success(kind: Any, record_info: bool, tmp_path: Path) -> None:
+    class Always(Winning):
+        """Its infos say it at every step of an episode of three."""
+
+        steps = 0
+
+        def reset(self, **kwargs: Any) -> Any:
+            self.steps = 0
+            return super().reset(**kwargs)
+
+        def step(self, action: Any) -> Any:
+            self.steps += 1
+            return 1, 1.0, self.steps == 3, False, {"is_success": True}
+
+    path, action = tmp_path / "r.mcap", np.array([1])
+    options: dict[str, Any] = {"record_info": record_info}
+    env: Any
+    if kind == "single":
+        env, action = RecordEpisodes(Always(), path, **options), 1
+    elif kind == "sb3":
+        dummy = pytest.importorskip("stable_baselines3.common.vec_env").DummyVecEnv
+        from tupli_mcap.sb3 import VecRecordEpisodes
+
+        env = VecRecordEpisodes(dummy([Always]), path, **options)
+    else:
+        env = RecordVectorEpisodes(gym.vector.SyncVectorEnv([Always], autoreset_mode=kind), path, **options)
+    env.reset()
+    for _ in range(3):
+        env.step(action)
+    if kind != "sb3" and kind != gym.vector.AutoresetMode.SAME_STEP:
+        env.reset()
+    env.step(action)
+    env.close()
+    found = [(episode.end, episode.metadata) for episode in Recording(path).episodes]
+    assert found == [("terminal", {"success": True}), ("interrupted", {})]
+
+
 @pytest.mark.parametrize("autoreset", list(gym.vector.AutoresetMode))
 @pytest.mark.parametrize("record_info", [False, True])
 def test_success_of_sub_environments_is_understood(autoreset: Any, record_info: bool, tmp_path: Path) -> None:

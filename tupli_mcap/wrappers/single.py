@@ -49,8 +49,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             directories are made.
         mode: if the file exists, "x" refuses, "w" replaces it, and "a" continues it. "a" also makes a missing file.
         metadata_callback: called with every step (an RLTuple); the dict it returns at the last one is the episode's
-            metadata. It is reset before each episode. If the last info has `is_success` or `success`, the metadata
-            gets that as `success`, unless the callback sets it.
+            metadata. It is reset before each episode. If the info of the step that ends an episode has `is_success` or
+            `success`, the metadata gets that as `success`, unless the callback sets it.
         record_info: False, True (everything), a list of names, or a function from an info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".

@@ -161,16 +161,17 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     def _end(self, taken: Any, result: Any) -> None:
         """The ends of the episodes that the batch has ended."""
-        _, _, terminals, timeouts, infos = result
-        texts = self._texts
-        if infos and tells_success(infos):
-            final = [final_info_of(infos, i, self.num_envs) for i in range(self.num_envs)]
-            texts = [with_success(text, info) for text, info in zip(texts, final, strict=True)]
+        _, _, terminals, _, infos = result
+        recorder, texts, ended = self._recorder, self._texts, self._recorder.ended
+        if ended and infos and tells_success(infos):
+            texts = list(texts)
+            for i in ended:
+                texts[i] = with_success(texts[i], final_info_of(infos, i, self.num_envs))
         if self._watches or texts is not self._texts:
-            self._recorder.note_metadata(texts)
-        self._recorder.finish(terminals, infos)
+            recorder.note_metadata(texts)
+        recorder.finish(terminals, infos)
         if self._callbacks is not None:
-            self._work.ask(self._forget, np.flatnonzero(taken[0] & np.logical_or(terminals, timeouts)))
+            self._work.ask(self._forget, ended)
 
     def _go_on(self, taken: Any, result: Any) -> None:
         """Flushes and syncs if that is due, and begins a new file if this one is full."""

@@ -223,6 +223,11 @@ class VectorRecorder:
         episode = self._episodes[i]
         return (-1, 0) if episode is None else (episode.number, int(self._lengths[i]))
 
+    @property
+    def ended(self) -> list[int]:
+        """The sub-environments whose episodes the batch just put has ended."""
+        return self._ended.nonzero()[0].tolist() if self._any_ended else []
+
     def note_metadata(self, texts: Sequence[str]) -> None:
         """The metadata (JSON texts) of the running episodes, by sub-environment."""
         self._texts = list(texts)
@@ -232,8 +237,7 @@ class VectorRecorder:
         if not self._any_ended or self._derives:
             return
         same_step = self._autoreset.mode == "SameStep"
-        ended = self._ended.nonzero()[0].tolist()
-        ends = [(i, TERMINAL if terminals[i] else TIMEOUT) for i in ended]
+        ends = [(i, TERMINAL if terminals[i] else TIMEOUT) for i in self.ended]
         if self._autoreset.is_assumed:
             self._late = ends
         else:
