@@ -370,18 +370,40 @@ def test_infos_without_masks(tmp_path: Path) -> None:
         assert episode.infos == [expected]
 
 
-def test_statistics_of_episodes_are_recorded(tmp_path: Path) -> None:
-    envs = gym.wrappers.vector.RecordEpisodeStatistics(make(SPACES["box"], None))
+class Numbered(Sampler):
+    """Infos of resets have the number of the episode, also as a dict; those of steps have nothing."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        state, _ = super().reset(**kwargs)
+        return state, {"number": self.episodes, "episode_id": {"r": self.episodes}}
+
+
+@pytest.mark.parametrize("key", ["episode", "statistics"])
+@pytest.mark.parametrize("as_list", [False, True])
+@pytest.mark.parametrize("mode", MODES, ids=name_of)
+def test_statistics_of_episodes_are_recorded(tmp_path: Path, mode: Any, as_list: bool, key: str) -> None:
+    if mode is None and as_list:
+        pytest.skip("DictInfoToList of Gymnasium 1.0 fails on the infos of its own RecordEpisodeStatistics")
+    kwargs = {} if mode is None else {"autoreset_mode": mode}
+    made = [lambda: Numbered(SPACES["box"], SPACES["discrete"], length=4)] * N
+    envs: Any = gym.wrappers.vector.RecordEpisodeStatistics(SyncVectorEnv(made, **kwargs), stats_key=key)
+    envs = gym.wrappers.vector.DictInfoToList(envs) if as_list else envs
     with RecordEpisodes(envs, tmp_path / "r.mcap", record_info=True) as env:
         env.reset()
         for _ in range(20):
-            env.step(env.action_space.sample())
+            _, _, terminals, timeouts, _ = env.step(env.action_space.sample())
+            if name_of(mode) == "Disabled" and (done := terminals | timeouts).any():
+                env.reset(options={"reset_mask": done})
     for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert set(episode.reset_info) == {"number", "episode_id"}
+        assert episode.reset_info["episode_id"]["r"] == episode.reset_info["number"]
         *before, last = episode.infos or []
         assert all(info == {} for info in before)
-        if episode.end != "interrupted":
-            assert last is not None
-            assert (last["episode"]["r"], last["episode"]["l"]) == (episode.return_, len(episode))
+        assert last is not None
+        if episode.end == "interrupted":
+            assert last == {}
+        else:
+            assert (last[key]["r"], last[key]["l"]) == (episode.return_, len(episode))
 
 
 @pytest.mark.parametrize("mode", MODES, ids=name_of)

@@ -33,6 +33,8 @@ def entries_of(given: Any, what: str) -> dict[str, Any]:
 _STATES = ("final_obs", "final_observation", "terminal_observation")
 _FINAL = frozenset([*_STATES, "final_info", *(f"_{name}" for name in (*_STATES, "final_info"))])
 
+_STATISTICS = frozenset("rlt")  # the return, length and time of an episode
+
 
 class InfoRecorder:
     """Chooses infos and puts them into the journal.
@@ -170,20 +172,27 @@ def final_states(infos: Any, done: Any, each: Callable[[Any], list[Any]]) -> dic
 def final_info_of(infos: Any, i: int, n: int) -> dict[str, Any]:
     """The last info of sub-environment `i` of `n`, whose episode a same-step autoreset ended.
 
-    Where there is no `final_info`, the infos of the batch are those of its steps.
+    Where there is no `final_info`, the infos of the batch are those of its steps. Where there is, the others are those
+    of resets, but for the statistics of a wrapper.
     """
-    if not isinstance(infos, Mapping):
-        final = infos[i].get("final_info")
-        return info_of(infos, i, n) if final is None else dict(final)
-    final = infos.get("final_info")
+    found, final = info_of(infos, i, n), (infos if isinstance(infos, Mapping) else infos[i]).get("final_info")
     if final is None:
-        return info_of(infos, i, n)
-    if isinstance(final, Mapping):
-        return info_of(final, i, n)
-    return dict(final[i] or {})  # before Gymnasium 1.0: an array of dicts
+        return found
+    if isinstance(infos, Mapping):  # before Gymnasium 1.0, `final_info` is an array of dicts
+        final = info_of(final, i, n) if isinstance(final, Mapping) else final[i] or {}
+    return {**{key: value for key, value in found.items() if _is_statistics(value)}, **final}
 
 
 def reset_info_of(infos: Any, i: int, n: int) -> dict[str, Any]:
     """The info of the reset that a same-step autoreset made; see `final_info_of`."""
-    there = "final_info" in (infos if isinstance(infos, Mapping) else infos[i])
-    return info_of(infos, i, n) if there else {}
+    if "final_info" not in (infos if isinstance(infos, Mapping) else infos[i]):
+        return {}
+    return {key: value for key, value in info_of(infos, i, n).items() if not _is_statistics(value)}
+
+
+def _is_statistics(value: Any) -> bool:
+    """Whether Gymnasium's `vector.RecordEpisodeStatistics` has added an entry, which is of the episode that has ended.
+
+    Only what is in it tells: its name is chosen by the caller, and masks of other entries may be the same.
+    """
+    return isinstance(value, Mapping) and value.keys() == _STATISTICS
