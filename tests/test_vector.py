@@ -370,6 +370,52 @@ def test_infos_without_masks(tmp_path: Path) -> None:
         assert episode.infos == [expected]
 
 
+def tensor(*values: Any) -> Any:
+    return pytest.importorskip("torch").tensor(values)
+
+
+def small(*values: Any) -> Any:
+    return np.array(values, np.uint8)
+
+
+@pytest.mark.parametrize("mask", [np.array, list, tensor, small], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("values", [np.array, list, tensor], ids=lambda kind: kind.__name__)
+def test_infos_of_any_kind_of_array(tmp_path: Path, values: Any, mask: Any) -> None:
+    of = {np.array: lambda *v: np.array(v), list: lambda *v: list(v)}
+    values, mask = of.get(values, values), of.get(mask, mask)
+    infos = {
+        "x": values(4, 5, 6),
+        "_x": mask(True, False, True),
+        "inner": {"y": values(1.5, 2.5, 3.5), "_y": mask(True, True, False)},
+        "is_success": values(True, False, True),
+        "_number": values(7, 8, 9),  # no mask of any entry
+    }
+    final = {
+        "final_info": infos,
+        "final_obs": values([0.0, 0], [1, 1], [2, 2]),
+        "_final_obs": mask(True, True, True),
+    }
+    batches = iter([infos, infos, {"reset": values(7, 8, 9), **final}])
+    env = RecordEpisodes(
+        Batches(lambda: next(batches), mode="SameStep"), tmp_path / "r.mcap", record_info=True
+    )
+    with env:
+        env.reset()
+        for _ in range(3):
+            env.step([0, 1, 2])
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        i = episode.env
+        expected = {
+            **({} if i == 1 else {"x": 4 + i}),
+            "inner": {} if i == 2 else {"y": 1.5 + i},
+            "is_success": i != 1,
+            "_number": 7 + i,
+        }
+        assert episode.infos == [expected] * 3
+        assert episode.metadata == {"success": i != 1}
+        assert episode.final_state.tolist() == [i, i]
+
+
 class Numbered(Sampler):
     """Infos of resets have the number of the episode, also as a dict; those of steps have nothing."""
 

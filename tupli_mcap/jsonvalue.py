@@ -90,12 +90,18 @@ def _shallow(value: Any) -> Any:
     return value
 
 
-def _nearest(value: Any) -> Any:
-    """The array in a tensor of PyTorch or JAX, else the text of `shown`."""
+def array_in(value: Any) -> np.ndarray[Any, Any] | None:
+    """Return the array in a tensor of PyTorch or JAX; None if there is none that NumPy has a dtype for."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value.__array__())
     except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
-        return shown(value)
+        return None
+
+
+def _nearest(value: Any) -> Any:
+    """The array in a tensor, else the text of `shown`."""
+    found = array_in(value)
+    return shown(value) if found is None else found
 
 
 def shown(value: Any) -> str:

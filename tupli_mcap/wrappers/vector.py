@@ -29,7 +29,7 @@ from tupli_mcap.recording.write.options import (
     StepCallback,
 )
 from tupli_mcap.recording.write.recorders.autoreset import Autoreset
-from tupli_mcap.recording.write.recorders.infos import final_info_of, info_of
+from tupli_mcap.recording.write.recorders.infos import final_infos_of, infos_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -165,8 +165,8 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         recorder, texts, ended = self._recorder, self._texts, self._recorder.ended
         if ended and infos and tells_success(infos):
             texts = list(texts)
-            for i in ended:
-                texts[i] = with_success(texts[i], final_info_of(infos, i, self.num_envs))
+            for i, info in zip(ended, final_infos_of(infos, ended, self.num_envs), strict=True):
+                texts[i] = with_success(texts[i], info)
         if self._watches or texts is not self._texts:
             recorder.note_metadata(texts)
         recorder.finish(terminals, infos)
@@ -231,8 +231,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         elif seed is not None:
             seeds = list(seed)
         facts = []
-        for i in range(n):
-            info = info_of(infos, i, n)
+        for i, info in enumerate(infos_of(infos, range(n), n)):
             text = jsonvalue.dumps_any(info) if info else "{}"
             drawn = None
             if seeds[i] is None and i < len(unseeded) and unseeded[i]:
@@ -255,10 +254,11 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         _, rewards, terminals, timeouts, infos = result
         entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         chosen = list(iterate(self.env.action_space, actions))
-        for i in np.flatnonzero(stepped).tolist():
-            info = info_of(infos, i, self.num_envs)
-            if (terminals[i] or timeouts[i]) and self._autoreset.mode == "SameStep":
-                info = final_info_of(infos, i, self.num_envs)
+        taken, n = np.flatnonzero(stepped).tolist(), self.num_envs
+        found = dict(zip(taken, infos_of(infos, taken, n), strict=True))
+        if self._autoreset.mode == "SameStep" and (ended := self._recorder.ended):
+            found.update(zip(ended, final_infos_of(infos, ended, n), strict=True))
+        for i, info in found.items():
             step = Step(before[i], chosen[i], rewards[i], bool(terminals[i]), bool(timeouts[i]), info)
             step.env = i
             entries[i] = self._entries(step)

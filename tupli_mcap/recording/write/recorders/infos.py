@@ -7,12 +7,13 @@ These are a dict as Gymnasium's environments return it, in which a mask `_<key>`
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import RecordingError, StepError, did_you_mean, warn
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.recording.write.options import RecordInfo
@@ -108,41 +109,56 @@ def check_infos(infos: Any, n: int) -> Any:
     raise StepError(f"infos: expected a dict, or a list of {n} dicts, found {shorten(infos)}")
 
 
-def info_of(infos: Any, i: int, n: int) -> dict[str, Any]:
-    """The info of sub-environment `i` of `n`, without what autoreset adds.
+def infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, Any]]:
+    """The infos of the sub-environments `chosen` of `n`, without what autoreset adds.
 
-    Where a dict has no mask (inside what wrappers add, and in custom environments), an array or list of length `n` has
-    an item for each, and anything else belongs to all.
+    Where a dict has no mask (inside what wrappers add, and in custom environments), an array, tensor or list of length
+    `n` has an item for each, and anything else belongs to all.
     """
     if not isinstance(infos, Mapping):
-        return {key: value for key, value in infos[i].items() if key not in _FINAL}
-    found = {}
+        return [{key: value for key, value in infos[i].items() if key not in _FINAL} for i in chosen]
+    found: list[dict[str, Any]] = [{} for _ in chosen]
+    masks = _masks(infos, n)
     for key, value in infos.items():
-        if key in _FINAL or _is_mask(infos, key):
-            continue
-        mask = infos.get(f"_{key}")
-        if isinstance(mask, np.ndarray) and not mask[i]:
+        if key in _FINAL or key in masks:
             continue
         if isinstance(value, dict):
-            found[key] = info_of(value, i, n)
-        elif isinstance(mask, np.ndarray) or _has_items(value, n):
-            found[key] = value[i]
+            values: Sequence[Any] = infos_of(value, chosen, n)
         else:
-            found[key] = value
+            items = _items(value, n)
+            values = [value] * len(chosen) if items is None else [items[i] for i in chosen]
+        mask = masks.get(f"_{key}")
+        for i, info, one in zip(chosen, found, values, strict=True):
+            if mask is None or mask[i]:
+                info[key] = one
     return found
 
 
-def _has_items(value: Any, n: int) -> bool:
+def _masks(infos: Mapping[str, Any], n: int) -> dict[str, Any]:
+    """The entries `_<key>` that are `n` flags, which say who has the entry `<key>`."""
+    found = {}
+    for key, value in infos.items():
+        if not isinstance(key, str) or key[:1] != "_" or key[1:] not in infos:
+            continue
+        flags = _items(value, n)
+        if isinstance(flags, np.ndarray):
+            kind = flags.dtype.type
+            is_mask = flags.ndim == 1 and (kind is np.bool_ or (kind is np.uint8 and flags.max() <= 1))
+        else:
+            is_mask = flags is not None and all(isinstance(flag, bool | np.bool_) for flag in flags)
+        if is_mask:
+            found[key] = flags
+    return found
+
+
+def _items(value: Any, n: int) -> Any:
+    """The array, tensor (as an array) or list that has an item for each of `n`; None if the value is no such thing."""
     if isinstance(value, np.ndarray):
-        return bool(value.shape[:1] == (n,))
-    return isinstance(value, list | tuple) and len(value) == n
-
-
-def _is_mask(infos: Mapping[str, Any], key: Any) -> bool:
-    if not isinstance(key, str) or not key.startswith("_") or key[1:] not in infos:
-        return False
-    value = infos[key]
-    return isinstance(value, np.ndarray) and value.dtype.type is np.bool_
+        return value if value.shape[:1] == (n,) else None
+    if isinstance(value, list | tuple):
+        return value if len(value) == n else None
+    shape = getattr(value, "shape", None)
+    return jsonvalue.array_in(value) if isinstance(shape, tuple) and shape[:1] == (n,) else None
 
 
 def final_states(infos: Any, done: Any, each: Callable[[Any], list[Any]]) -> dict[int, Any]:
@@ -169,25 +185,33 @@ def final_states(infos: Any, done: Any, each: Callable[[Any], list[Any]]) -> dic
     return {}
 
 
-def final_info_of(infos: Any, i: int, n: int) -> dict[str, Any]:
-    """The last info of sub-environment `i` of `n`, whose episode a same-step autoreset ended.
+def final_infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, Any]]:
+    """The last infos of the sub-environments `chosen` of `n`, whose episodes a same-step autoreset ended.
 
     Where there is no `final_info`, the infos of the batch are those of its steps. Where there is, the others are those
     of resets, but for the statistics of a wrapper.
     """
-    found, final = info_of(infos, i, n), (infos if isinstance(infos, Mapping) else infos[i]).get("final_info")
-    if final is None:
+    given = (
+        infos.get("final_info") if isinstance(infos, Mapping) else [one.get("final_info") for one in infos]
+    )
+    found = infos_of(infos, chosen, n)
+    if given is None:
         return found
-    if isinstance(infos, Mapping):  # before Gymnasium 1.0, `final_info` is an array of dicts
-        final = info_of(final, i, n) if isinstance(final, Mapping) else final[i] or {}
-    return {**{key: value for key, value in found.items() if _is_statistics(value)}, **final}
+    # before Gymnasium 1.0, it is an array of dicts
+    finals = infos_of(given, chosen, n) if isinstance(given, Mapping) else [given[i] for i in chosen]
+    return [
+        info if final is None else {**{key: info[key] for key in info if _is_statistics(info[key])}, **final}
+        for info, final in zip(found, finals, strict=True)
+    ]
 
 
-def reset_info_of(infos: Any, i: int, n: int) -> dict[str, Any]:
-    """The info of the reset that a same-step autoreset made; see `final_info_of`."""
-    if "final_info" not in (infos if isinstance(infos, Mapping) else infos[i]):
-        return {}
-    return {key: value for key, value in info_of(infos, i, n).items() if not _is_statistics(value)}
+def reset_infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, Any]]:
+    """The infos of the resets that a same-step autoreset made; see `final_infos_of`."""
+    there = ["final_info" in (infos if isinstance(infos, Mapping) else infos[i]) for i in chosen]
+    return [
+        {key: value for key, value in info.items() if is_there and not _is_statistics(value)}
+        for info, is_there in zip(infos_of(infos, chosen, n), there, strict=True)
+    ]
 
 
 def _is_statistics(value: Any) -> bool:

@@ -23,8 +23,8 @@ from tupli_mcap.recording.write.recorders.infos import (
     InfoRecorder,
     check_infos,
     final_states,
-    info_of,
-    reset_info_of,
+    infos_of,
+    reset_infos_of,
 )
 from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import BatchStore
@@ -351,7 +351,7 @@ class VectorRecorder:
         first, writer.next_episode = writer.next_episode, writer.next_episode + len(begun)
         self._episode_numbers[begun] = np.arange(first, writer.next_episode)
         self._lengths[begun] = 0
-        if infos and any(info_of(infos, i, self._n) for i in begun.tolist()):
+        if infos and any(infos_of(infos, begun.tolist(), self._n)):
             self.derives_episodes = False
             self._write_pending()
             self._note_resets(holes, infos)
@@ -390,10 +390,10 @@ class VectorRecorder:
         return self._final_encoder(state)
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
-        of = reset_info_of if self._autoreset.mode == "SameStep" else info_of
-        plain = ResetFacts(None, None, "", "{}", time.time_ns())
-        for i in holes.nonzero()[0].tolist():
-            info = of(infos, i, self._n) if infos else None
+        of = reset_infos_of if self._autoreset.mode == "SameStep" else infos_of
+        plain, chosen = ResetFacts(None, None, "", "{}", time.time_ns()), holes.nonzero()[0].tolist()
+        found = of(infos, chosen, self._n) if infos else [{}] * len(chosen)
+        for i, info in zip(chosen, found, strict=True):
             self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
         self._fresh = True
 
