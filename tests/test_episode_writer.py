@@ -125,12 +125,17 @@ def _plain(step: Any) -> tuple[Any, ...]:
     return state, action, float(reward), terminal, timeout
 
 
+@pytest.mark.parametrize("durability", ["os", "step"])
 @pytest.mark.parametrize("num_envs", [None, 1, 3])
 @pytest.mark.parametrize("name", SPACES)
-def test_episodes_are_as_they_were_told(tmp_path: Path, name: str, num_envs: int | None) -> None:
+def test_episodes_are_as_they_were_told(
+    tmp_path: Path, name: str, num_envs: int | None, durability: Any
+) -> None:
     space, path = SPACES[name], tmp_path / "r.mcap"
     script = Script(space, num_envs, 3, 600)
-    with EpisodeWriter(path, space, ACTIONS, num_envs=num_envs, chunk_size=3000) as writer:
+    with EpisodeWriter(
+        path, space, ACTIONS, num_envs=num_envs, chunk_size=3000, durability=durability
+    ) as writer:
         script.run(writer)
     expected = script.episodes(len(script.calls), closed=True)
     assert any("discarded" in told.metadata for told in expected)
@@ -205,7 +210,8 @@ def _die(script: Any, space: Any, moment: Moment, rng: random.Random, path: Path
     while data := os.read(read_end, 4096):
         done += len(data)
     os.close(read_end)
-    os.waitpid(pid, 0)
+    _, status = os.waitpid(pid, 0)
+    assert os.WIFSIGNALED(status)  # not by an exception
     return done
 
 

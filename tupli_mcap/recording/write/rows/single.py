@@ -204,9 +204,10 @@ class SingleRows:
         start = self._offset()
         return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
 
-    def _seal(self, offset: int) -> None:
+    def _seal(self, offset: int, *, alone: bool = False) -> None:
         end = offset + self._area.row_size
-        seal(self._buffer, offset, end, self._buffer[end + STATE : end + self._state_end])
+        running = b"" if alone else self._buffer[end + STATE : end + self._state_end]
+        seal(self._buffer, offset, end, running)
 
     def _switch(self) -> None:
         """The half is full: go on in the other one, then write this one as a chunk."""
