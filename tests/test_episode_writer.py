@@ -365,6 +365,96 @@ def test_many_steps_at_once_are_as_one_after_another(tmp_path: Path) -> None:
     assert verify_recording(tmp_path / "b.mcap").problems == []
 
 
+KEPT = {  # spaces and options, by how steps are kept
+    "rows": (BOX, {}),
+    "rows of several leaves": (spaces.Dict({"x": BOX, "n": spaces.Discrete(4)}), {}),
+    "sealed rows": (BOX, {"durability": "step"}),
+    "images": (CAMERA, {}),
+    "logs": (TEXT, {}),
+}
+
+
+def batch(space: spaces.Space[Any], n: int) -> tuple[Any, Any, Any]:
+    """States, actions and rewards of `n` steps."""
+    states = [space.sample() for _ in range(n)]
+    if isinstance(space, spaces.Dict):
+        columns: Any = {key: [state[key] for state in states] for key in space}
+        return (
+            {key: rows if key == "note" else np.stack(rows) for key, rows in columns.items()},
+            np.arange(n),
+            np.arange(n) / 2,
+        )
+    return np.stack(states), np.arange(n), np.arange(n) / 2
+
+
+@pytest.mark.parametrize("infos", [False, True])
+@pytest.mark.parametrize("is_first", [True, False])
+@pytest.mark.parametrize("kind", KEPT)
+def test_steps_that_are_refused_leave_nothing(tmp_path: Path, kind: str, is_first: bool, infos: bool) -> None:
+    space, options = KEPT[kind]
+    states, actions, rewards = batch(space, 3)
+    longer, _, _ = batch(space, 4)
+    info = [{"n": i} for i in range(3)]
+    strange = {**states, "more": rewards} if isinstance(states, dict) else states.astype(np.complex64)
+    refused: list[tuple[tuple[Any, ...], str]] = [
+        ((states, actions[:2], rewards), "actions: expected one for each of 3 steps, found 2"),
+        ((states, np.arange(4), rewards), "actions: expected one for each of 3 steps, found 4"),
+        ((longer, actions, rewards), "states: expected one for each of 3 steps, found 4"),
+        ((batch(space, 2)[0], actions, rewards), "states: expected one for each of 3 steps, found 2"),
+        ((states, 4, rewards), "actions: expected an array of 3 entries, found 4"),
+        ((states, [0, 1, "left"], rewards), "action"),
+        ((states, actions, [0.0, 0.5, "much"]), "reward"),
+        ((strange, actions, rewards), "state"),
+    ]
+    with EpisodeWriter(tmp_path / "r.mcap", space, ACTIONS, **options) as writer:
+        writer.begin()
+        if not is_first:
+            writer.steps(states, actions, rewards)
+        for arguments, match in refused:
+            with pytest.raises(StepError, match=match):
+                writer.steps(*arguments, infos=info if infos else None)
+        if infos:
+            with pytest.raises(StepError, match="infos: expected one for each of 3 steps, found 2"):
+                writer.steps(states, actions, rewards, infos=info[:2])
+        writer.steps(states, actions, rewards, infos=info if infos else None)
+        writer.end()
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert episode.rewards.tolist() == [0, 0.5, 1] * (1 if is_first else 2)
+    assert episode.return_ == episode.rewards.sum()
+    assert same(
+        episode[-1].state, {k: v[2] for k, v in states.items()} if isinstance(states, dict) else states[2]
+    )
+    if infos:
+        assert [step.info for step in episode][-3:] == info
+    assert verify_recording(tmp_path / "r.mcap").problems == []
+
+
+@pytest.mark.parametrize("kind", KEPT)
+def test_episodes_that_are_refused_leave_nothing(tmp_path: Path, kind: str) -> None:
+    space, options = KEPT[kind]
+    states, actions, rewards = batch(space, 5)
+    ends, never = [0, 1, 0, 0, 1], [0] * 5
+    (finals, _, _), (more, _, _), (fewer, _, _) = (batch(space, n) for n in (2, 3, 1))
+    strange = {**finals, "x": np.full((2, 3), "a")} if isinstance(finals, dict) else [["a"] * 3] * 2
+    with EpisodeWriter(tmp_path / "r.mcap", space, ACTIONS, **options) as writer:
+        for given, match in (
+            (more, "final_states: expected one for each of 2 episodes, found 3"),
+            (fewer, "final_states: expected one for each of 2 episodes, found 1"),
+            (strange, "state"),
+        ):
+            with pytest.raises(StepError, match=match):
+                writer.episodes(states, actions, rewards, ends, never, given)
+        with pytest.raises(StepError, match="actions: expected one for each of 5 steps, found 4"):
+            writer.episodes(states, actions[:4], rewards, ends, never, finals)
+        with pytest.raises(StepError, match="action"):
+            writer.episodes(states, ["left", *actions[1:]], rewards, ends, never, finals)
+        writer.episodes(states, actions, rewards, ends, never, finals)
+    found = Recording(tmp_path / "r.mcap").episodes
+    assert [(len(episode), episode.end) for episode in found] == [(2, "terminal"), (3, "terminal")]
+    assert all(episode.final_state is not None for episode in found)
+    assert verify_recording(tmp_path / "r.mcap").problems == []
+
+
 def test_a_discarded_episode_leaves_nothing(tmp_path: Path) -> None:
     path, state = tmp_path / "r.mcap", np.zeros(3, np.float32)
     with EpisodeWriter(path, BOX, ACTIONS) as writer:

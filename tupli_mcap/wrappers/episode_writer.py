@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 import weakref
@@ -14,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
@@ -195,7 +196,7 @@ class EpisodeWriter(Recorder):
         try:
             stream.put(state, action, reward, terminal, timeout)
             if entries:
-                stream.put_info(entries)
+                stream.put_infos([entries])
             if not self._is_plain:
                 self._writer.flush_if_due()
                 self._writer.sync_step()
@@ -225,7 +226,8 @@ class EpisodeWriter(Recorder):
             infos: a dict for each step.
 
         Raises:
-            StepError: as `step`; also for flags before the last step, and for arrays of unequal length.
+            StepError: as `step`; also for flags before the last step, and for arrays of unequal length. Nothing of this
+                call is recorded, and the episode goes on.
         """
         stream = self._ready(env)
         n = len(rewards)
@@ -235,6 +237,7 @@ class EpisodeWriter(Recorder):
             raise StepError(f"expected no flag before the last step, {n - 1}, found one at step {early[0]}")
         if infos is not None and len(infos) != n:
             raise StepError(f"infos: expected one for each of {n} steps, found {len(infos)}")
+        _check_lengths(n, "step", states=states, actions=actions, rewards=rewards)
         entries = [entries_of(info, "info") for info in infos or ()]
         if n:
             with _Whole(self._work, self._writer):
@@ -274,6 +277,8 @@ class EpisodeWriter(Recorder):
             raise StepError(
                 "expected whole episodes, found no flag at the last step; steps() records a part of one"
             )
+        _check_lengths(n, "step", states=states, actions=actions, rewards=rewards)
+        _check_lengths(len(stops), "episode", final_states=final_states)
         with _Whole(self._work, self._writer):
             self._next(env).put_episodes(states, actions, rewards, *flags, stops, final_states)
             self._writer.flush_if_due()
@@ -380,6 +385,21 @@ def flags_of(given: Any, shape: tuple[int, ...], name: str) -> Array:
     """The given flags as bools, by default false; StepError if they are no flags."""
     expected = f"flags of shape {shape}, true or false"
     return np.zeros(shape, np.bool_) if given is None else exact_flags(given, shape, name, expected)
+
+
+def _check_lengths(count: int, of: str, **columns: Any) -> None:
+    """StepError unless all arrays of nested dicts and tuples have an entry for each of `count` steps or episodes."""
+
+    def check(name: str, array: Any) -> None:
+        try:
+            found = len(array)
+        except TypeError:
+            raise StepError(f"{name}: expected an array of {count} entries, found {shorten(array)}") from None
+        if found != count:
+            raise StepError(f"{name}: expected one for each of {count} {of}s, found {found}")
+
+    for name, column in columns.items():
+        map_arrays(column, functools.partial(check, name))
 
 
 def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:

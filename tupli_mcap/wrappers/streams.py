@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import StepStore
 from tupli_mcap.recording.write.rows.single import SingleRows
-from tupli_mcap.recording.write.rows.variable import final_encoder
+from tupli_mcap.recording.write.rows.variable import final_encoder, step_check
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_array, leaf_value
 
@@ -80,27 +81,32 @@ class Stream:
     def put(self, state: Any, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """Records a step."""
         if self._episode is None:
-            self._put_first(state, action, reward, terminal, timeout)
+            store = self._ready(state, action, reward)
+            put = functools.partial(store.put_whole, state, action, reward, terminal, timeout)
+            self._start(store, put)
         else:
             self._store.put_whole(state, action, reward, terminal, timeout)  # type: ignore[union-attr]
         if terminal or timeout:
             self.over = TERMINAL if terminal else TIMEOUT
 
-    def _put_first(self, *step: Any) -> None:
+    def _ready(self, state: Any, action: Any, reward: Any) -> StepStore:
+        """Where the steps go, of which these are the values of the first one."""
+        self._streams.begin(state, action, reward)
+        self._store = self._writer.streams[self._env]
+        return self._store
+
+    def _start(self, store: StepStore, put: Callable[[], None]) -> None:
+        """Starts the episode, whose first steps `put` records; it is taken back if they are refused."""
         writer = self._writer
-        is_first = not writer.streams
-        self._streams.begin(*step[:3])
-        self._store = store = writer.streams[self._env]
         store.begin_episode(writer.next_episode)
         episode = writer.start_episode(self._env, store.count, self._facts)
         try:
-            store.put_whole(*step)
+            put()
         except StepError:
             writer.drop_start()
             raise
         self._episode = episode
-        if is_first:
-            writer.take_place()
+        writer.take_place()
 
     def put_many(
         self,
@@ -111,19 +117,26 @@ class Stream:
         timeouts: Array,
         infos: Sequence[Mapping[str, Any]],
     ) -> None:
-        """Records several steps."""
-        columns = (states, actions, rewards)
-        for i in range(len(rewards)):
-            store = self._store
-            if self._episode and not infos and isinstance(store, SingleRows) and store.can_put_many:
-                rest = [arrays_at(column, slice(i, None)) for column in columns]
-                store.put_many(rest[0], rest[1], rest[2], terminals[i:], timeouts[i:], self._episode.number)
-                self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
-                break
+        """Records several steps; StepError if a value cannot be stored exactly; nothing is recorded."""
+        columns, n, writer = (states, actions, rewards), len(terminals), self._writer
+        store = self._ready(*(arrays_at(column, 0) for column in columns))
+        if isinstance(store, SingleRows) and store.can_put_many:
+            number = writer.next_episode if self._episode is None else self._episode.number
+            put = functools.partial(store.put_many, *columns, terminals, timeouts, number)
+            if self._episode is None:
+                self._start(store, put)
+            else:
+                put()
+            self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
+            self.put_infos(infos)
+            return
+        check = step_check(writer.laid())
+        for i in range(n):
+            check(*(arrays_at(column, i) for column in columns))
+        for i in range(n):
             state, action, reward = (arrays_at(column, i) for column in columns)
             self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
-            if infos:
-                self.put_info(infos[i])
+            self.put_infos(infos[i : i + 1])
 
     def put_episodes(
         self,
@@ -145,10 +158,17 @@ class Stream:
                 rest = [arrays_at(column, slice(begin, None)) for column in columns]
                 self._put_together(store, rest, stops[i:] - begin, arrays_at(finals, slice(i, None)))
                 return
-            self.begin(facts, {})
             part = [arrays_at(column, slice(begin, stop)) for column in columns]
-            self.put_many(part[0], part[1], part[2], part[3], part[4], ())
-            self.end(arrays_at(finals, i))
+            final = arrays_at(finals, i)
+            self._ready(*(arrays_at(column, 0) for column in part[:3]))
+            self._encoded(final)  # is refused before the steps of its episode are recorded
+            self.begin(facts, {})
+            try:
+                self.put_many(part[0], part[1], part[2], part[3], part[4], ())
+            except StepError:
+                self.is_running = False
+                raise
+            self.end(final)
             begin = stop
 
     def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
@@ -168,25 +188,27 @@ class Stream:
         ends["end"] = np.where(terminals[stops - 1], TERMINAL, TIMEOUT)
         writer.add_episodes(EpisodeBatch(starts, ends, final_bytes))
 
-    def put_info(self, info: Mapping[str, Any]) -> None:
-        """Records the info of the step just put."""
+    def put_infos(self, infos: Sequence[Mapping[str, Any]]) -> None:
+        """Records the infos of the last steps."""
         if self._episode is not None and self._store is not None:
-            step = self._store.count - self._episode.first_row - 1
-            self._streams.infos.put(self._writer, self._episode.number, step, info)
+            first = self._store.count - self._episode.first_row - len(infos)
+            for step, info in enumerate(infos, first):
+                self._streams.infos.put(self._writer, self._episode.number, step, info)
 
     def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
         """Ends the running episode, if there is one with a step."""
         writer, episode, store = self._writer, self._episode, self._store
         if episode is not None and store is not None:
-            final = None
-            if final_state is not None and writer.layout is not None:
-                final = final_encoder(writer.layout)(final_state)
             text = jsonvalue.dumps_plain({**self._metadata, **(metadata or {})})
             length = store.count - episode.first_row
             how = INTERRUPTED if self.over is None else self.over
-            writer.end_episode(episode, how, length, store.total, final, text)
+            writer.end_episode(episode, how, length, store.total, self._encoded(final_state), text)
         self._episode = None
         self.is_running, self.over = False, None
+
+    def _encoded(self, final_state: Any) -> bytes | None:
+        """A final state as it is stored; None if it is not known. StepError if it cannot be stored exactly."""
+        return None if final_state is None else final_encoder(self._writer.laid())(final_state)
 
     def discard(self) -> int | None:
         """Ends the running episode and marks it as discarded; returns its number, None if it has no step."""

@@ -18,7 +18,7 @@ from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, ImageSink, make_ro
 from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.spaces.exact import exact_array, leaf_value
+from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 
 # of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
 CHUNKS_PER_HALF = 2
@@ -117,6 +117,8 @@ class SingleRows:
             StepError: something cannot be stored exactly; nothing is recorded.
         """
         n, layout = len(terminals), self._layout
+        check_structure(layout.observation_space, states, "state")
+        check_structure(layout.action_space, actions, "action")
         columns = [("terminal", terminals), ("timeout", timeouts), ("episode", np.broadcast_to(episodes, n))]
         for root, leaves in ((states, layout.state), (actions, layout.action), (rewards, layout.reward)):
             for leaf in leaves:

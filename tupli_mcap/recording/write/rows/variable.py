@@ -353,6 +353,22 @@ def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
     return encode
 
 
+def step_check(layout: StepLayout) -> Callable[[Any, Any, Any], None]:
+    """A function that raises StepError unless a step (state, action, reward) can be stored exactly."""
+    check_state = structure_check(layout.observation_space, "state")
+    check_action = structure_check(layout.action_space, "action")
+    encoders = [leaf_encoders(layout, leaves) for leaves in (layout.state, layout.action, layout.reward)]
+
+    def check(state: Any, action: Any, reward: Any) -> None:
+        check_state(state)
+        check_action(action)
+        for root, each in zip((state, action, reward), encoders, strict=True):
+            for leaf, encode in each:
+                encode(leaf_value(root, leaf), bytearray(), 0)
+
+    return check
+
+
 def each_of(space: Any, batch: Any, n: int) -> list[Any]:
     """A batch's values by sub-environment; StepError if they are not as many, or the batch is no such thing."""
     try:
