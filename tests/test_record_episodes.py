@@ -506,6 +506,19 @@ def test_seeds_options_and_reset_infos(tmp_path: Path) -> None:
     assert (second.seed, second.options) == (None, None)
 
 
+def test_options_that_the_environment_takes_out_are_recorded(tmp_path: Path) -> None:
+    class Takes(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            assert options.pop("start") == 3
+            return self.env.reset(seed=seed, options=options)
+
+    with RecordEpisodes(Takes(gym.make("CartPole-v1")), tmp_path / "r.mcap") as env:
+        env.reset(options={"start": 3, "low": -0.01})
+        env.step(0)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert episode.options == {"start": 3, "low": -0.01}
+
+
 def test_the_seed_of_an_unseeded_first_reset_is_found(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
         state, _ = env.reset()

@@ -217,6 +217,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         work = self._work
         if work.state:
             work.refuse()
+        told = "" if options is None else jsonvalue.dumps_any(options)  # before the environment takes any out
         work.state = ASKING
         unseeded = seed is None and getattr(self._base, "_np_random", 0) is None
         try:
@@ -232,7 +233,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             facts = ResetFacts(
                 seed,
                 drawn_seed(self.env) if unseeded else None,
-                "" if options is None else jsonvalue.dumps_any(options),
+                told,
                 jsonvalue.dumps_any(info) if info else "{}",
                 time.time_ns(),
             )
