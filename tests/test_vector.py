@@ -211,6 +211,28 @@ def test_a_full_reset_interrupts_every_episode(tmp_path: Path) -> None:
     assert [(e.env, len(e), e.end) for e in episodes] == [(i, 1, "interrupted") for i in (0, 1, 2, 0, 1, 2)]
 
 
+@pytest.mark.skipif(MODES == [None], reason="Gymnasium 1.0 knows no partial resets")
+def test_options_are_those_of_the_sub_environments(tmp_path: Path) -> None:
+    given: list[Any] = []
+
+    class Notes(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            given.append(options)
+            return self.env.reset(seed=seed)
+
+    made = SyncVectorEnv(
+        [lambda: Notes(Sampler(SPACES["box"], SPACES["discrete"]))] * 2, autoreset_mode="Disabled"
+    )
+    with RecordEpisodes(made, tmp_path / "r.mcap") as env:
+        env.reset(options={"level": 1})
+        env.step([2, 2])
+        for more in ({}, {"level": 2}):
+            env.reset(options={"reset_mask": np.array([True, False]), **more})
+            env.step([2, 2])
+    recorded = [episode.options for episode in Recording(tmp_path / "r.mcap").episodes]
+    assert recorded == given == [{"level": 1}, {"level": 1}, {}, {"level": 2}]
+
+
 class Returns(EpisodeMetadataCallback):
     def __init__(self) -> None:
         self.reset()

@@ -107,7 +107,7 @@ class Replayer:
         for seed, text in plan.resets or (ResetCall(None, ""),):
             options = jsonvalue.loads(text) if text else None
             if isinstance(options, dict):
-                options.pop("reset_mask", None)  # for the vector environment, which removes it too
+                options.pop("reset_mask", None)  # in older recordings; it was for the vector environment
             self._used = True
             try:
                 state, info = env.reset(seed=seed, options=options)

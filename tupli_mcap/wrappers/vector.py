@@ -186,7 +186,9 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         work = self._work
         if work.state:
             work.refuse()
-        told = "" if options is None else jsonvalue.dumps_any(options)
+        # before the environment takes any out; the mask is for the vector environment, not its sub-environments
+        given = None if options is None else {key: options[key] for key in options if key != "reset_mask"}
+        told = "" if given is None else jsonvalue.dumps_any(given)
         mask = None if options is None else options.get("reset_mask")
         mask = None if mask is None else np.array(mask, dtype=np.bool_)
         work.state = ASKING
