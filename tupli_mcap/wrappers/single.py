@@ -39,7 +39,8 @@ from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, met
 class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     """Records the episodes of `env` into the MCAP file `path`.
 
-    The policy sees what it would see without a recorder: the same objects are returned. A step is safe, whatever
+    The policy sees what it would see without a recorder: the same objects are passed on and returned, and none is
+    copied for the environment, so an action that it changes in place is recorded as changed. A step is safe, whatever
     happens to the process, as soon as `step()` has returned. A reset in mid-episode, `close()`, garbage collection
     and the end of the interpreter end the running episode as "interrupted".
 
