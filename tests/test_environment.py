@@ -184,6 +184,68 @@ def test_a_spec_is_enough_where_classes_say_how_attributes_came_about() -> None:
         del gym.registry["TupliPlant-v0"]
 
 
+class Valve(Counter):
+    """Assigns its attributes by property setters."""
+
+    def __init__(self, start: float = 0.0, *, opening: int = 1) -> None:
+        super().__init__(start)
+        self.opening = opening
+        self.leak = False
+        self.width = 2
+        self._hot = True
+
+    @property
+    def opening(self) -> int:
+        return self._opening
+
+    @opening.setter
+    def opening(self, value: int) -> None:
+        self._opening = value
+
+    @property
+    def leak(self) -> bool:
+        return self._leak
+
+    @leak.setter
+    def leak(self, value: bool) -> None:
+        self._leak = value
+
+    @property
+    def width(self) -> float:
+        return self._width
+
+    @width.setter
+    def width(self, value: float) -> None:
+        self._width = value / 2
+
+    @property
+    def hot(self) -> bool:
+        return self._hot
+
+    @hot.setter
+    def hot(self, value: bool) -> None:
+        self._hot = value
+
+
+def test_what_was_set_through_a_property_is_pickled() -> None:
+    gym.register("TupliValve-v0", entry_point=f"{__name__}:Valve")
+    try:
+        for change, is_spec in (
+            ({}, True), ({"opening": 4}, True), ({"leak": False}, True), ({"hot": True}, True), ({"width": 3}, True),
+            ({"opening": 5}, False), ({"leak": True}, False), ({"hot": False}, False),
+        ):  # fmt: skip
+            env = gym.make("TupliValve-v0", opening=4)
+            for name, value in change.items():
+                setattr(env.unwrapped, name, value)
+            assert (capture(env, by_reference=True).spec is not None) == is_spec, change
+    finally:
+        del gym.registry["TupliValve-v0"]
+    normalized = gym.wrappers.NormalizeObservation(gym.make("CartPole-v1"))
+    assert capture(normalized).spec is not None
+    normalized.update_running_mean = False
+    assert capture(normalized).pickle is not None
+
+
 def test_a_wrapper_that_hides_itself_from_the_spec_is_pickled() -> None:
     class Hidden(gym.RewardWrapper[Any, Any]):
         spec = property(lambda self: self.env.spec)  # type: ignore[assignment]

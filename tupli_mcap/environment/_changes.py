@@ -59,25 +59,35 @@ def _bound(cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 @functools.lru_cache(maxsize=256)
 def _assigned(cls: type) -> Mapping[str, list[Any]]:
-    """The values that the code of a class and its bases assigns to each attribute."""
+    """The values that the code of a class and its bases assigns to each attribute.
+
+    A setter of a property counts only if that code assigns the property: others may be used from outside. What it
+    stores as it is given is what the code assigns to the property.
+    """
     sources: dict[str, list[Any]] = {}
+    setters: list[tuple[str, Callable[..., Any]]] = []
     for base in cls.__mro__:
         for name, member in vars(base).items():
             if isinstance(member, functools.cached_property):
                 sources.setdefault(name, []).append(_COMPUTED)
+            if isinstance(member, property):
+                setters += [(name, function) for function in _functions(member.fset)]
             for function in _functions(member):
                 own = function is cls.__init__  # type: ignore[misc]
-                for code in _codes(function.__code__):
-                    for attribute, source in _stores(code):
-                        usable = own or not isinstance(source, _Argument)
-                        sources.setdefault(attribute, []).append(source if usable else _COMPUTED)
+                for attribute, source in _stores(function.__code__):
+                    usable = own or not isinstance(source, _Argument)
+                    sources.setdefault(attribute, []).append(source if usable else _COMPUTED)
+    for name, function in setters:
+        for attribute, source in _stores(function.__code__) if name in sources else ():
+            given = sources[name] if isinstance(source, _Argument) else [source]
+            sources.setdefault(attribute, []).extend(given)
     return sources
 
 
 def _functions(member: Any) -> Iterator[Callable[..., Any]]:
-    """The functions written in Python behind a member of a class."""
+    """The functions written in Python behind a member of a class, without the setter of a property."""
     if isinstance(member, property):
-        parts: tuple[Any, ...] = (member.fget, member.fset, member.fdel)
+        parts: tuple[Any, ...] = (member.fget, member.fdel)
     elif isinstance(member, functools.cached_property):
         parts = (member.func,)
     else:
@@ -89,21 +99,17 @@ def _functions(member: Any) -> Iterator[Callable[..., Any]]:
                 yield from _functions(inspect.unwrap(part))
 
 
-def _codes(code: CodeType) -> Iterator[CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _codes(constant)
-
-
 def _stores(code: CodeType) -> Iterator[tuple[str, Any]]:
-    """Each attribute that a function assigns, and the assigned value."""
+    """Each attribute that a function assigns, and the assigned value; those of functions in it, too."""
     instructions = [one for one in dis.get_instructions(code) if one.opname != "CACHE"]
     rebound = {one.argval for one in instructions if one.opname in ("STORE_FAST", "DELETE_FAST")}
     known = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]} - rebound
     for i, one in enumerate(instructions):
         if one.opname == "STORE_ATTR":
             yield one.argval, _source(instructions[max(0, i - 2) : i + 1], known)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _stores(constant)
 
 
 def _source(last: list[dis.Instruction], arguments: set[str]) -> Any:
