@@ -26,6 +26,7 @@ from tupli_mcap import (
     RecordEpisodes,
     Recording,
     RecordingError,
+    TupliDataset,
     TupliEnvWrapper,
     write_rollout,
 )
@@ -150,6 +151,17 @@ class TestRun:
         assert record(tmp_path / "runs", name="a/b c").name.startswith("a_b_c_20")
 
     @pytest.mark.parametrize(
+        ("name", "start"),
+        [(".baseline", "baseline_20"), ("../ppo", "_ppo_20"), ("-v.-x", "v.-x_20"), ("..", "run_20"), ("-", "run_20")],
+    )  # fmt: skip
+    def test_names_no_hidden_file_or_option(self, name: str, start: str, tmp_path: Path) -> None:
+        (tmp_path / "runs").mkdir()
+        path = record(tmp_path / "runs", name=name)
+        assert path.name.startswith(start)
+        assert Recording(path).run.name == name
+        assert len(TupliDataset(tmp_path / "runs")) > 0
+
+    @pytest.mark.parametrize(
         "options",
         [{"name": 3}, {"tags": "abc"}, {"tags": [3]}, {"metadata": [1]}, {"metadata": {"f": object()}},
          {"split": None}, {"capture": "some"}],
@@ -186,7 +198,7 @@ class TestRun:
             env.close()
         names = [path.name for path in sorted((tmp_path / "lab" / "recordings").rglob("*.mcap"))]
         assert [re.sub(r"[0-9a-f]{12}\.mcap$|^\d{8}T\d{6}", "", name) for name in names] == [
-            "-.._.._ppo_seed_3-",
+            "-_.._ppo_seed_3-",
             "-cart-",
         ]
 

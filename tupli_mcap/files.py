@@ -213,5 +213,8 @@ def _remove(path: Path) -> None:
 
 
 def as_file_name(name: str) -> str:
-    """A file name made of `name`: letters, digits, `_`, `-`, `+` and dots, at most 80 bytes."""
-    return re.sub(r"[^\w.+-]+", "_", name).encode()[:80].decode(errors="ignore")
+    """A file name made of `name`: letters, digits, `_`, `-`, `+` and dots, at most 80 bytes.
+
+    It does not begin with dots, which would hide the file, or with dashes, as an option does; so it may be empty.
+    """
+    return re.sub(r"[^\w.+-]+", "_", name.lstrip(".-")).encode()[:80].decode(errors="ignore")

@@ -304,8 +304,8 @@ def oldest_first(items: Iterable[_Item]) -> list[_Item]:
 def new_name(name: str = "") -> str:
     """The name of a new recording's file: time (UTC), a given name, and random digits."""
     now = datetime.datetime.now(datetime.UTC)
-    named = f"{files.as_file_name(name)}-" if name else ""
-    return f"{now:%Y%m%dT%H%M%S}-{named}{secrets.token_hex(6)}.mcap"
+    named = files.as_file_name(name)
+    return f"{now:%Y%m%dT%H%M%S}-{named}{'-' if named else ''}{secrets.token_hex(6)}.mcap"
 
 
 def published_in(groups: Sequence[str], group: str) -> list[str]:

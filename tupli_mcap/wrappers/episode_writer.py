@@ -101,7 +101,7 @@ class EpisodeWriter(Recorder):
         )  # fmt: skip
         options = replace(options, attachments=with_run(given, options, ""))
         self._spaces, self._num_envs = spaces, None if num_envs is None else int(num_envs)
-        self.rotation = Rotation(path, options, format_version(spaces, image_format), name or "run")
+        self.rotation = Rotation(path, options, format_version(spaces, image_format), name or "")
         self._work = Work()
         self._discarded: dict[Path, list[int]] = {}
         self._compression, self._is_plain = compression, options.is_plain

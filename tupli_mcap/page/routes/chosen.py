@@ -108,13 +108,13 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
     first, numbers_of = shelf.ask(ask)
     if first is None:
         raise NotFoundError("no episode matches; choose others, or another filter")
-    name = str(first.run.get("name", "")) or Path(first.recording).stem
+    name = files.as_file_name(str(first.run.get("name", ""))) or files.as_file_name(
+        Path(first.recording).stem
+    )
     count = sum(map(len, numbers_of.values()))
     what = f"episode-{first.episode}" if count == 1 else f"{count}-episodes"
     answer = recording_of(shelf, numbers_of)
-    answer.headers["Content-Disposition"] = (
-        f'attachment; filename="{quote(files.as_file_name(name))}-{what}.mcap"'
-    )
+    answer.headers["Content-Disposition"] = f'attachment; filename="{quote(name)}-{what}.mcap"'
     return answer
 
 

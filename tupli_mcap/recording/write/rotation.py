@@ -42,7 +42,7 @@ class Rotation:
         path: of the first file, or a directory.
         options: how each of the files is written; `mode` is that of the first one.
         format_version: the least one that has what is recorded.
-        name: what a new file in a directory is called, before the time.
+        name: what a new file in a directory is called, before the time; "run" if nothing of it can be in a file name.
 
     Attributes:
         beginning: a context in which the next file is made.
@@ -60,7 +60,7 @@ class Rotation:
         name: str = "run",
     ) -> None:
         check_place(path)
-        self._name = as_file_name(name)
+        self._name = as_file_name(name) or "run"
         self._folder = Path(path) if _is_folder(path) else None
         self._options, self._format_version = options, format_version
         self._limited, self._max_bytes, self._max_seconds = (
