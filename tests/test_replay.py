@@ -176,6 +176,19 @@ def test_a_state_is_compared_bit_for_bit(tmp_path: Path) -> None:
     assert float(first.expected) == pytest.approx(float(first.found) + 0.5)
 
 
+def test_no_more_steps_differ_than_an_episode_has(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 40)
+
+    def change(i: int, episode: EpisodeData) -> EpisodeData:
+        episode.states[:] += 1
+        episode.final_state = np.asarray(episode.final_state) + 1
+        return episode
+
+    first = certify(forge(path, tmp_path / "b.mcap", change)).first
+    assert first is not None
+    assert first.differing_steps == first.length
+
+
 def test_a_different_end_is_named(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 60)
     first = certify(set_flags(path, 0, 4, terminal=True)).first
@@ -230,7 +243,7 @@ def test_hidden_randomness_is_named(tmp_path: Path) -> None:
     first = certificate.first
     assert first is not None
     assert (first.episode, first.step, first.path) == (0, 1, "state[0]")
-    assert first.differing_steps == 20
+    assert first.differing_steps == 19
     assert "not deterministic" in first.hint and "np.random" in first.hint
 
 

@@ -43,7 +43,7 @@ def attempt(
 ) -> Attempt:
     """Runs an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
     first difference."""
-    tally = Tally()
+    tally = Tally(values.length)
     try:
         moment = replayer.start(plan)
         for block in values:

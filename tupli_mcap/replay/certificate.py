@@ -48,7 +48,8 @@ class Divergence(_Model):
     expected, found: the recorded value and the one of the new run, as text.
     largest_difference, largest_step: the largest difference of this leaf in the episode, and its step; None if it is no
         number.
-    differing_steps, length: how many steps of the episode differ, and how many it has. hint: a likely cause, or empty.
+    differing_steps, length: how many steps of the episode differ, the final state counted with the last one, and how
+        many it has. hint: a likely cause, or empty.
     """
 
     kind: Literal["value", "end", "error"]

@@ -42,8 +42,9 @@ class Difference(NamedTuple):
 @dataclass
 class Tally:
     """The differences of one episode: the first one, the number of differing steps, and the largest difference of the
-    leaf that differed first."""
+    leaf that differed first. The final state, which the last step leads to, is counted with it."""
 
+    length: int  # steps of the episode
     first: Difference | None = None
     steps: int = 0
     largest: float | None = None
@@ -56,8 +57,9 @@ class Tally:
         """Adds a difference. Call it in the order of the steps."""
         if self.first is None:
             self.first = difference
-        if difference.step != self._last:
-            self._last = difference.step
+        step = min(difference.step, self.length - 1)
+        if step != self._last:
+            self._last = step
             self.steps += 1
         if difference.leaf != self.first.leaf:
             return
