@@ -526,6 +526,15 @@ def test_reward_outliers(tmp_path: Path) -> None:
     assert "the furthest is 1e+06" in finding.message
 
 
+@pytest.mark.parametrize(("spikes", "told"), [(63, "63 rewards are"), (65, "at least 64 rewards are")])
+def test_reward_outliers_are_counted_up_to_a_limit(tmp_path: Path, spikes: int, told: str) -> None:
+    rewards = [1e6 if i < spikes else i % 5.0 for i in range(1000)]
+    finding = found(
+        examine(by_hand(tmp_path / "a.mcap", [{"length": 1000, "rewards": rewards}])), "reward-outliers"
+    )
+    assert finding.message.startswith(told)
+
+
 @pytest.mark.parametrize("bonus", [1.0, 100.0, -1000.0])
 def test_a_bonus_at_the_end_is_no_outlier(tmp_path: Path, bonus: float) -> None:
     rng = np.random.default_rng(0)

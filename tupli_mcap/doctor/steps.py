@@ -53,6 +53,10 @@ class Largest:
         self.values.sort(key=lambda item: (-item[0], item[1]))
         del self.values[self._k :]
 
+    def may_hide(self, found: int, total: int) -> bool:
+        """Whether there may be more than `found` among `total` values: all that are kept are found."""
+        return found == len(self.values) < total
+
 
 class Frames(Statistic):
     """The images of a leaf. repeated: how many equal the one before in their episode, in every pixel.
@@ -154,15 +158,16 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
             continue
         median, scale = _scale(rewards.sample.values)
         limit = factor * scale
-        outliers = [(value, place) for value, place in rewards.highest.values if value - median > limit]
-        outliers += [(-value, place) for value, place in rewards.lowest.values if median + value > limit]
-        if scale == 0 or not outliers:
+        high = [(value, place) for value, place in rewards.highest.values if value - median > limit]
+        low = [(-value, place) for value, place in rewards.lowest.values if median + value > limit]
+        if scale == 0 or not (high or low):
             continue
-        outliers.sort(key=lambda item: (-abs(item[0] - median), item[1]))
+        outliers = sorted(high + low, key=lambda item: (-abs(item[0] - median), item[1]))
         count, total = len(outliers), rewards.sample.seen
         places = measured.places(place for _, place in outliers)
+        hidden = rewards.highest.may_hide(len(high), total) or rewards.lowest.may_hide(len(low), total)
         message = (
-            f"{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than {factor:g} times the usual "
+            f"{'at least ' if hidden else ''}{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than {factor:g} times the usual "
             f"deviation ({scale:.3g}) from the median ({median:.3g}), {'among' if rewards.last else 'before'} the last "
             f"steps of episodes; the furthest is {outliers[0][0]:g}"
         )
@@ -224,8 +229,7 @@ def clock_jump(
         if not pauses:
             continue
         (longest, _), count, total = pauses[0], len(pauses), clock.gaps.seen
-        # Only the longest gaps are kept: if all of these are pauses, there may be more.
-        more = "at least " if count == len(clock.longest.values) < total else ""
+        more = "at least " if clock.longest.may_hide(count, total) else ""
         message = (
             f"{more}{plural(count, 'step')} came after a pause inside an episode, the longest of {duration(longest)}; "
             f"the median is {duration(median)}"
