@@ -413,6 +413,7 @@ def test_stepping_on_without_a_reset(tmp_path: Path) -> None:
     finding = found(examine(tmp_path / "a.mcap"), "missing-reset")
     assert (finding.severity, finding.count, finding.total) == (WARNING, 3, 6)
     assert places(finding) == [(1, None), (3, None), (5, None)]
+    assert examine(tmp_path / "a.mcap").of("final-state-is-reset") == ()
     assert examine(scripted(tmp_path / "b.mcap")).of("missing-reset") == ()
 
 

@@ -127,7 +127,10 @@ def missing_reset(measured: Measurements) -> Iterator[Finding]:
         return
     verb = "begins" if count == 1 else "begin"
     message = f"{plural(count, 'episode')} of {total:,} {verb} without a reset after the end of another one"
-    advice = "call reset once terminated or truncated is true; leave these episodes out"
+    advice = (
+        "call reset once terminated or truncated is true, or put the recorder inside of the wrapper that resets; leave "
+        "these episodes out"
+    )
     places = measured.episodes(missing)
     yield measured.finding("missing-reset", Severity.WARNING, message, advice, count, total, places)
 
@@ -144,11 +147,13 @@ class FinalStates(Statistic):
     """Final states that equal the first state of the next episode of the same sub-environment.
 
     compared: the number of compared pairs. equal: how many of them are equal; places: the first of these. A pair of
-    episodes that start in the same state is not compared: its states may be equal by chance.
+    episodes that start in the same state is not compared: its states may be equal by chance. Nor is one whose second
+    begins without a reset: its first state is the final state of the first.
     """
 
-    def __init__(self, layout: StepLayout) -> None:
-        self._layout = layout
+    def __init__(self, measured: Measurements) -> None:
+        self._layout = measured.layout
+        self._without_reset = set(measured.rows["episode"][_continued(measured)].tolist())
         self._first = b""  # the first state of the running episode
         # By sub-environment, for the last episode that ended: place of its final state, first state, final state.
         self._ended: dict[int, tuple[StepPlace, bytes, bytes | None]] = {}
@@ -157,7 +162,7 @@ class FinalStates(Statistic):
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[FinalStates]:
-        return [cls(measured.layout)]
+        return [cls(measured)]
 
     def put(self, block: Block) -> None:
         finals = {int(at): i for i, at in enumerate(block.finals_of)}
@@ -165,7 +170,8 @@ class FinalStates(Statistic):
         for i, ((episode, env, length), start) in enumerate(zip(rows, block.starts.tolist(), strict=True)):
             if block.first_step == 0:
                 self._first = self._state(block.leaves, start)
-                self._compare(env)
+                if episode not in self._without_reset:
+                    self._compare(env)
             if block.whole:
                 final = self._state(block.finals, finals[i]) if i in finals else None
                 self._ended[env] = ((episode, length), self._first, final)
@@ -190,7 +196,8 @@ def final_state_is_reset(measured: Measurements, *, least: int = 3, part: float 
 
     A wrapper that resets by itself inside of the recorder makes them: the true last observation is lost, and
     bootstrapping at a timeout takes the value of another episode. A warning if at least `least` episodes and `part` of
-    the compared ones are affected. Episodes that start in the same state are not compared.
+    the compared ones are affected. Episodes that start in the same state, or without a reset (see "missing-reset"), are
+    not compared.
     """
     for finals in measured.statistics(FinalStates):
         count, total = finals.equal, finals.compared
