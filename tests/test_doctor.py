@@ -543,6 +543,28 @@ def test_a_bonus_at_the_end_is_no_outlier(tmp_path: Path, bonus: float) -> None:
     assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()
 
 
+@pytest.mark.parametrize("success", [100.0, -1000.0])
+def test_a_rare_success_is_no_outlier(tmp_path: Path, success: float) -> None:
+    """As of MountainCarContinuous: most episodes end at the limit of steps, some at the goal."""
+    rng = np.random.default_rng(0)
+    at_limit = {"terminals": [False] * 10, "timeouts": [False] * 9 + [True]}
+    episodes = [
+        {"length": 10, "rewards": [*rng.uniform(-0.1, 0, size=9), success]}
+        if i in (3, 9, 20)
+        else {"length": 10, "rewards": rng.uniform(-0.1, 0, size=10).tolist(), **at_limit}
+        for i in range(27)
+    ]
+    assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()
+
+
+def test_a_terminal_reward_far_from_all_others_is_an_outlier(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    episodes = [{"length": 2, "rewards": [0.0, 1e6 if i == 5 else rng.normal()]} for i in range(30)]
+    finding = found(examine(by_hand(tmp_path / "a.mcap", episodes)), "reward-outliers")
+    assert (finding.count, finding.total, places(finding)) == (1, 30, [(5, 1)])
+    assert "among terminal steps; the furthest is 1e+06" in finding.message
+
+
 # --- actions ---
 
 

@@ -61,7 +61,8 @@ def doctor(
 
     Finds NaN and infinities, values outside their space, dimensions that never change,
     actions that never occur, missing terminals, episodes of one step, wrong resets,
-    duplicates, frozen cameras, reward outliers, clock jumps.
+    duplicates, frozen cameras, reward outliers (terminal rewards are compared only with each
+    other), clock jumps.
 
     An error is wrong data, a warning is probably wrong data, an info is worth knowing. The
     command exits with 1 if it finds an error (see --fail-on), or cannot read a file; it

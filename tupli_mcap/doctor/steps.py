@@ -16,6 +16,11 @@ from tupli_mcap.spaces.leaves import Leaf
 _SECOND = 10**9
 _SAMPLE_SIZE = 1 << 16
 _FEWEST_REWARDS = 20
+_KINDS = (  # of steps whose rewards are judged together
+    "before the last steps of episodes",
+    "among the last steps of episodes without a terminal",
+    "among terminal steps",
+)
 # The standard deviation of a normal distribution is 1.4826 times its median absolute deviation. Source: B. Iglewicz and
 # D. C. Hoaglin, How to Detect and Handle Outliers, ASQC 1993, chapter 3.
 _MAD_TO_STD = 1.4826
@@ -121,25 +126,29 @@ def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Findi
 
 
 class Rewards(Statistic):
-    """A sample and the extremes of one scalar reward, either in the last steps of episodes or in all others."""
+    """A sample and the extremes of one scalar reward, in the steps of one kind.
 
-    def __init__(self, leaf: Leaf, total: int, *, last: bool) -> None:
+    kind: which steps, as an index in `_KINDS`.
+    """
+
+    def __init__(self, leaf: Leaf, total: int, kind: int) -> None:
         self.leaf = leaf
-        self.last = last
+        self.kind = kind
         self.sample = Sample(total)
         self.highest, self.lowest = Largest(), Largest()
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[Rewards]:
         leaves = [leaf for leaf in measured.layout.reward if leaf.kind != "variable" and leaf.size == 1]
-        totals = {False: measured.steps, True: len(measured.rows)}
-        return [cls(leaf, total, last=last) for leaf in leaves for last, total in totals.items()]
+        totals = (measured.steps, len(measured.rows), len(measured.rows))
+        return [cls(leaf, total, kind) for leaf in leaves for kind, total in enumerate(totals)]
 
     def put(self, block: Block) -> None:
         rewards = block.leaves[self.leaf.name].astype(np.float64).reshape(-1)
-        is_last = np.zeros(len(rewards), np.bool_)
-        is_last[block.ends if block.whole else block.ends[:-1]] = True
-        steps = np.flatnonzero((is_last == self.last) & np.isfinite(rewards))
+        kinds = np.zeros(len(rewards), np.int64)
+        kinds[block.ends if block.whole else block.ends[:-1]] = 1
+        kinds[block.columns.terminals] = 2
+        steps = np.flatnonzero((kinds == self.kind) & np.isfinite(rewards))
         self.sample.put(rewards[steps])
         self.highest.put(rewards[steps], lambda i: block.place(int(steps[i])))
         self.lowest.put(-rewards[steps], lambda i: block.place(int(steps[i])))
@@ -148,10 +157,11 @@ class Rewards(Statistic):
 def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[Finding]:
     """Rewards further than `factor` scales from the median.
 
-    The last steps of episodes and all others are judged apart, because a bonus at the end is usual. The scale is 1.4826
-    times the median absolute deviation. If most rewards are equal, it is the larger of the median's magnitude and the
-    median of the deviations that are not 0 (if there are at least three). Nothing is found if the scale is 0, or below
-    20 rewards. Of more than 65,536 rewards, a sample gives the median and the scale.
+    Terminal steps, the last steps of other episodes, and all steps before are judged apart, because a reward of success
+    or failure, or a bonus at the end, is usual: such rewards are outliers only among their own kind. The scale is
+    1.4826 times the median absolute deviation. If most rewards are equal, it is the larger of the median's magnitude
+    and the median of the deviations that are not 0 (if there are at least three). Nothing is found if the scale is 0,
+    or below 20 rewards. Of more than 65,536 rewards, a sample gives the median and the scale.
     """
     for rewards in measured.statistics(Rewards):
         if rewards.sample.seen < _FEWEST_REWARDS:
@@ -167,9 +177,9 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
         places = measured.places(place for _, place in outliers)
         hidden = rewards.highest.may_hide(len(high), total) or rewards.lowest.may_hide(len(low), total)
         message = (
-            f"{'at least ' if hidden else ''}{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than {factor:g} times the usual "
-            f"deviation ({scale:.3g}) from the median ({median:.3g}), {'among' if rewards.last else 'before'} the last "
-            f"steps of episodes; the furthest is {outliers[0][0]:g}"
+            f"{'at least ' if hidden else ''}{plural(count, 'reward')} {'is' if count == 1 else 'are'} further than "
+            f"{factor:g} times the usual deviation ({scale:.3g}) from the median ({median:.3g}), "
+            f"{_KINDS[rewards.kind]}; the furthest is {outliers[0][0]:g}"
         )
         advice = "look at these steps; if the rewards are right, clip or scale them for training"
         yield measured.finding(
