@@ -339,6 +339,34 @@ def test_frozen_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_by
     assert examine(path, thresholds={"frozen-frames": {"frames": 31}}).of("frozen-frames") == ()
 
 
+@pytest.mark.parametrize("block_bytes", [1, 8 << 20], ids=["single steps", "whole"])
+@pytest.mark.parametrize("frame_format", ["png", "jpeg"])
+def test_frozen_recorded_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frame_format: Any, block_bytes: int
+) -> None:
+    class Filmed(Scripted):
+        metadata = {"render_modes": ["rgb_array"]}
+        render_mode = "rgb_array"
+
+        def render(self) -> Any:
+            shown = self._step if self._step < 15 or self._step > 44 else 15
+            return np.full((8, 8, 3), 4 * shown, np.uint8)
+
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(
+        Filmed(still, UNIT, length=60), path, frames=True, frame_format=frame_format
+    ) as recorded:
+        roll(recorded, 120)
+    monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
+    finding = found(examine(path), "frozen-frames")
+    assert (finding.severity, finding.leaf, finding.count, finding.total) == (
+        WARNING, "camera 'render'", 2 * 29, 2 * 61
+    )  # fmt: skip
+    assert places(finding) == [(0, 16)]
+    assert finding.message == "30 frames in a row are equal; 48% of all frames repeat the one before"
+    assert examine(path, thresholds={"frozen-frames": {"frames": 31}}).of("frozen-frames") == ()
+
+
 # --- episodes ---
 
 

@@ -56,8 +56,8 @@ class Finding:
     path: the recording; the first one, if several are affected.
     message: one sentence with numbers.
     suggestion: what to do about it.
-    leaf: the affected leaf by its keys in the space (`state['arm']['angle'][0]`, `action`); None for findings about
-        episodes or files.
+    leaf: the affected leaf by its keys in the space (`state['arm']['angle'][0]`, `action`), or the camera of recorded
+        frames (`camera 'render'`); None for findings about episodes or files.
     dimensions: the affected indexes inside the leaf; empty for the whole leaf, and for a scalar.
     count, total: how many values, steps or episodes (the message says which) are affected, and of how many.
     places: the first examples, at most `MAX_PLACES`.

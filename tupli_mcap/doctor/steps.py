@@ -10,6 +10,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.doctor.findings import Finding, Severity, duration, share
 from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace
 from tupli_mcap.errors import plural
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -64,21 +65,32 @@ class Largest:
 
 
 class Frames(Statistic):
-    """The images of a leaf. repeated: how many equal the one before in their episode, in every pixel.
+    """The images of a leaf, or the frames of a camera, of which `name` is a leaf's path or says the camera.
 
+    seen: how many there are; repeated: how many of them equal the one before in their episode, in every pixel.
     longest: how many such there are in a row at most; place: the first of these.
     """
 
-    def __init__(self, leaf: Leaf) -> None:
-        self.leaf = leaf
-        self.repeated = self.longest = 0
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.seen = self.repeated = self.longest = 0
         self.place: StepPlace = (0, 0)
-        self._last: Array = np.empty(0)  # the last image of the block before
-        self._run = 0  # how many images in a row, up to that one, equal the one before
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[Frames]:
-        return [cls(leaf) for leaf in measured.layout.images]
+        recording = measured.recording
+        leaves = [_LeafFrames(leaf) for leaf in measured.layout.images]
+        return [*leaves, *(_CameraFrames(recording, camera) for camera in recording.cameras)]
+
+
+class _LeafFrames(Frames):
+    """The images of a leaf."""
+
+    def __init__(self, leaf: Leaf) -> None:
+        super().__init__(leaf.path)
+        self._leaf = leaf
+        self._last: Array = np.empty(0)  # the last image of the block before
+        self._run = 0  # how many images in a row, up to that one, equal the one before
 
     def put(self, block: Block) -> None:
         repeats = self._repeats(block)
@@ -90,12 +102,13 @@ class Frames(Statistic):
             self.longest = int(runs[end])
             episode, step = block.place(end)
             self.place = (episode, step - self.longest + 1)
+        self.seen += len(repeats)
         self.repeated += int(repeats.sum())
         self._run = int(runs[-1])
 
     def _repeats(self, block: Block) -> Array:
         """Which images equal the one before in their episode (bool)."""
-        frames = block.leaves[self.leaf.name]
+        frames = block.leaves[self._leaf.name]
         flat = frames.reshape(len(frames), -1)
         repeats = np.zeros(len(flat), np.bool_)
         repeats[1:] = (flat[1:] == flat[:-1]).all(axis=1)
@@ -106,23 +119,50 @@ class Frames(Statistic):
         return repeats
 
 
+class _CameraFrames(Frames):
+    """The recorded frames of a camera. They are compared as they are encoded: equal pictures have equal bytes."""
+
+    def __init__(self, recording: Recording, camera: str) -> None:
+        super().__init__(f"camera {camera!r}")
+        self._recording = recording
+        self._camera = camera
+
+    def put(self, block: Block) -> None:
+        if block.first_step == 0:  # else the frames of this episode are known
+            for position in block.positions.tolist():
+                self._episode(position)
+
+    def _episode(self, position: int) -> None:
+        frames = self._recording.frames(position, self._camera)
+        last, run = b"", 0
+        for i in range(len(frames)):
+            data = frames.encoded(i).data
+            run = run + 1 if data == last else 0
+            last = data
+            self.repeated += run > 0
+            if run > self.longest:
+                self.longest = run
+                self.place = (int(self._recording.index["episode"][position]), int(frames.steps[i - run + 1]))
+        self.seen += len(frames)
+
+
 def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Finding]:
     """A frozen camera: `frames` or more consecutive frames of an episode are equal in every pixel.
 
-    Shorter runs are usual, for instance after an action without effect, or while a game waits.
+    Images of the state and frames that were recorded beside it are checked. Shorter runs are usual, for instance after
+    an action without effect, or while a game waits.
     """
     for images in measured.statistics(Frames):
         if images.longest + 1 < frames:
             continue
-        count, total, places = images.repeated, measured.steps, measured.places([images.place])
+        count, total, places = images.repeated, images.seen, measured.places([images.place])
         length = images.longest + 1
         message = (
             f"{length:,} frames in a row are equal; {share(count, total)} of all frames repeat the one before"
         )
         advice = "check whether the camera or the renderer hung, and cut these steps out"
-        yield measured.finding(
-            "frozen-frames", Severity.WARNING, message, advice, count, total, places, images.leaf
-        )
+        path, warning = measured.path, Severity.WARNING
+        yield Finding("frozen-frames", warning, path, message, advice, images.name, (), count, total, places)
 
 
 class Rewards(Statistic):
