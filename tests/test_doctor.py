@@ -814,7 +814,11 @@ def test_command_exit_codes(tmp_path: Path) -> None:
     many = "unused-action.steps_each=5"
     few = scripted(tmp_path / "few.mcap", act=lambda n: n % 2)
     assert run(few, "--fail-on", "warning", "--check", "unused-action", "--set", many)[0] == 1
-    for wrong in ("unused-action.nothing=3", "nothing.frames=3", many.replace("5", "many")):
+    for wrong in (
+        "unused-action.nothing=3",
+        "nothing.frames=3",
+        *(many.replace("5", to) for to in ("many", "nan", "-1")),
+    ):
         assert run(few, "--set", wrong)[0] == 2
     assert run(bad, "--filter", "n_tuples > 10")[0] == 0
 

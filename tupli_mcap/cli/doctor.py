@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -118,9 +119,12 @@ def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, float]]:
         if check not in CHECKS or threshold not in CHECKS[check].thresholds:
             raise typer.BadParameter(f"there is no threshold {name!r}; see tupli-mcap doctor --list --json")
         try:
-            thresholds.setdefault(check, {})[threshold] = float(text)
-        except ValueError as err:
-            raise typer.BadParameter(f"expected a number for {name}, found {text!r}") from err
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not value >= 0:
+            raise typer.BadParameter(f"expected a number from 0 on for {name}, found {text!r}")
+        thresholds.setdefault(check, {})[threshold] = value
     return thresholds
 
 
