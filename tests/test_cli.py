@@ -508,6 +508,16 @@ class TestLook:
         facts = json.loads(ok("info", "i.mcap", "--json", "--episodes", "1,2"))["result"]
         assert (facts["info_keys"], facts["seeds"]) == (["logp", "name", "step"], 1)
 
+    def test_info_of_infos_whose_keys_are_no_texts(self, here: Path) -> None:
+        keys: dict[Any, float] = {1: 2.0, "x": 1.0, 0: 3.0, None: 4.0}
+        with RecordEpisodes(
+            gym.make("CartPole-v1"), here / "i.mcap", step_callback=lambda step: keys
+        ) as recorded:
+            recorded.reset(seed=1)
+            recorded.step(0)
+        out = ok("info", "i.mcap")
+        assert re.search(r"^infos +0, 1, None, x$", out, re.M) and "info.0" in out
+
     def test_info_as_json(self, cartpole: Path, here: Path) -> None:
         told = run("info", cartpole, "--json").json
         with Recording(cartpole) as recording:

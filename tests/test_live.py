@@ -544,7 +544,7 @@ class Told(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         *rest, _ = self.env.step(action)
         self._number += 1
-        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes"}
+        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes", 7: 1}
 
 
 @pytest.mark.parametrize("num_envs", [0, 12])
@@ -574,6 +574,7 @@ def test_numbers_among_infos_come_to_rerun(num_envs: int, tmp_path: Path) -> Non
     assert len(found) > 10
     assert all(wanted[row] == half for row, half in found)
     assert len(shown(tmp_path / "r.rrd", f"{root}/return")[0]) > 10
+    assert len(shown(tmp_path / "r.rrd", "/info/7")[0]) > 10  # a key that is no text
     assert not len(shown(tmp_path / "r.rrd", "/info/word")[0])
 
 

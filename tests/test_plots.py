@@ -696,6 +696,13 @@ def test_huge_numbers_of_infos_are_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(measured(path).numbers["info: k"], [5, 5])
 
 
+def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
+    env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {0: n, "x": 1}, length=4)  # type: ignore[dict-item]
+    made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
+    np.testing.assert_array_equal(made.measured[0].numbers["info: 0"], [2.5, 2.5])
+    assert panel(made, "info: 0")
+
+
 def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:
     env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {"k": np.float32(n)}, length=4)
     path = record(tmp_path / "r.mcap", env, 8, record_info=True)

@@ -352,6 +352,17 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     assert "info 'array'" in card(found)
 
 
+def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
+    def info(step: int) -> dict[Any, Any]:
+        return {0: step / 2, "x": 1.0, 7: "said", (1, 2): np.zeros(3)}
+
+    found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
+    assert np.array_equal(found.scalars("/info/0")[:, 0], np.tile(np.arange(1, 11) / 2, 2))
+    assert len(found.scalars("/info/x")) == 20
+    assert found.rows("/info/7", "TextLog:text")[0] == ["said"]
+    assert r"info '\(1, 2\)'" in card(found)
+
+
 def test_time_in_the_environment_is_a_timeline_where_it_is_known(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("Pendulum-v1"), tmp_path / "pendulum.mcap") as recorder:
         recorder.reset(seed=1)

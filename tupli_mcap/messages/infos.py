@@ -20,6 +20,11 @@ _HEAD = struct.Struct("<II")
 _FIELD = struct.Struct("<d?7x")
 
 
+def with_text_keys(info: Mapping[Any, Any]) -> dict[str, Any]:
+    """An info as people are shown it: an environment may have keys that are no text, such as the numbers of agents."""
+    return {str(key): value for key, value in info.items()}
+
+
 class InfoCodec:
     """Encodes and decodes `/info` messages.
 

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
-from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.infos import InfoCodec, with_text_keys
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
 from tupli_mcap.recording import Recording
@@ -154,8 +154,8 @@ def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array
 
 def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
     """The entries of an info or of metadata that are numbers, except those for success."""
-    for key, value in said.items() if isinstance(said, Mapping) else ():
-        if isinstance(key, str) and key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
+    for key, value in with_text_keys(said).items() if isinstance(said, Mapping) else ():
+        if key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
             if isinstance(value, np.floating):
                 value = float(value)  # a float32 cannot be compared with LARGEST
             # an integer may be too large for a float

@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
-from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.infos import InfoCodec, with_text_keys
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
@@ -98,7 +98,8 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
 
 
 def sampled_infos(recording: Recording, positions: Array) -> list[dict[str, Any]]:
-    """Infos of steps of these episodes: all, or of a long recording some at even distances; none of a URL."""
+    """Infos of steps of these episodes, by the texts of their keys: all, or of a long recording some at even
+    distances; none of a URL."""
     file = recording.file
     channel = file.topics.get(INFO)
     total = 0 if channel is None or recording.path is None else file.store.count(channel)
@@ -112,7 +113,7 @@ def sampled_infos(recording: Recording, positions: Array) -> list[dict[str, Any]
     wanted = set(recording.index["episode"][positions].tolist())
     starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
     bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)
-    return [info for episode, _, info in map(codec.decode, bodies) if episode in wanted]
+    return [with_text_keys(info) for episode, _, info in map(codec.decode, bodies) if episode in wanted]
 
 
 def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[Series]:

@@ -47,7 +47,8 @@ class NewSteps(NamedTuple):
 
 
 class NewInfo(NamedTuple):
-    """The recorded infos of the step in row `row` of a sub-environment's channel; `time_ns` is wall clock."""
+    """The recorded infos of the step in row `row` of a sub-environment's channel, by the texts of their keys; `time_ns`
+    is wall clock."""
 
     row: int
     time_ns: int
