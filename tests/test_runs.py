@@ -469,7 +469,14 @@ class TestAnnotations:
             verify_signature(Recording(path))
 
     @pytest.mark.parametrize(
-        "data", [b"{}", b"[3]", b'[{"episodes": [-1], "values": {}, "by": "", "at": ""}]', b"\xff"]
+        "data",
+        [
+            b"{}",
+            b"[3]",
+            b'[{"episodes": [-1], "values": {}, "by": "", "at": ""}]',
+            b'[{"episodes": [0], "values": {"$dict": [[1, 2]]}, "by": "", "at": ""}]',
+            b"\xff",
+        ],
     )
     def test_that_are_damaged_are_said(self, data: bytes, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap")

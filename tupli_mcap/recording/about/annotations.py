@@ -81,6 +81,7 @@ def _is_annotation(value: object) -> bool:
         isinstance(numbers, list)
         and all(type(number) is int and 0 <= number < 1 << 32 for number in numbers)
         and isinstance(value["values"], dict)
+        and all(isinstance(key, str) for key in value["values"])
         and isinstance(value["by"], str)
         and isinstance(value["at"], str)
     )
