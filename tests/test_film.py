@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.replay import film
 
 
@@ -112,6 +113,19 @@ def test_some_pictures_of_a_size(tmp_path: Path) -> None:
         assert image.size[0] == 40
     told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "e.gif"), "--camera", "front"])
     assert (told.exit_code, "it has render, state" in told.output) == (1, True)
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".gif"])
+@pytest.mark.parametrize("seconds", [900, 1e-300, 1e300])
+def test_of_steps_that_last_longer_or_shorter_than_films_hold(
+    seconds: float, kind: str, tmp_path: Path
+) -> None:
+    path = record(tmp_path / "r.mcap", Camera(), 1)
+    add_attachments(path, {"labels.json": ("application/json", b'{"step_seconds": %r}' % seconds)})
+    episode = tupli_mcap.open(path)[0]
+    assert episode.recording.labels.step_seconds == seconds
+    episode.video(tmp_path / f"film{kind}")
+    assert shown(tmp_path / f"film{kind}")[0] == 250
 
 
 @pytest.mark.parametrize("target", [None, "film.mp4", "film.gif"])

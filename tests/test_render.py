@@ -186,6 +186,11 @@ class TestOutput:
             assert [e.number for e in recording.episodes] == [0, 2]
         shows(tmp_path / "new.mcap", [0, 2])
 
+    def test_steps_that_last_longer_than_films_hold(self, tmp_path: Path) -> None:
+        path = recorded(tmp_path / "r.mcap")
+        add_attachments(path, {"labels.json": ("application/json", b'{"step_seconds": 900}')})
+        assert render(path, tmp_path / "film.gif", episodes=[0]).fps == 1 / 600
+
     @pytest.mark.parametrize("width", [None, 31])
     def test_mp4(self, tmp_path: Path, width: int | None) -> None:
         path = recorded(tmp_path / "r.mcap", gym.make("CartPole-v1"), 2)

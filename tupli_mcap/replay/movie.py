@@ -24,6 +24,7 @@ from tupli_mcap.messages.images.pictures import (
     resized,
 )
 
+_SLOWEST, _FASTEST = 1 / 600, 1e6  # pictures a second: GIF holds durations up to 655 seconds
 _GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
 _GIF_SAMPLE = 15_000  # about so many pixels of a larger picture are sampled to choose its colours
@@ -114,6 +115,11 @@ def check_pictures(every: int, width: int | None) -> None:
         raise RecordingError(
             f"expected every >= 1 and a width of 1 to 16384, found {every!r:.40} and {width!r:.40}"
         )
+
+
+def film_rate(fps: float) -> float:
+    """The nearest number of pictures a second that films of all kinds hold: from one in 10 minutes to a million."""
+    return min(max(fps, _SLOWEST), _FASTEST)
 
 
 def _av() -> Any:

@@ -16,7 +16,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.images.pictures import Picture, resized
 from tupli_mcap.recording import Episode
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.replay.movie import check_goal, check_pictures, write_movie
+from tupli_mcap.replay.movie import check_goal, check_pictures, film_rate, write_movie
 from tupli_mcap.spaces.leaves import Leaf
 
 _KINDS = (".mp4", ".gif")
@@ -67,7 +67,8 @@ def film(
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
         camera: a camera, or the path of an image in the states, such as `state['wrist']`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
-        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`.
+        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`. A
+            picture is shown for at most 10 minutes.
         every: only every n-th picture of an episode, and its last one.
         width: of the film (pixels). By default as recorded; small pictures become larger, by a whole number.
 
@@ -93,7 +94,8 @@ def film(
             if i % every == 0 or i == number - 1
         )
         with replacing(goal) as (_, path):
-            write_movie(path, kind, pictures, count, fps or (1 / seconds if seconds else _FPS) / every)
+            rate = film_rate(fps or (1 / seconds if seconds else _FPS) / every)
+            write_movie(path, kind, pictures, count, rate)
         return Film(count, kind, None if target is None else goal, goal.read_bytes())
 
 

@@ -21,7 +21,7 @@ from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.replay.attempt import Watch
 from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
 from tupli_mcap.replay.certify import Certifier
-from tupli_mcap.replay.movie import RenderedFrames, check_goal, check_pictures, write_movie
+from tupli_mcap.replay.movie import RenderedFrames, check_goal, check_pictures, film_rate, write_movie
 from tupli_mcap.replay.reapply import Replayer
 from tupli_mcap.replay.starts import EpisodePlan
 
@@ -45,7 +45,7 @@ class RenderReport(NamedTuple):
     episodes: the chosen episodes that were begun, in their order.
     divergence: the first difference from the recording, at which rendering stopped; None if there is none.
     skipped: episodes that cannot be run again.
-    fps: frames a second of environment time.
+    fps: frames a second of environment time, or the nearest number that films hold.
     width, height: size of the frames (pixels); 0 without frames.
     signature_left_out: whether the recording has a signature that the new file lacks.
     """
@@ -198,8 +198,8 @@ class _Renderer(Certifier):
 
     @property
     def fps(self) -> float:
-        """Frames a second of environment time."""
-        return (self._fps or _FPS) / self._every
+        """Frames a second of environment time, or the nearest number that films hold."""
+        return film_rate((self._fps or _FPS) / self._every)
 
     def report(
         self, path: Path | None, chosen: list[int], skipped: Sequence[Skipped], seconds: float
