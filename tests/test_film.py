@@ -128,6 +128,19 @@ def test_of_steps_that_last_longer_or_shorter_than_films_hold(
     assert shown(tmp_path / f"film{kind}")[0] == 250
 
 
+@pytest.mark.parametrize(("kind", "shape"), [(".mp4", (1, 60_000, 3)), (".gif", (1, 70_000, 3))])
+def test_pictures_larger_than_films_hold_are_refused(
+    kind: str, shape: tuple[int, ...], tmp_path: Path
+) -> None:
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera(shape), 1))[0]
+    with pytest.raises(
+        RecordingError, match=f"that {kind} can hold, found {shape[1]} x 1 pixels; give another"
+    ):
+        episode.video(tmp_path / f"film{kind}")
+    assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
+    assert episode.video(tmp_path / f"film{kind}", width=320).pictures == 5
+
+
 @pytest.mark.parametrize("target", [None, "film.mp4", "film.gif"])
 def test_a_notebook_shows_it(target: str | None, tmp_path: Path) -> None:
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[0]

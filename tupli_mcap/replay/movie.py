@@ -27,6 +27,7 @@ from tupli_mcap.messages.images.pictures import (
 _SLOWEST, _FASTEST = 1 / 600, 1e6  # pictures a second: GIF holds durations up to 655 seconds
 _GIF_FPS = 50  # browsers slow faster ones down to 10 frames a second
 _GIF_COLOURS = 256
+_GIF_PIXELS = (1 << 16) - 1  # of the longer side
 _GIF_SAMPLE = 15_000  # about so many pixels of a larger picture are sampled to choose its colours
 _CODECS = ("libx264", "h264", "mpeg4")
 
@@ -131,18 +132,29 @@ def _av() -> Any:
 
 
 def write_movie(path: Path, kind: str, pictures: Iterator[Picture], count: int, fps: float) -> None:
-    """Writes `count` pictures as ".mp4" or ".gif"; all get the size of the first one. RecordingError if that fails."""
+    """Writes `count` pictures as ".mp4" or ".gif"; all get the size of the first one. RecordingError if that fails, as
+    of pictures that are too large."""
     first = next(pictures)
-    size = first.shape[1], first.shape[0]
+    width, height = size = first.shape[1], first.shape[0]
     rest = (resized(picture, *size) for picture in pictures)
-    if kind == ".mp4":
-        _write_mp4(path, first, rest, fps)
-    else:
+    failed = RecordingError(
+        f"expected pictures that {kind} can hold, found {width} x {height} pixels; give another width (--width)"
+    )
+    if kind == ".gif":
+        if max(size) > _GIF_PIXELS:
+            raise failed
         _write_gif(path, first, rest, count, fps)
-
-
-def _write_mp4(path: Path, first: Picture, rest: Iterator[Picture], fps: float) -> None:
+        return
     av = _av()
+    try:
+        _write_mp4(av, path, first, rest, fps)
+    except av.FFmpegError as err:
+        if isinstance(err, OSError):  # a full disk, say
+            raise
+        raise failed from err
+
+
+def _write_mp4(av: Any, path: Path, first: Picture, rest: Iterator[Picture], fps: float) -> None:
     rate = Fraction(fps).limit_denominator(1000)
     codec = next((name for name in _CODECS if name in av.codecs_available), "")
     if not codec:

@@ -81,7 +81,7 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
     except FormatError:
         raise
     except Exception as err:  # Pillow's decoders raise many kinds
-        raise FormatError(f"{where}: expected a PNG or a JPEG, found {bytes(data[:16])!r}: {err}") from err
+        raise FormatError(f"{where}: expected a PNG or a JPEG, found {_unread(data, err)}") from err
 
 
 def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
@@ -113,7 +113,13 @@ def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np
     except FormatError:
         raise
     except Exception as err:  # Pillow's decoders raise many kinds
-        raise FormatError(f"expected a PNG, found {bytes(data[:16])!r}: {err}") from err
+        raise FormatError(f"expected a PNG, found {_unread(data, err)}") from err
+
+
+def _unread(data: bytes | memoryview, err: Exception) -> str:
+    """The first bytes of what is no picture, and Pillow's reason, unless it only says that it does not know them."""
+    found = repr(bytes(data[:16]))
+    return found if isinstance(err, pillow().UnidentifiedImageError) else f"{found}: {err}"
 
 
 def format_of(data: bytes | memoryview) -> FrameFormat | None:
