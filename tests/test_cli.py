@@ -848,6 +848,11 @@ def test_a_file_cut_off_later_is_read_up_to_there(here: Path, cartpole: Path) ->
     assert (told["state"], told["error"]) == ("incomplete", None)
 
 
+@pytest.mark.parametrize("command", [("edit", "--name", "x"), ("compact",), ("tag", "--undo"), ("info",)])
+def test_a_file_that_does_not_exist(command: tuple[str, ...], here: Path) -> None:
+    assert "no.mcap does not exist; give" in fails(*command, "no.mcap")
+
+
 def test_episodes_of_what_is_missing(here: Path) -> None:
     assert (
         fails("episodes", "bad.mcap") == "there is no file 'bad.mcap'; give the path of a recording (.mcap)"

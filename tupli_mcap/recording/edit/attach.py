@@ -41,9 +41,11 @@ def held(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     If a new attachment depends on the old one, read the old one within the block, then `attach` the new one.
 
-    RecordingError if another writer holds the lock for longer than a moment.
+    RecordingError if there is no file, or another writer holds the lock for longer than a moment.
     """
     place = Path(os.path.realpath(path))  # the file that a symbolic link names is replaced, not the link
+    if not place.exists():
+        raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)")
     lock = FileLock(place, "a")
     try:
         yield place
