@@ -848,6 +848,16 @@ def test_a_file_cut_off_later_is_read_up_to_there(here: Path, cartpole: Path) ->
     assert (told["state"], told["error"]) == ("incomplete", None)
 
 
+@pytest.mark.parametrize(
+    "command", [("info",), ("verify", "--rerun"), ("render", "-o", "x.gif"), ("doctor",), ("tag", "a=1")]
+)
+def test_an_empty_choice_of_episodes_is_refused(command: tuple[str, ...], cartpole: Path, here: Path) -> None:
+    """As from a variable of a shell that is not set."""
+    path = shutil.copy(cartpole, here / "r.mcap")
+    assert "expected numbers of episodes such as '3,7-9'" in fails(*command, path, "-e", "", code=2)
+    assert not (here / "x.gif").exists()
+
+
 @pytest.mark.parametrize("command", [("edit", "--name", "x"), ("compact",), ("tag", "--undo"), ("info",)])
 def test_a_file_that_does_not_exist(command: tuple[str, ...], here: Path) -> None:
     assert "no.mcap does not exist; give" in fails(*command, "no.mcap")

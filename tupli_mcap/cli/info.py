@@ -137,7 +137,8 @@ def info(
     with Recording(source) as recording:
         positions = candidates(recording, wanted)  # without deleted episodes
         if episodes is not None or wanted is not None:
-            positions = np.array(sorted(named_positions(recording, positions, episodes or "all", wanted)))
+            which = "all" if episodes is None else episodes
+            positions = np.array(sorted(named_positions(recording, positions, which, wanted)))
         description = describe(recording, positions)
         if not as_json:
             print_facts(_facts(description))

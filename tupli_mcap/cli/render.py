@@ -82,8 +82,9 @@ def render(
 
     # nothing is shown on a screen: pygame must not look for one
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    wanted = "best" if episodes is None else episodes
     with (
-        _chosen(source, episodes or "best", filter_of(filter_text)) as (recording, chosen),
+        _chosen(source, wanted, filter_of(filter_text)) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         which = _which(recording, chosen)

@@ -129,7 +129,7 @@ class _Replays:
         if episodes is not None or wanted is not None:  # spares the import
             from tupli_mcap.dataset.which import check_choice
 
-            check_choice(episodes or "all", wanted)
+            check_choice("all" if episodes is None else episodes, wanted)
         self._trust = trust
         self._episodes = episodes
         self._wanted = wanted
@@ -182,7 +182,8 @@ class _Replays:
         among = candidates(recording, self._wanted)
         if self._wanted is not None and not len(among):
             return []
-        positions = named_positions(recording, among, self._episodes or "all", self._wanted)
+        which = "all" if self._episodes is None else self._episodes
+        positions = named_positions(recording, among, which, self._wanted)
         return [int(number) for number in recording.index["episode"][positions]]
 
     def to_json(self) -> list[dict[str, Any]]:
