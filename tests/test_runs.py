@@ -694,6 +694,8 @@ class TestCommands:
         assert "grade" not in Recording(path).episodes[0].metadata
         command("tag", path, "--undo")
         assert Recording(path).episodes[0].metadata["grade"] == 1.5
+        command("tag", path, "--episodes", "0", "much=1e400")
+        assert Recording(path).episodes[0].metadata["much"] == "1e400"
         wrong = CliRunner().invoke(app, ["edit", path, "lr=0.5"])
         assert "lr=0.5 is no recording; to change metadata of the run, give --set lr=0.5" in wrong.output
         command(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -128,7 +129,8 @@ def filter_of(text: str | None) -> BaseFilter | None:
 
 
 def pair_of(text: str) -> tuple[str, Any]:
-    """Splits KEY=VALUE. An empty value is None, True and False are bools, JSON is read as such, all else is text."""
+    """Splits KEY=VALUE. An empty value is None, True and False are bools, JSON is read as such, all else is text; so is
+    a number that is too large for a float."""
     from tupli_mcap import jsonvalue
     from tupli_mcap.errors import FormatError
 
@@ -140,9 +142,10 @@ def pair_of(text: str) -> tuple[str, Any]:
     if value in ("True", "False"):
         return key, value == "True"
     try:
-        return key, jsonvalue.loads(value)
+        found = jsonvalue.loads(value)
     except (FormatError, ValueError, RecursionError):
         return key, value
+    return key, value if isinstance(found, float) and math.isinf(found) else found
 
 
 def open_storage(path: Path, *, create: bool = False) -> FileStorage:
