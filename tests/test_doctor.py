@@ -593,6 +593,11 @@ def test_a_terminal_reward_far_from_all_others_is_an_outlier(tmp_path: Path) -> 
     assert "among terminal steps; the furthest is 1e+06" in finding.message
 
 
+def test_rewards_whose_sums_overflow_are_no_outliers(tmp_path: Path) -> None:
+    episodes = [{"length": 11, "rewards": [1e308] * 11}] * 3
+    assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()
+
+
 # --- actions ---
 
 

@@ -27,6 +27,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.copies import MOST_MERGED
+from tupli_mcap.page.curves import curves_of, values_at
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
 from tupli_mcap.schema import EpisodeHeader
@@ -236,6 +237,18 @@ class TestEpisodes:
         last = web.get(f"/episode/{uri}/step/19").json()
         assert last["end"] == {"end": "terminal"}
         assert web.get(f"/episode/{uri}/step/20").status_code == 404
+
+    def test_returns_that_overflow(self, tmp_path: Path) -> None:
+        space, n = gym.spaces.Discrete(2), 4
+        flags = [False] * n
+        episode = tupli_mcap.EpisodeData([0] * n, [0] * n, [1e308] * n, flags, flags)
+        tupli_mcap.write_recording(
+            tmp_path / "r.mcap", [episode], observation_space=space, action_space=space
+        )
+        with tupli_mcap.Recording(tmp_path / "r.mcap") as recording:
+            assert curves_of(recording.episodes[0]).tracks
+            told = values_at(recording.episodes[0], 3)
+        assert told["reward"] == {"reward": "1e+308", "return so far": "inf"}
 
     def test_pictures(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]

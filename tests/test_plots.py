@@ -696,6 +696,11 @@ def test_huge_numbers_of_infos_are_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(measured(path).numbers["info: k"], [5, 5])
 
 
+def test_returns_that_overflow_are_drawn_without_warning(tmp_path: Path) -> None:
+    env = Scripted(lambda n: UNIT.low, UNIT, reward=lambda n: 1e308 if n < 4 else -1e308, length=8)
+    assert panel(report(record(tmp_path / "r.mcap", env, 16)), "return")
+
+
 def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
     env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {0: n, "x": 1}, length=4)  # type: ignore[dict-item]
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))

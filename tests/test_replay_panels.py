@@ -77,6 +77,19 @@ def test_the_card_leaves_returns_that_are_nan_out(tmp_path: Path, returns: list[
     assert f"| return | {told} |" in card(Rrd(viewer.save(tmp_path / "r.mcap", tmp_path / "r.rrd")))
 
 
+def test_returns_that_overflow_stay_in_their_episodes(tmp_path: Path) -> None:
+    space = spaces.Discrete(2)
+    n = 3
+    episodes = [
+        EpisodeData([0] * n, [0] * n, rewards, [False, False, True], [False] * n)
+        for rewards in ([1e308] * n, [1.0] * n)
+    ]
+    write_recording(tmp_path / "r.mcap", episodes, observation_space=space, action_space=space)
+    found = Rrd(viewer.save(tmp_path / "r.mcap", tmp_path / "r.rrd"))
+    returns = found.scalars("/return")[:, 0]
+    assert returns[np.isfinite(returns)].tolist() == [1e308, 1, 2, 3]
+
+
 def test_dimensions_of_other_scales_are_other_entities(tmp_path: Path) -> None:
     scales = np.array([1.0, 500.0, 2.0, 0.001, 0.0])
     found = replayed(tmp_path, Sampled(Box(-np.inf, np.inf, (5,), np.float64), lambda t: scales * (t + 1)))

@@ -229,9 +229,10 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
 
 def _scale(values: Array) -> tuple[float, float]:
     """The median, and the usual distance of values from it."""
-    median = float(np.median(values))
-    deviations = np.abs(values - median)
-    spread = _MAD_TO_STD * float(np.median(deviations))
+    with np.errstate(over="ignore", invalid="ignore"):  # nothing is far from a median beyond all floats
+        median = float(np.median(values))
+        deviations = np.abs(values - median)
+        spread = _MAD_TO_STD * float(np.median(deviations))
     if spread > 0:
         return median, spread
     others = deviations[deviations > 0]

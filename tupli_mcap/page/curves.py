@@ -72,7 +72,8 @@ def curves_of(episode: Episode) -> Curves:
     for field, leaf, column in numbers_of(layout, columns):
         tracks += _tracks(field, leaf, recording.labels, column, notes)
         if field == "reward" and leaf.size == 1:
-            so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
+            with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are not drawn
+                so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
             tracks.append(_track("reward", SO_FAR, np.arange(read, dtype=np.float64), so_far))
     tracks += _info_tracks(recording, episode, read, notes)
     if read < len(episode):
@@ -103,7 +104,8 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     }
     if layout.reward[0].size == 1:
         rewards = recording.read_steps(episode.position, 0, step + 1, ("rewards",)).rewards
-        told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.5g}"
+        with np.errstate(over="ignore", invalid="ignore"):
+            told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.5g}"
     if columns.terminals[0] or columns.timeouts[0]:
         told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
     if _few_infos(recording):

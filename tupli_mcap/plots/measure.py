@@ -229,7 +229,8 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     most = READ_BYTES // step_bytes(recording.layout, images=False)
     columns, steps = _read(recording, np.array([position]), most)
     rewards = np.concatenate([columns[leaf.leaf.name] for leaf in measured.rewards], axis=1)
-    totals = drawable_numbers(rewards.astype(np.float64).sum(axis=1).cumsum())
+    with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are not drawn
+        totals = drawable_numbers(rewards.astype(np.float64).sum(axis=1).cumsum())
     values = {
         leaf.leaf.name: thinned(drawable_numbers(columns[leaf.leaf.name][:, leaf.elements]), width)
         for leaf in measured.leaves

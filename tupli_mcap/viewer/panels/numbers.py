@@ -67,8 +67,9 @@ class Rewards:
             place.stream.log(f"{place.root}/end/{name}", points, static=True)
 
     def send(self, place: Place, block: Block, times: Times) -> None:
-        rewards = self._totals(block)
-        returns = self._returns(rewards, block)
+        with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are infinite, or NaN
+            rewards = self._totals(block)
+            returns = self._returns(rewards, block)
         send_lines(place, "/reward", times, rewards[:, None])
         send_lines(place, "/return", times, returns[:, None])
         heights = np.where(np.isfinite(returns), returns, 0.0)  # a marker needs a finite position
@@ -91,8 +92,8 @@ class Rewards:
     def _returns(self, rewards: Array, block: Block) -> Array:
         """The return so far, after each step."""
         returns = np.empty(len(rewards))
-        if np.isfinite(rewards).all():
-            sums = np.cumsum(rewards)
+        sums = np.cumsum(rewards)
+        if np.isfinite(sums).all():
             first = np.array([piece.begin for piece in block.pieces])
             lengths = np.array([piece.end - piece.begin for piece in block.pieces])
             returns = sums - np.repeat(sums[first] - rewards[first], lengths)
