@@ -29,8 +29,8 @@ from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.merge import merge_recordings
 from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
+from tupli_mcap.recording.write import writer
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.replay.render import render
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -107,7 +107,7 @@ def test_killed_appended_rewritten_and_repaired(tmp_path: Path) -> None:
 
 def test_a_file_without_steps_keeps_its_version(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
-    RecordingWriter(path, RecordOptions(), keep_empty=True).close()
+    writer.RecordingWriter(path, RecordOptions(), keep_empty=True).close()
     with pytest.raises(RecordingError, match="begun in format version 1, holds no step"):
         RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a", image_format="png")
     with RecordEpisodes(Sampler(SPACE, spaces.Discrete(2), length=9), path, mode="a") as env:
@@ -287,9 +287,9 @@ def formats(path: Path) -> dict[str, str]:
 
 def test_a_leaf_keeps_its_format(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Earlier versions left stacks as they are; such recordings go on, and none is made of two formats."""
-    path = tmp_path / "old.mcap"
+    path, register = tmp_path / "old.mcap", writer.register_channels
     with monkeypatch.context() as patch:
-        patch.setattr(RecordingWriter, "_png", lambda self, layout: frozenset({"state_seen"}))
+        patch.setattr(writer, "register_channels", lambda *given: register(*given[:-1], {"state_seen"}))
         with beside(path, image_format="png") as env:
             states = play(env, 40)
     old = {"state_last": "raw", "state_seen": "png"}
