@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from commands import Result, run
+from command_line import Result, run
 from environments import Scripted
 from gymnasium.envs.classic_control import CartPoleEnv
 from mcap.writer import Writer

@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from commands import run
+from command_line import run
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from PIL import Image

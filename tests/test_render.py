@@ -12,7 +12,7 @@ import av
 import gymnasium as gym
 import numpy as np
 import pytest
-from commands import run
+from command_line import run
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519
 from drawing import Drawing, Drifting, drawn

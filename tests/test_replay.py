@@ -13,7 +13,7 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
-from commands import run
+from command_line import run
 from crafted import set_flags
 from cryptography.hazmat.primitives import serialization as ser
 from cryptography.hazmat.primitives.asymmetric import ed25519
