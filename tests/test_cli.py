@@ -320,10 +320,21 @@ class TestRecord:
         assert found.endswith("see tupli-mcap record --help")
 
     def test_the_library_refuses_no_steps(self, here: Path) -> None:
-        with pytest.raises(RecordingError, match="expected at least 1 step and 1 environment, found 0 and 1"):
+        with pytest.raises(RecordingError, match="expected at least 1 step, .* found steps=0, episodes=None"):
             record_rollouts("CartPole-v1", "a.mcap", steps=0)
         with pytest.raises(RecordingError, match="must have the form module:function"):
             load_policy(":act")
+
+    def test_a_rollout_of_episodes_ends_with_the_last_one(self, here: Path) -> None:
+        run("record", "CartPole-v1", "-o", "a.mcap", "--episodes", "3", "--seed", "1")
+        with Recording(here / "a.mcap") as recording:
+            assert [episode.end for episode in recording] == ["terminal"] * 3
+        summary = record_rollouts("CartPole-v1", "b.mcap", episodes=4, num_envs=3, seed=1)
+        with Recording(here / "b.mcap") as recording:
+            ends = [episode.end for episode in recording]
+            assert ends.count("terminal") in (4, 5, 6) and len(ends) == summary.episodes
+            assert recording.num_steps == summary.steps
+        assert record_rollouts("CartPole-v1", "c.mcap", steps=5, episodes=2, seed=1).steps == 5
 
     def test_progress_grows_to_the_end(self, here: Path) -> None:
         told: list[int] = []

@@ -36,7 +36,15 @@ _Output = Annotated[
         "--output", "-o", metavar="FILE|DIR/", help="The new recording (.mcap), or a directory for it."
     ),
 ]
-_Steps = Annotated[int, typer.Option(min=1, help="How many steps to record, in total.")]
+_Steps = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="How many steps to record, in total; by default 1000 if --episodes is not given."
+    ),
+]
+_Episodes = Annotated[
+    int | None, typer.Option(min=1, help="How many episodes to record: the rollout ends with the last one.")
+]
 _Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the first reset and of random actions.")]
 _NumEnvs = Annotated[int, typer.Option(min=1, help="How many sub-environments to step together.")]
 _Policy = Annotated[
@@ -101,7 +109,8 @@ _Capture = Annotated[
 def record(
     env_id: _EnvId,
     output: _Output,
-    steps: _Steps = 1000,
+    steps: _Steps = None,
+    episodes: _Episodes = None,
     seed: _Seed = None,
     num_envs: _NumEnvs = 1,
     policy: _Policy = None,
@@ -132,17 +141,17 @@ def record(
         raise typer.BadParameter("--every thins out frames; give --frames too")
     if frames:  # nothing is shown on a screen: pygame must not look for one
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
+    from tupli_mcap.wrappers.rollout import STEPS, load_policy, record_rollouts
 
     if policy is not None or ":" in env_id:
         sys.path.append("")  # last, so that a file in this directory replaces no installed module
     function = None if policy is None else load_policy(policy)
     with (
         _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode == "w"),
-        step_progress(steps) as progress,
+        step_progress(steps if steps or episodes else STEPS) as progress,
     ):
         summary = record_rollouts(
-            env_id, output, steps=steps, seed=seed, num_envs=num_envs, policy=function, mode=mode,
+            env_id, output, steps=steps, episodes=episodes, seed=seed, num_envs=num_envs, policy=function, mode=mode,
             compression=compression, record_info=record_info, durability=durability, live=live,
             frames=every if frames else False, capture_env=None if capture_env == "none" else capture_env,
             max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=dict(map(pair_of, settings or ())),

@@ -180,8 +180,9 @@ def confirmed(question: str) -> bool:
 
 
 @contextlib.contextmanager
-def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
-    """Shows a progress bar; yields a function that takes the number of steps done, or None if it cannot show one."""
+def step_progress(total: int | None, what: str = "recording") -> Iterator[Callable[[int], None] | None]:
+    """Shows a progress bar, of `total` steps if that is known; yields a function that takes the number of steps done,
+    or None where none can be shown."""
     from tupli_mcap.progress import alone, can_redraw
 
     if not can_redraw():
@@ -194,7 +195,7 @@ def step_progress(total: int, what: str = "recording") -> Iterator[Callable[[int
     columns = TextColumn(what), *shown
     with alone(), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("steps", total=total)
-        yield lambda done: progress.update(task, completed=min(done, total))
+        yield lambda done: progress.update(task, completed=min(done, total or done))
 
 
 @contextlib.contextmanager

@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +24,7 @@ from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
 Policy = Callable[[Any], Any]
 """A function from one observation (never a batch) to one action."""
+STEPS: Final = 1000  # of a rollout, unless steps or episodes are given
 _REPORTS = 200  # reports of progress in a rollout, about
 
 
@@ -47,19 +49,22 @@ def record_rollouts(
     env_id: str,
     path: str | os.PathLike[str],
     *,
-    steps: int = 1000,
+    steps: int | None = None,
+    episodes: int | None = None,
     seed: int | None = None,
     num_envs: int = 1,
     policy: Policy | None = None,
     progress: Callable[[int], None] | None = None,
     **options: Any,
 ) -> RolloutSummary:
-    """Records `steps` steps of a registered environment into the MCAP file `path`.
+    """Records steps or episodes of a registered environment into the MCAP file `path`.
 
     Args:
         env_id: as `gymnasium.make` takes it; "module:Name-v0" imports the module first.
-        steps: in total; with several sub-environments at least this many. The last episode may end
-            "interrupted".
+        steps: in total, by default 1000 if no `episodes` are given; with several sub-environments at least this many.
+            The last episode may end "interrupted".
+        episodes: ends the rollout once this many episodes have ended, over all sub-environments; the episodes of the
+            other ones end "interrupted".
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
@@ -71,17 +76,21 @@ def record_rollouts(
             recorded before is in the file), or the file cannot be written.
         SpaceError: a space that cannot be recorded.
     """
-    if steps < 1 or num_envs < 1:
-        raise RecordingError(f"expected at least 1 step and 1 environment, found {steps} and {num_envs}")
+    limit = _Limit(steps, episodes)
+    if limit.steps < 1 or limit.episodes < 1 or num_envs < 1:
+        raise RecordingError(
+            "expected at least 1 step, 1 episode and 1 environment, "
+            f"found steps={steps}, episodes={episodes}, num_envs={num_envs}"
+        )
     began = time.perf_counter()
     asked = RecordOptions(**options)
-    report = _every(max(1, steps // _REPORTS), progress)
+    report = _every(max(1, (steps or 100 * _REPORTS) // _REPORTS), progress)
     with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if asked.every else None)) as made:
         is_vector = isinstance(made, gym.vector.VectorEnv)
         wrapped: Any = (RecordVectorEpisodes if is_vector else RecordEpisodes)(made, path, **options)
         known = wrapped._writer.index.count
         with _closing(wrapped, asked.mode):
-            done = (_run_vector if is_vector else _run)(wrapped, steps, seed, policy, report)
+            done = (_run_vector if is_vector else _run)(wrapped, limit, seed, policy, report)
     return _summary(wrapped.paths, known, done, time.perf_counter() - began)
 
 
@@ -145,14 +154,31 @@ def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator
         raise
 
 
+class _Limit:
+    """When a rollout is over: after so many steps, or so many episodes that have ended."""
+
+    def __init__(self, steps: int | None, episodes: int | None) -> None:
+        self.episodes = sys.maxsize if episodes is None else episodes
+        self.steps = steps if steps is not None else STEPS if episodes is None else sys.maxsize
+
+    def allows(self, steps: int, episodes: int) -> bool:
+        """Whether the rollout goes on after these."""
+        return steps < self.steps and episodes < self.episodes
+
+
 def _run(
-    env: RecordEpisodes, steps: int, seed: int | None, policy: Policy | None, report: Callable[[int], None]
+    env: RecordEpisodes,
+    limit: _Limit,
+    seed: int | None,
+    policy: Policy | None,
+    report: Callable[[int], None],
 ) -> int:
-    """Takes the steps, and calls `report` with their number so far."""
+    """Takes the steps, and calls `report` with their number so far; returns it."""
     env.action_space.seed(seed)
+    done = episodes = 0
     ended, again = True, seed
     state: Any = None
-    for done in range(steps):
+    while limit.allows(done, episodes):
         with _failures(done, env.path):
             if ended:
                 state, _ = env.reset(seed=again)
@@ -160,31 +186,34 @@ def _run(
             action = env.action_space.sample() if policy is None else policy(state)
             state, _, terminal, timeout, _ = env.step(action)
             ended = bool(terminal or timeout)
-        report(done + 1)
-    return steps
+        done, episodes = done + 1, episodes + ended
+        report(done)
+    return done
 
 
 def _run_vector(
     env: RecordVectorEpisodes,
-    steps: int,
+    limit: _Limit,
     seed: int | None,
     policy: Policy | None,
     report: Callable[[int], None],
 ) -> int:
     """The same with several sub-environments; returns how many steps were taken."""
     env.action_space.seed(seed)
-    done = 0
+    done = episodes = 0
     with _failures(done, env.path):
         states, _ = env.reset(seed=seed)
     resetting = np.zeros(env.num_envs, dtype=np.bool_)
     next_step = "next" in str(env.metadata.get("autoreset_mode", "next")).lower()
-    while done < steps:
+    while limit.allows(done, episodes):
         with _failures(done, env.path):
             actions = env.action_space.sample() if policy is None else _actions(env, policy, states)
             states, _, terminals, timeouts, _ = env.step(actions)
             done += env.num_envs - int(resetting.sum())
+            ended = np.logical_or(terminals, timeouts)
+            episodes += int(ended.sum())
             if next_step:  # the step after an end is a reset, which is not recorded
-                resetting = np.logical_or(terminals, timeouts)
+                resetting = ended
         report(done)
     return done
 
