@@ -9,6 +9,17 @@ import gymnasium as gym
 import numpy as np
 
 
+class Fails(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment whose step raises once it is told to."""
+
+    fails = False
+
+    def step(self, action: Any) -> Any:
+        if self.fails:
+            raise TimeoutError("no answer")
+        return self.env.step(action)
+
+
 class Sampler(gym.Env[Any, Any]):
     """Returns samples of its spaces; an episode has `length` steps, every third one ends by timeout."""
 

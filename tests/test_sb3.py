@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Sampler, Scripted, same
+from environments import Fails, Sampler, Scripted, same
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
@@ -243,14 +243,6 @@ def test_both_ends_at_once_are_a_terminal(tmp_path: Path) -> None:
 
 
 def test_a_step_that_raises_is_followed_by_a_reset(tmp_path: Path) -> None:
-    class Fails(gym.Wrapper[Any, Any, Any, Any]):
-        fails = False
-
-        def step(self, action: Any) -> Any:
-            if self.fails:
-                raise TimeoutError("no answer")
-            return self.env.step(action)
-
     last = Fails(Sampler(BOX, BOX))
     venv = DummyVecEnv([lambda: Sampler(BOX, BOX), lambda: last])
     with VecRecordEpisodes(venv, tmp_path / "run.mcap") as venv:

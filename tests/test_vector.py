@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Sampler, same
+from environments import Fails, Sampler, same
 from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from gymnasium.vector.utils import iterate
@@ -300,17 +300,6 @@ def test_a_batch_that_cannot_be_stored(tmp_path: Path) -> None:
     assert [len(e) for e in Recording(tmp_path / "r.mcap").episodes] == [1] * 6
     with pytest.raises(RecordingError, match="is closed"):
         env.step([2, 3, 4])
-
-
-class Fails(gym.Wrapper[Any, Any, Any, Any]):
-    """An environment whose step raises once it is told to."""
-
-    fails = False
-
-    def step(self, action: Any) -> Any:
-        if self.fails:
-            raise TimeoutError("no answer")
-        return self.env.step(action)
 
 
 @pytest.mark.parametrize("mode", MODES, ids=name_of)

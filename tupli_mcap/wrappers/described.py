@@ -44,10 +44,7 @@ _PACKAGES: Final = {  # distributions, by the module that says whether one is at
 }  # fmt: skip
 _LONGEST: Final = 1000  # characters of an argument
 _PATIENCE: Final = 2.0  # seconds for git
-_SIZES: Final = (
-    "stack_size",
-    "num_stack",
-)  # attributes of FrameStackObservation, and of Gymnasium's older FrameStack
+_SIZES: Final = ("stack_size", "num_stack")  # of FrameStackObservation, and of Gymnasium's older FrameStack
 
 
 # ---- the environment
