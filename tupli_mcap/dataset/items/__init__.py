@@ -2,7 +2,7 @@
 
 steps                          the interface that items read from; steps in memory
 beside                         steps with infos and frames; infos as columns
-recorded, index, segments      reads steps from recordings; finds them; finds the chunks with their rows
+recorded, index, segments      reads steps from recordings, by `recording.columns`; finds them; finds their chunks
 kept                           caches decoded columns
 items                          the base of windows, transitions and delta windows; reads them in batches, also ahead
 windows, transitions, deltas   the three kinds of items
