@@ -16,9 +16,8 @@ from environments import Sampler, roll
 from gymnasium import spaces
 
 import tupli_mcap
-from tupli_mcap import Dataset, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
+from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.jsonvalue import loads
-from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeMetadataCallback
 
 SPACE = spaces.Box(-1, 1, (1,), np.float32)

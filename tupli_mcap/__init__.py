@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         UntrustedError as UntrustedError,
     )
     from tupli_mcap.recording import (
+        Episode as Episode,
         EpisodeData as EpisodeData,
         Recording as Recording,
         RecoveryReport as RecoveryReport,
@@ -92,8 +93,8 @@ _HOMES = {
         "SpaceError StepError StorageError TupliError UntrustedError"
     ),
     "recording": (
-        "EpisodeData Recording RecoveryReport Step VerifyReport journal_path recover_recording rewrite_recording "
-        "verify_recording write_recording"
+        "Episode EpisodeData Recording RecoveryReport Step VerifyReport journal_path recover_recording "
+        "rewrite_recording verify_recording write_recording"
     ),
     "schema": (
         "EpisodeMetadataCallback F FilterAND FilterCONTAINS FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "
