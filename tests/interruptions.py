@@ -281,7 +281,7 @@ def _check(
         found = list(transitions(files))
         for file in files:
             with Recording(file) as recording:
-                assert recording.complete or not recording.num_steps
+                assert recording.complete or not recording.n_steps
             report = verify_recording(file)
             assert report.ok, (file.name, report.problems)
     if before:

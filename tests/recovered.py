@@ -35,7 +35,7 @@ def differences(path: Path, directory: Path, *, killed: bool = False) -> list[st
         report = recover_recording(path, target, overwrite=True)
     with opened as recording:
         if report.target is None:
-            return [] if recording.num_steps == 0 else [f"{recording.num_steps} steps are not recovered"]
+            return [] if recording.n_steps == 0 else [f"{recording.n_steps} steps are not recovered"]
         more = bool(report.cut or report.lost or report.steps_lost or _is_behind_a_gap(path, recording))
         if killed and more:
             return [f"after a kill: {report}"]

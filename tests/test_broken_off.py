@@ -194,7 +194,7 @@ def test_a_callback_that_survives_a_flush_in_vain_does_not_go_on(tmp_path: Path)
     assert len(taken) == 10
     env.close()
     with Recording(tmp_path / "r.mcap") as recording:
-        assert recording.num_steps == 11  # the one that was refused is there, too
+        assert recording.n_steps == 11  # the one that was refused is there, too
         assert verify_recording(tmp_path / "r.mcap").ok
 
 
@@ -229,7 +229,7 @@ def test_nothing_is_recorded_once_it_was_closed_from_within(tmp_path: Path, when
         with pytest.raises(RecordingError, match="is closed"):
             use()
     with Recording(tmp_path / "r.mcap") as recording:
-        assert len(taken) <= recording.num_steps <= len(taken) + 1
+        assert len(taken) <= recording.n_steps <= len(taken) + 1
 
 
 def test_a_recorder_that_the_disk_refused_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

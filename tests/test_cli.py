@@ -163,7 +163,7 @@ class TestRecord:
             r"a\.mcap: \d+ episodes, 300 steps, mean return [\d.]+, [\d.]+ kB in [\d.]+ s\n", out
         )
         with Recording("a.mcap") as recording:
-            assert recording.num_steps == 300
+            assert recording.n_steps == 300
             assert recording.episodes[0].seed == 7
             assert recording.benchmark.record.name == "CartPole-v1"
         ok("record", "CartPole-v1", "-o", "b.mcap", "--steps", 300, "--seed", 7)
@@ -179,7 +179,7 @@ class TestRecord:
         told = run("record", "CartPole-v1", "-o", "v.mcap", "--steps", 301, "--num-envs", 3, "--json").json
         with Recording("v.mcap") as recording:
             assert recording.num_envs == 3
-            assert recording.num_steps == told["steps"]
+            assert recording.n_steps == told["steps"]
             assert 301 <= told["steps"] < 304
             assert len(recording) == told["episodes"]
             assert recording.benchmark.record.name == "CartPole-v1"
@@ -190,7 +190,7 @@ class TestRecord:
             for _ in range(2)
         ]
         assert sorted(made) == made
-        assert [Recording(path).num_steps for path in made] == [10, 10]
+        assert [Recording(path).n_steps for path in made] == [10, 10]
 
     def test_modes(self, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
@@ -203,14 +203,14 @@ class TestRecord:
         told = run("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "a", "--json").json
         assert told["steps"] == 30
         with Recording("a.mcap") as recording:
-            assert recording.num_steps == 70
+            assert recording.n_steps == 70
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "w")
         with Recording("a.mcap") as recording:
-            assert recording.num_steps == 30
+            assert recording.n_steps == 30
         for n in (20, 40):
             ok("record", "CartPole-v1", "-o", "new.mcap", "--steps", 20, "--mode", "a")
             with Recording("new.mcap") as recording:
-                assert recording.num_steps == n
+                assert recording.n_steps == n
                 assert recording.benchmark.record.name == "CartPole-v1"
 
     def test_compression_and_infos(self, here: Path) -> None:
@@ -282,7 +282,7 @@ class TestRecord:
             "a.mcap holds the steps before it"
         )
         with Recording("a.mcap") as recording:
-            assert recording.num_steps == 9
+            assert recording.n_steps == 9
 
     def test_environments_that_cannot_be_made(self, here: Path) -> None:
         line = fails("record", "NoSuchEnvironment-v0", "-o", "a.mcap")
@@ -333,7 +333,7 @@ class TestRecord:
         with Recording(here / "b.mcap") as recording:
             ends = [episode.end for episode in recording]
             assert ends.count("terminal") in (4, 5, 6) and len(ends) == summary.episodes
-            assert recording.num_steps == summary.steps
+            assert recording.n_steps == summary.steps
         assert record_rollouts("CartPole-v1", "c.mcap", steps=5, episodes=2, seed=1).steps == 5
 
     def test_progress_grows_to_the_end(self, here: Path) -> None:
@@ -384,8 +384,8 @@ class TestRecord:
             _, err = process.communicate(timeout=120)
         with Recording("a.mcap") as recording:
             assert recording.complete
-            assert recording.num_steps > 0
-            held = f"{len(recording):,} episodes, {recording.num_steps:,} steps"
+            assert recording.n_steps > 0
+            held = f"{len(recording):,} episodes, {recording.n_steps:,} steps"
         assert (process.returncode, err) == (130, f"interrupted; a.mcap holds {held}\n")
 
     @pytest.mark.parametrize(("limits", "files"), [((), 1), (("--max-bytes", 20_000), 3)])

@@ -50,6 +50,9 @@ def test_of_a_file_and_back(runs: Path) -> None:
     assert "deleted 2 episodes" in run("delete", str(file), "--episodes", "1,last")
     assert seeds(file) == [0, 2]
     assert file.read_bytes() == before
+    with Recording(file) as recording:  # has all that the file has
+        assert [recording.n_steps, len(recording.dataset)] == [12, 2]
+        assert len(recording) == len(recording.lengths) == len(recording.returns) == 4
     assert seeds(runs) == [0, 2, 0, 1, 2, 3]
     run("delete", str(file), "--episodes", "1", code=1)  # it is not there any more
     assert "would restore 2 episodes" in run("restore", str(runs), "--dry-run")

@@ -89,7 +89,7 @@ def test_without_seals_only_what_shows_to_be_whole_counts(tmp_path: Path) -> Non
     place.write_bytes(story.moments[-1].file)
     journal_path(place).write_bytes(story.moments[-1].journal or b"")
     with pytest.warns(UserWarning, match=r"was restarted afterwards.*1 step\(s\) in its journal.*left out"):
-        assert Recording(place).num_steps == 3  # in the file: there was a flush
+        assert Recording(place).n_steps == 3  # in the file: there was a flush
 
 
 def test_small_rows_are_shown_to_be_whole_by_those_after_them(tmp_path: Path) -> None:
@@ -99,7 +99,7 @@ def test_small_rows_are_shown_to_be_whole_by_those_after_them(tmp_path: Path) ->
     journal_path(place).write_bytes(story.moments[-1].journal or b"")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        assert 29 <= Recording(place).num_steps <= 30
+        assert 29 <= Recording(place).n_steps <= 30
 
 
 def test_on_the_same_boot_every_row_counts(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_on_the_same_boot_every_row_counts(tmp_path: Path) -> None:
     shutil.copy(path, copy)
     shutil.copy(journal_path(path), journal_path(copy))
     env.close()
-    assert Recording(copy).num_steps == 5
+    assert Recording(copy).n_steps == 5
 
 
 def test_a_disk_that_does_not_sync_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def test_a_disk_that_does_not_sync_is_an_error(tmp_path: Path, monkeypatch: pyte
             RecordingError, match=r"r\.mcap.*: could not be synced to the disk: Input/output error"
         ):
             env.close()
-    assert Recording(tmp_path / "r.mcap").num_steps == 1
+    assert Recording(tmp_path / "r.mcap").n_steps == 1
 
 
 def test_durability_costs_syncs_where_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,7 +80,7 @@ def test_an_image_chunk_that_is_refused_is_no_wrong_step(tmp_path: Path) -> None
     env.close()  # there is space again
     with Recording(tmp_path / "r.mcap") as recording:
         assert recording.complete
-        assert recording.num_steps >= 5
+        assert recording.n_steps >= 5
 
 
 def test_a_disk_that_cannot_be_read_is_no_defect(tmp_path: Path) -> None:

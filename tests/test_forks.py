@@ -148,7 +148,7 @@ class TestAsyncVectorEnv:
         for i in range(2):
             with Recording(tmp_path / f"{i}.mcap") as recording:
                 assert recording.complete
-                assert recording.num_steps >= 17  # a reset in between takes a step of its own
+                assert recording.n_steps >= 17  # a reset in between takes a step of its own
                 assert recording.episodes[0].seed == 3 + i
 
     def test_a_terminated_worker_loses_nothing(self, tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ class TestAsyncVectorEnv:
         for _ in range(5):
             envs.step(np.array([0, 1]))
         envs.close(terminate=True)
-        assert [Recording(tmp_path / f"{i}.mcap").num_steps for i in range(2)] == [5, 5]
+        assert [Recording(tmp_path / f"{i}.mcap").n_steps for i in range(2)] == [5, 5]
 
     def test_workers_share_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")
@@ -180,7 +180,7 @@ class TestAsyncVectorEnv:
             env.reset(seed=1)
             for _ in range(5):
                 env.step(np.array([0, 1]))
-        assert Recording(tmp_path / "a.mcap").num_steps == 10
+        assert Recording(tmp_path / "a.mcap").n_steps == 10
 
 
 class Rows:
@@ -190,7 +190,7 @@ class Rows:
         self.recording = recording
 
     def __len__(self) -> int:
-        return self.recording.num_steps
+        return self.recording.n_steps
 
     def __getitem__(self, i: int) -> Any:
         ends = np.cumsum(self.recording.index["length"].astype(int))
@@ -276,7 +276,7 @@ class TestForkedChildren:
             steps = [step for episode in recording.episodes for step in episode]
             assert len(steps) == 51
             assert all(same(step.state, before) for step, (before, *_) in zip(steps, seen, strict=False))
-        assert Recording(tmp_path / "b.mcap").num_steps == 9
+        assert Recording(tmp_path / "b.mcap").n_steps == 9
 
     @pytest.mark.parametrize("ends", [False, True])
     def test_cannot_begin_the_parents_next_episode(self, tmp_path: Path, ends: bool) -> None:
@@ -299,11 +299,11 @@ class TestForkedChildren:
 
         assert in_child(child) == 0
         with Recording(path) as recording:
-            assert recording.num_steps == count
+            assert recording.n_steps == count
         env.reset()
         env.step(1)
         env.close()
-        assert Recording(path).num_steps == count + 1
+        assert Recording(path).n_steps == count + 1
 
     @pytest.mark.parametrize("method", ["fork", "program"])
     def test_that_outlive_a_killed_writer_hold_nothing(self, tmp_path: Path, method: str) -> None:
@@ -325,7 +325,7 @@ class TestForkedChildren:
             os.kill(survivor, 0)
             with cart_pole(path, mode="a") as env:
                 roll(env, 5)
-            assert Recording(path).num_steps == 35
+            assert Recording(path).n_steps == 35
             assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "told"]
         finally:
             os.kill(survivor, signal.SIGKILL)

@@ -113,7 +113,7 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
         assert_same(list(as_read(recording)), expected(name))
         number = list(tool("make_golden").FEATURES).index(name)
         assert int(recording.uuid, 16) == 1 + number or name == "rewritten"
-        assert recording.num_steps == sum(len(episode["rewards"]) for episode in expected(name))
+        assert recording.n_steps == sum(len(episode["rewards"]) for episode in expected(name))
 
 
 @pytest.mark.parametrize("name", UNFINISHED)
@@ -216,7 +216,7 @@ def test_fields_can_be_left_out(name: str, without: tuple[str, str], tmp_path: P
 def test_other_readers_decode_every_message(name: str, tmp_path: Path) -> None:
     path = finished(name, tmp_path)
     with Recording(path) as recording:
-        layout, steps, episodes = recording.layout, recording.num_steps, len(recording)
+        layout, steps, episodes = recording.layout, recording.n_steps, len(recording)
         lengths = {episode.number: len(episode) for episode in recording.episodes}
         states = {e.number: [step.state for step in e] for e in recording.episodes}
     seen: dict[str, int] = {}

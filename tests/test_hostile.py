@@ -399,7 +399,7 @@ def test_metadata_that_is_no_object(text: bytes, tmp_path: Path) -> None:
     path = tmp_path / "hostile.mcap"
     path.write_bytes(with_texts(text))
     with Recording(path) as recording:
-        assert len(recording.read().rewards) == recording.num_steps
+        assert len(recording.read().rewards) == recording.n_steps
         if text:
             with pytest.raises(FormatError, match="expected"):
                 _ = recording.episodes[0].metadata

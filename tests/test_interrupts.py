@@ -139,7 +139,7 @@ def test_recording_at_any_line(tmp_path: Path, mode: str) -> None:
     words = ["record", "CartPole-v1", "--steps", "40", "--seed", "1"]
     assert run([*words, "-o", first], 1 << 60)[1] == 0
     assert len(Recording(first)) >= 1
-    steps = Recording(first).num_steps
+    steps = Recording(first).n_steps
     for line in random.Random(mode).choices(range(1, 12_000), k=3):
         path = tmp_path / f"{mode}{line}.mcap"
         if mode != "x":
@@ -151,6 +151,6 @@ def test_recording_at_any_line(tmp_path: Path, mode: str) -> None:
             continue
         with Recording(path) as recording:
             assert recording.complete
-            assert recording.num_steps >= (steps if mode == "a" else 1)
-            assert len(recording.read().states) == recording.num_steps
+            assert recording.n_steps >= (steps if mode == "a" else 1)
+            assert len(recording.read().states) == recording.n_steps
         assert [p.name for p in tmp_path.iterdir() if p.suffix != ".mcap"] == []

@@ -213,7 +213,7 @@ def test_nothing_of_a_killed_writer_stays_behind(tmp_path: Path) -> None:
     assert Recording(path).complete
     make("a").close()
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
-    assert Recording(path).num_steps == 1
+    assert Recording(path).n_steps == 1
 
 
 def _count(path: Path, mode: Any) -> RecordEpisodes:
@@ -262,7 +262,7 @@ def test_the_journal_of_what_was_replaced_goes_though_the_replacing_was_killed(
         in_a_process_that_dies(lambda: _as_soon_as_it_is_there(path))
         assert journal_path(path).exists()
         with Recording(path) as recording:
-            assert (recording.metadata["replaced"], recording.num_steps) == (uuid, 1)
+            assert (recording.metadata["replaced"], recording.n_steps) == (uuid, 1)
             uuid = recording.uuid
     report = recover_recording(path, tmp_path / "recovered.mcap")
     assert (report.journal, report.notes) == ("used", [])
@@ -271,7 +271,7 @@ def test_the_journal_of_what_was_replaced_goes_though_the_replacing_was_killed(
     (tmp_path / "recovered.mcap").unlink()
     with _count(path, mode) as env:
         _take(env, 3)
-    assert Recording(path).num_steps == (4 if mode == "a" else 3)
+    assert Recording(path).n_steps == (4 if mode == "a" else 3)
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
 
 
@@ -287,7 +287,7 @@ def test_the_journal_of_what_was_renamed_stays_though_its_successor_was_killed(
         _take(env, 3)
     (journal,) = tmp_path.glob("*.journal")
     journal.rename(journal_path(kept))
-    assert (Recording(kept).num_steps, Recording(path).num_steps) == (7, 3)
+    assert (Recording(kept).n_steps, Recording(path).n_steps) == (7, 3)
 
 
 @pytest.mark.parametrize("mode", ["w", "a"])
@@ -304,8 +304,8 @@ def test_a_recording_that_never_took_the_place_of_another_leaves_nothing(tmp_pat
 
     in_a_process_that_dies(die_before_the_file_is_there)
     assert journal_path(path).exists()
-    assert Recording(path).num_steps == 7
+    assert Recording(path).n_steps == 7
     with _count(path, mode) as env:
         _take(env, 3)
-    assert Recording(path).num_steps == (10 if mode == "a" else 3)
+    assert Recording(path).n_steps == (10 if mode == "a" else 3)
     assert [file.name for file in tmp_path.iterdir() if not files.is_temporary(file.name)] == ["r.mcap"]

@@ -641,7 +641,7 @@ def test_the_command_records_live(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     client.join()
     with Recording(tmp_path / "r.mcap") as recording:
-        assert recording.num_steps == 3000
+        assert recording.n_steps == 3000
     done = CliRunner().invoke(
         app, ["record", "CartPole-v1", "-o", str(tmp_path / "n.mcap"), "--live", "rviz"]
     )
@@ -680,7 +680,7 @@ def test_a_viewer_may_come_later_be_killed_and_come_back(
     assert len(rows) > 50
     assert rows.max() == steps - 1
     with Recording(path) as recording:
-        assert (recording.complete, recording.num_steps) == (True, steps)
+        assert (recording.complete, recording.n_steps) == (True, steps)
 
 
 @pytest.mark.timeout(120)
@@ -695,7 +695,7 @@ def test_a_viewer_that_stops_taking_data_holds_nothing_up(tmp_path: Path) -> Non
         os.killpg(process.pid, signal.SIGKILL)
     with Recording(path) as recording:
         assert recording.complete
-        assert recording.num_steps > 3000
+        assert recording.n_steps > 3000
 
 
 def test_something_else_listens_at_the_viewers_port(
@@ -1023,7 +1023,7 @@ def test_a_forked_child_has_no_view_and_the_parent_goes_on(tmp_path: Path) -> No
     rows, _ = shown(tmp_path / "r.rrd", "/state")
     assert len(np.unique(rows)) == 200
     with Recording(path) as recording:
-        assert (recording.complete, recording.num_steps) == (True, 200)
+        assert (recording.complete, recording.n_steps) == (True, 200)
 
 
 def test_a_collected_wrapper_ends_its_view(tmp_path: Path) -> None:

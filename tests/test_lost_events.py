@@ -195,9 +195,9 @@ def test_rows_before_holes_are_shown_to_be_whole(tmp_path: Path, monkeypatch: py
         warnings.simplefilter("ignore", UserWarning)
         with Recording(copy) as recording, Recording(path) as wanted:
             n = len(recording.index)
-            assert 88 <= recording.num_steps <= 90
+            assert 88 <= recording.n_steps <= 90
             assert (recording.index["length"][:-1] == 3).all()
-            assert same(recording.read().states, wanted.read().states[: recording.num_steps])
+            assert same(recording.read().states, wanted.read().states[: recording.n_steps])
             assert [recording.final_state(i) is None for i in range(n)][-10:] == [True] * 10
 
 

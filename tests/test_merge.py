@@ -182,7 +182,7 @@ class TestMerge:
             assert [e.number for e in merged.episodes] == list(range(len(merged)))
             times = [t for one in opened for t in one.read(fields=["times"]).times.tolist()]
             assert merged.read(fields=["times"]).times.tolist() == times
-            assert (report.episodes, report.steps, report.held) == (len(merged), merged.num_steps, 0)
+            assert (report.episodes, report.steps, report.held) == (len(merged), merged.n_steps, 0)
             assert merged.metadata["next_episode"] == str(len(merged))
         assert report.size == report.path.stat().st_size
         first = chunks_of(paths[0])
@@ -473,7 +473,7 @@ class TestSplit:
         for part in parts:
             assert_sound(part.path)
             with Recording(part.path) as recording:
-                assert (len(recording), recording.num_steps) == (part.episodes, part.steps)
+                assert (len(recording), recording.n_steps) == (part.episodes, part.steps)
                 assert [recording.episodes[i].number for i in (0, -1)] == [part.first, part.last]
                 found += facts(recording)
         with Recording(path) as recording:

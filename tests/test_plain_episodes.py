@@ -297,7 +297,7 @@ def test_broken_off_as_an_episode_ends(tmp_path: Path, monkeypatch: pytest.Monke
             go_on()
     env.close()
     with Recording(path) as recording:
-        assert recording.num_steps == steps
+        assert recording.n_steps == steps
         assert len(recording.episodes) == (1 if begun == "seeded" else 5)
         assert recording.episodes[-1].end in ("terminal", "timeout")
         assert same(recording.episodes[-1].final_state, state)
@@ -330,6 +330,6 @@ def test_a_flush_that_failed_after_an_end(tmp_path: Path) -> None:
             go_on()
     env.close()  # the file may grow again
     with Recording(path) as recording:
-        assert (recording.num_steps, len(recording.episodes)) == (steps, 5)
+        assert (recording.n_steps, len(recording.episodes)) == (steps, 5)
         assert recording.episodes[-1].end in ("terminal", "timeout")
         assert same(recording.episodes[-1].final_state, state)

@@ -114,7 +114,7 @@ def test_gymnasiums_own_check_passes(tmp_path: Path) -> None:
         warnings.simplefilter("ignore", UserWarning)  # about wrappers and infinite bounds
         check_env(env, skip_render_check=True, skip_close_check=True)
     env.close()
-    assert Recording(tmp_path / "r.mcap").num_steps > 0
+    assert Recording(tmp_path / "r.mcap").n_steps > 0
 
 
 def test_under_and_over_other_wrappers(tmp_path: Path) -> None:
@@ -470,7 +470,7 @@ def test_steps_after_an_end_are_an_episode_of_their_own(tmp_path: Path) -> None:
 def test_data_is_written_before_the_environment_is_closed(tmp_path: Path) -> None:
     class Inner(gym.Wrapper[Any, Any, Any, Any]):
         def close(self) -> None:
-            self.found = Recording(tmp_path / "r.mcap").num_steps
+            self.found = Recording(tmp_path / "r.mcap").n_steps
             super().close()
 
     inner = Inner(gym.make("CartPole-v1"))
@@ -628,7 +628,7 @@ def test_infos_and_entries_that_are_no_dicts(tmp_path: Path, given: Any) -> None
             recorded.reset()
             with pytest.raises(RecordingError, match=f"^{what}: expected a dict, found "):
                 recorded.step(0)
-        assert Recording(tmp_path / "r.mcap").num_steps == 1
+        assert Recording(tmp_path / "r.mcap").n_steps == 1
 
 
 # ---- files
@@ -783,7 +783,7 @@ def test_two_writers_of_one_file_are_refused(tmp_path: Path) -> None:
             with pytest.raises(RecordingError, match="is being recorded by another writer"):
                 RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", mode=mode)  # type: ignore[arg-type]
         roll(env, 10)
-    assert Recording(tmp_path / "r.mcap").num_steps == 20
+    assert Recording(tmp_path / "r.mcap").n_steps == 20
 
 
 def test_a_recording_is_readable_while_it_grows(tmp_path: Path) -> None:
@@ -791,7 +791,7 @@ def test_a_recording_is_readable_while_it_grows(tmp_path: Path) -> None:
         for round_ in range(1, 5):
             roll(env, 40)
             recording = Recording(tmp_path / "r.mcap")
-            assert (recording.num_steps, recording.complete) == (40 * round_, False)
+            assert (recording.n_steps, recording.complete) == (40 * round_, False)
 
 
 def test_flush_in_any_state(tmp_path: Path) -> None:
@@ -889,7 +889,7 @@ def test_a_masked_array_is_refused_at_any_step(tmp_path: Path, size: int) -> Non
         env.step(0)
         with pytest.raises(StepError, match="whose mask cannot be recorded"):
             env.step(0)
-    assert Recording(tmp_path / "r.mcap").num_steps == 2
+    assert Recording(tmp_path / "r.mcap").n_steps == 2
 
 
 def test_named_tuples_are_tuples(tmp_path: Path) -> None:
@@ -1032,7 +1032,7 @@ def test_the_journal_stays_where_the_recording_is(tmp_path: Path, monkeypatch: p
     (journal,) = files("journals")
     assert re.fullmatch(r"other\.mcap\.[0-9a-f]{32}\.journal", journal)
     for path in ("here/plain.mcap", "here/other.mcap", "here/linked.mcap", "there/link.mcap"):
-        assert Recording(path).num_steps == 1
+        assert Recording(path).n_steps == 1
     for env in (plain, elsewhere, linked):
         env.close()
     assert files("here") == ["linked.mcap", "other.mcap", "plain.mcap"]
@@ -1280,6 +1280,6 @@ class TestReplacing:
         with RecordEpisodes(Counting(), old, mode="w") as env:
             env.reset()
             env.step(0)
-            assert Recording(old).num_steps == 1
-        assert Recording(old).num_steps == 1
+            assert Recording(old).n_steps == 1
+        assert Recording(old).n_steps == 1
         assert list(old.parent.iterdir()) == [old]

@@ -71,7 +71,7 @@ def test_appending_finishes_what_a_killed_writer_left(tmp_path: Path) -> None:
     recording = Recording(path)
     assert recording.complete
     assert np.array_equal(recording.read().states[:100], before.states)
-    assert recording.num_steps == 150
+    assert recording.n_steps == 150
     assert not journal_path(path).exists()
 
 
@@ -121,7 +121,7 @@ def test_a_journal_elsewhere(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     abandon(path, lambda p: cart_pole(p, journal_dir=tmp_path / "fast"), 10)
     assert [p.suffix for p in (tmp_path / "fast").iterdir()] == [".journal"]
-    assert Recording(path).num_steps == 10
+    assert Recording(path).n_steps == 10
 
 
 def test_a_missing_journal_is_said(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_stale_journal_of_another_recording_is_left_alone(tmp_path: Path) -> N
     shutil.copy(journal_path(second), journal_path(first))
     with pytest.warns(UserWarning, match=r"a\.mcap\.journal is the journal of another recording"):
         recording = Recording(first)
-    assert 0 < recording.num_steps < 100
+    assert 0 < recording.n_steps < 100
 
 
 UNREADABLE: dict[str, Callable[[bytes], bytes]] = {
@@ -181,7 +181,7 @@ def test_a_journal_that_cannot_be_read_is_not_taken_for_none(how: str, steps: in
     assert "the journal cannot be read" in found.notes[0]
     assert CliRunner().invoke(app, ["recover", str(path), "--force"]).exit_code == (steps == 10)
     with Recording(attached) as recording:
-        kept = recording.num_steps
+        kept = recording.n_steps
         assert (kept > 0) == (steps == 100)
         assert kept == 0 or np.array_equal(recording.read().states, whole[:kept])
     assert {item.name: item.read_bytes() for item in tmp_path.iterdir() if item.name in before} == before
@@ -199,7 +199,7 @@ def test_beside_a_finished_recording_no_journal_matters(tmp_path: Path) -> None:
         cart_pole(path, mode="a") as env,
     ):
         roll(env, 5)
-    assert Recording(path).num_steps == 15
+    assert Recording(path).n_steps == 15
     (kept,) = tmp_path.glob("*.journal")
     assert kept.read_bytes() == b"of another version"
 
@@ -276,7 +276,7 @@ def test_a_forked_child_neither_records_nor_holds_the_file(tmp_path: Path) -> No
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 42
     roll(env, 5)
     env.close()
-    assert Recording(path).num_steps == 10
+    assert Recording(path).n_steps == 10
 
 
 def test_a_full_disk_is_one_clear_error_and_the_rest_stays(tmp_path: Path) -> None:
@@ -307,7 +307,7 @@ def test_a_full_disk_is_one_clear_error_and_the_rest_stays(tmp_path: Path) -> No
     taken, message = child.stdout.split(" ", 1)
     assert "could not write" in message
     assert "stays readable" in message
-    assert Recording(path).num_steps == int(taken)
+    assert Recording(path).n_steps == int(taken)
 
 
 def test_what_the_image_thread_cannot_write_is_raised(tmp_path: Path) -> None:
@@ -346,7 +346,7 @@ def test_what_the_image_thread_cannot_write_is_raised(tmp_path: Path) -> None:
     taken, message = child.stdout.split(" ", 1)
     assert "could not write" in message
     recording = Recording(path)
-    assert int(taken) - 1 <= recording.num_steps <= int(taken)
+    assert int(taken) - 1 <= recording.n_steps <= int(taken)
     assert recording.read().states.shape[1:] == (80, 80, 3)
 
 
@@ -372,7 +372,7 @@ def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
     after = Recording(path)
     assert after.complete
     assert np.array_equal(after.read(range(len(before.index))).states, states)
-    assert after.num_steps == before.num_steps + 2
+    assert after.n_steps == before.n_steps + 2
 
 
 def test_nothing_is_recorded_after_a_full_disk(tmp_path: Path) -> None:
@@ -398,7 +398,7 @@ def test_nothing_is_recorded_after_a_full_disk(tmp_path: Path) -> None:
         [sys.executable, "-W", "ignore", "-c", code, str(path)], capture_output=True, text=True, timeout=60
     )
     assert int(child.stdout) > 500
-    assert 0 <= Recording(path).num_steps - int(child.stdout) <= 1
+    assert 0 <= Recording(path).n_steps - int(child.stdout) <= 1
 
 
 def test_finishing_removes_the_journal_of_the_killed(tmp_path: Path) -> None:
@@ -412,7 +412,7 @@ def test_finishing_removes_the_journal_of_the_killed(tmp_path: Path) -> None:
     assert journal_path(path).exists()
     cart_pole(path, mode="a").close()
     assert not journal_path(path).exists()
-    assert (Recording(path).complete, Recording(path).num_steps) == (True, 5)
+    assert (Recording(path).complete, Recording(path).n_steps) == (True, 5)
 
 
 def test_a_recording_that_names_any_file_as_its_journal_is_refused(
@@ -428,11 +428,11 @@ def test_a_recording_that_names_any_file_as_its_journal_is_refused(
     with pytest.raises(FormatError, match=r"expected its journal at an absolute path that ends in .*journal"):
         cart_pole(path, mode="a")
     with pytest.warns(UserWarning, match="expected its journal at an absolute path"):
-        assert Recording(tmp_path / "killed.mcap").num_steps > 0
+        assert Recording(tmp_path / "killed.mcap").n_steps > 0
     with pytest.raises(FormatError, match="recover it into a new file"):
         cart_pole(tmp_path / "killed.mcap", mode="a")
     assert precious.read_text() == "precious"
-    assert Recording(path).num_steps == 5
+    assert Recording(path).n_steps == 5
 
 
 def test_appending_cuts_nothing_good_off_behind_damage(tmp_path: Path) -> None:
@@ -462,7 +462,7 @@ def test_appending_cuts_nothing_good_off_behind_damage(tmp_path: Path) -> None:
     assert report.steps > 200
     with cart_pole(tmp_path / "whole.mcap", mode="a") as env:
         roll(env, 5)
-    assert Recording(tmp_path / "whole.mcap").num_steps == report.steps + 5
+    assert Recording(tmp_path / "whole.mcap").n_steps == report.steps + 5
 
 
 @pytest.mark.parametrize("slow", ["rows", "events"])
@@ -492,7 +492,7 @@ def test_what_a_writer_does_while_its_journal_is_read_makes_nothing_up(
     monkeypatch.setattr(recover, "read_journal", read)
     record(10)
     with Recording(path) as recording:
-        assert done and 50 <= recording.num_steps <= 150
+        assert done and 50 <= recording.n_steps <= 150
         assert [episode.seed for episode in recording.episodes] == list(range(len(recording.index)))
         assert all(episode.metadata == {"steps": 5} for episode in recording.episodes if len(episode) == 5)
     env.close()
@@ -543,9 +543,9 @@ def test_the_journal_of_a_renamed_recording_is_kept(tmp_path: Path) -> None:
         roll(env, 5)
     (journal,) = tmp_path.glob("*.journal")
     with pytest.warns(UserWarning, match=rf"{journal.name} is its journal: rename that to kept"):
-        assert Recording(kept).num_steps == 0
+        assert Recording(kept).n_steps == 0
     journal.rename(journal_path(kept))
-    assert (Recording(kept).num_steps, Recording(path).num_steps) == (7, 5)
+    assert (Recording(kept).n_steps, Recording(path).n_steps) == (7, 5)
 
 
 def test_a_writer_leaves_the_journal_of_another_one_alone(tmp_path: Path) -> None:
@@ -559,9 +559,9 @@ def test_a_writer_leaves_the_journal_of_another_one_alone(tmp_path: Path) -> Non
         roll(second, 4)
     first.close()
     assert [p.name for p in tmp_path.glob("*.journal")] == ["r.mcap.journal"]
-    assert Recording(path).num_steps == 4
+    assert Recording(path).n_steps == 4
     second.close()
-    assert Recording(moved).num_steps == 3
+    assert Recording(moved).n_steps == 3
     assert list(tmp_path.glob("*.journal")) == []
 
 
@@ -571,10 +571,10 @@ def test_replacing_a_recording_removes_its_journal(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cart_pole(path, mode="w").close()  # without a step
-        assert Recording(path).num_steps == 7
+        assert Recording(path).n_steps == 7
         with cart_pole(path, mode="w") as env:
             roll(env, 3)
-    assert Recording(path).num_steps == 3
+    assert Recording(path).n_steps == 3
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -732,4 +732,4 @@ def test_definitions_that_only_the_journal_has_left_are_written_again(
         report = verify_recording(place)
         assert report.ok, (end, report.problems)
         with Recording(place) as recording:
-            assert recording.num_steps == 2
+            assert recording.n_steps == 2

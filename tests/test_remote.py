@@ -150,7 +150,7 @@ def test_a_file_that_changes_is_an_error_and_never_a_mixture(server: WebServer, 
     server.tags["/r.mcap"] = '"second"'
     with pytest.raises(RecordingError, match="has been changed since it was opened"):
         recording.read()
-    assert Recording(server.url()).num_steps == EPISODES * STEPS
+    assert Recording(server.url()).n_steps == EPISODES * STEPS
 
 
 def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
@@ -166,7 +166,7 @@ def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
 
 def test_a_server_that_knows_no_suffixes(server: WebServer) -> None:
     server.suffixes = False
-    assert Recording(server.url()).num_steps == EPISODES * STEPS
+    assert Recording(server.url()).n_steps == EPISODES * STEPS
     assert [asked.method for asked in server.asked] == ["GET", "HEAD", "GET"]
 
 

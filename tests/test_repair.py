@@ -697,7 +697,7 @@ def test_no_step_saved_is_a_failure(tmp_path: Path) -> None:
     said = " ".join(result.output.split())  # lines are broken where paths are long
     assert f"{path}: none of its 60 steps could be saved; 3 attachments saved to" in said
     with Recording(tmp_path / "a.recovered.mcap") as recording:
-        assert (recording.num_steps, list(recording.attachments)) == (
+        assert (recording.n_steps, list(recording.attachments)) == (
             0,
             ["benchmark.json", "env.cloudpickle", "run.json"],
         )
@@ -714,13 +714,13 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     report, recording = recovered(cut)
     with recording:
         verify_signature(recording)
-        assert recording.num_steps == 60
+        assert recording.n_steps == 60
     assert report.notes == []
     hit(path, chunks(path, "/step")[1])
     report, recording = recovered(path)
     with recording:
         assert SIGNATURE_NAME not in recording.attachments
-        assert 0 < recording.num_steps < 60
+        assert 0 < recording.n_steps < 60
     assert report.notes == ["its signature is left out: it does not fit what could be saved"]
     assert report.attachments_lost == []
     assert verify_recording(str(report.target)).problems == []

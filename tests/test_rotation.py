@@ -441,7 +441,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     summary = record_rollouts("CartPole-v1", "run.mcap", steps=20_000, seed=1, max_bytes=300_000)
     assert len(summary.paths) > 1
-    assert summary.steps == sum(Recording(path).num_steps for path in summary.paths) == 20_000
+    assert summary.steps == sum(Recording(path).n_steps for path in summary.paths) == 20_000
     assert summary.episodes == sum(len(Recording(path)) for path in summary.paths)
     assert summary.size == sum(path.stat().st_size for path in summary.paths)
     again = record_rollouts("CartPole-v1", "run.mcap", steps=100, seed=1, mode="a", max_bytes=300_000)

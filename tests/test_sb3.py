@@ -144,7 +144,7 @@ def test_random_rollouts(tmp_path: Path, env: Any) -> None:
     with VecRecordEpisodes(witness, tmp_path / "run.mcap") as venv:
         roll(venv, 450)
     recording = witness.check(tmp_path / "run.mcap")
-    assert recording.num_steps == N * 450
+    assert recording.n_steps == N * 450
     assert [episode.seed for episode in recording.episodes[:N]] == [5, 6, 7]
     ends = {"CartPole-v1": {"terminal"}, "Pendulum-v1": {"timeout"}}.get(str(env), {"terminal", "timeout"})
     assert {episode.end for episode in recording.episodes} == {*ends, "interrupted"}
@@ -160,7 +160,7 @@ def test_ppo(tmp_path: Path, env: Any) -> None:
         model = PPO(policy, venv, n_steps=125, batch_size=125, n_epochs=1, device="cpu")
         model.learn(1000)
         model.learn(1000, reset_num_timesteps=False)
-    assert witness.check(tmp_path / "run.mcap").num_steps == 2000
+    assert witness.check(tmp_path / "run.mcap").n_steps == 2000
 
 
 def test_processes(tmp_path: Path) -> None:
@@ -310,7 +310,7 @@ def test_a_file_of_each_sub_environment(tmp_path: Path, kind: Any) -> None:
     venv.close()
     files = [Recording(path) for path in (tmp_path / "runs").iterdir()]
     assert sorted(one.episodes[0].seed for one in files) == [5, 6, 7]
-    assert [one.num_steps for one in files] == [100] * N
+    assert [one.n_steps for one in files] == [100] * N
 
 
 def test_one_path_of_many_sub_environments_names_the_directory(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_fields_that_are_not_asked_for_are_left_out(users: Users, names: list[st
         assert told is not None and told["without"] == ["frames", "infos", "states"]
         validator("made_of.schema.json").validate(told)
     unlike = asked(users.ann, fields=["actions"])  # their states differ, their actions do not
-    assert kept(unlike, tmp_path / "unlike.mcap").num_steps > 0
+    assert kept(unlike, tmp_path / "unlike.mcap").n_steps > 0
     refused = asked(users.ann, fields=["velocity"])
     assert refused.status_code == 400 and "expected fields from states" in refused.json()["detail"]
 

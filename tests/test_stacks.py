@@ -298,7 +298,7 @@ def test_killed_appended_rewritten_and_repaired(tmp_path: Path, placed: Any, for
     for one in (killed, mended):
         with Recording(one) as recording:
             assert recording.layout.stacks == named("state", placed)  # type: ignore[union-attr]
-            count = recording.num_steps
+            count = recording.n_steps
             assert count == 61 or (one is mended and count > 40)
             assert np.array_equal(recording.read().states, np.array(states[:61])[-count:])
             assert np.array_equal(recording.episodes[-1].final_state, states[61])

@@ -265,7 +265,7 @@ def test_rerun_imports_every_entity_and_row(name: str, tmp_path: Path) -> None:
     topics = {summary.channels[number].topic: count for number, count in counts.items()}
     assert {entity: n for entity, n in rows.items() if not entity.startswith("/__")} == topics
     with Recording(path) as recording:
-        assert sum(n for topic, n in topics.items() if topic.endswith("/step")) == recording.num_steps
+        assert sum(n for topic, n in topics.items() if topic.endswith("/step")) == recording.n_steps
         images = {leaf.name: 1 if leaf.kind == "stack" else leaf.shape[2] for leaf in recording.layout.images}
         as_png = "png" in path.stem
     for topic in topics:

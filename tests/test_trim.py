@@ -52,7 +52,7 @@ def test_what_stays_is_what_it_was(name: str, tmp_path: Path) -> None:
     kept |= {e.number: slice(1, None) for e in before.episodes if len(e) >= 3 and e.number % 3 == 1}
     report = tupli_mcap.recording.trim_recording(before, tmp_path / "new.mcap", kept)
     after = Recording(tmp_path / "new.mcap")
-    assert (report.episodes, report.steps) == (len(before), after.num_steps)
+    assert (report.episodes, report.steps) == (len(before), after.n_steps)
     for old, new in zip(before.episodes, after.episodes, strict=True):
         start, stop, _ = kept.get(old.number, slice(None)).indices(len(old))
         assert new.number == old.number
@@ -123,7 +123,7 @@ def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
 def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
     first, second = (record(tmp_path / "runs" / name) for name in ("a.mcap", "b.mcap"))
     target = tmp_path / "n.mcap"
-    n_steps = [Recording(path).num_steps for path in (first, second)]
+    n_steps = [Recording(path).n_steps for path in (first, second)]
     with web_server.serving() as server:
         server.files["/b.mcap"] = second.read_bytes()
         for sources in ([first.parent], [first, second], [first, server.url("/b.mcap")]):
@@ -143,7 +143,7 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
             told = json.loads(done.output)["result"]
             assert {**told, "dry_run": True, "size": 0} == json.loads(dry.output)["result"]
             assert (told["episodes"], told["steps"], told["left_out"]) == (8, sum(n_steps) - 8, 8)
-            assert Recording(target).num_steps == sum(n_steps) - 8
+            assert Recording(target).n_steps == sum(n_steps) - 8
             said = tupli_mcap.open(target).made_of[str(target)]
             assert said == Recording(target).made_of
             assert [one["name"] for one in said["sources"]] == ["a.mcap", "b.mcap"]
@@ -156,12 +156,12 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
 def test_command(tmp_path: Path) -> None:
     source, target = record(tmp_path / "r.mcap"), tmp_path / "n.mcap"
     words = ["trim", str(source), "--steps", "2:-1", "--episodes", "0,2", "-o", str(target)]
-    steps = Recording(source).num_steps - 6
+    steps = Recording(source).n_steps - 6
     done = CliRunner().invoke(app, [*words, "--dry-run"])
     assert done.output.split() == f"would write {target}: 4 episodes, {steps:,} steps".split()
     assert not target.exists()
     assert f"{steps:,} steps" in CliRunner().invoke(app, words).output
-    assert Recording(target).num_steps == steps
+    assert Recording(target).n_steps == steps
     assert "exists" in CliRunner().invoke(app, words).output
     assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
     assert (

@@ -96,7 +96,7 @@ class TestASecondWriter:
             with pytest.raises(RecordingError, match="exists and is not overwritten"):
                 cart_pole(also, mode="x")
             roll(env, 20)
-        assert Recording(path).num_steps == {"x": 40, "w": 40, "a": 70}[first]
+        assert Recording(path).n_steps == {"x": 40, "w": 40, "a": 70}[first]
         assert {p.name for p in tmp_path.iterdir()} <= {"r.mcap", "elsewhere.mcap", "other.mcap"}
 
     def test_is_refused_between_threads(self, tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ class TestASecondWriter:
         assert all("another writer" in line or "exists" in line for line in refused), refused
         with won[0] as env:
             roll(env, 5)
-        assert Recording(path).num_steps == 5
+        assert Recording(path).n_steps == 5
 
     def test_is_told_of_a_file_deleted_under_it(self, tmp_path: Path) -> None:
         path = tmp_path / "r.mcap"
@@ -138,7 +138,7 @@ class TestASecondWriter:
         roll(env, 5)
         (tmp_path / "r.mcap").rename(tmp_path / "s.mcap")
         env.close()
-        assert Recording(tmp_path / "s.mcap").num_steps == 5
+        assert Recording(tmp_path / "s.mcap").n_steps == 5
 
     def test_is_not_who_only_asks(self, tmp_path: Path) -> None:
         path = tmp_path / "r.mcap"
@@ -180,7 +180,7 @@ class TestASecondWriter:
             roll(env, 7)
         thread.join()
         with Recording(path) as recording:
-            assert recording.num_steps == 7 + len(recording.episodes[0])
+            assert recording.n_steps == 7 + len(recording.episodes[0])
 
     def test_readers_of_a_replaced_file_keep_the_old_one(self, tmp_path: Path) -> None:
         path = tmp_path / "r.mcap"
@@ -191,7 +191,7 @@ class TestASecondWriter:
             with cart_pole(path, mode="w") as env:
                 roll(env, 3)
                 assert np.array_equal(old.read().states, wanted)
-                assert Recording(path).num_steps == 3
+                assert Recording(path).n_steps == 3
         assert list(tmp_path.iterdir()) == [path]
 
 
@@ -222,7 +222,7 @@ def test_a_recording_in_progress_is_not_replaced(tmp_path: Path, how: str) -> No
             with pytest.raises(LockedError, match="being recorded by another writer"):
                 REPLACE[how](source, target)
         roll(env, 20)
-    assert Recording(live).num_steps == 40
+    assert Recording(live).n_steps == 40
 
 
 def test_what_replaces_a_link_replaces_the_file_it_names(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_what_replaces_a_link_replaces_the_file_it_names(tmp_path: Path) -> None
             roll(env, steps)
     link.symlink_to(file.name)
     tupli_mcap.open(source).save(link, overwrite=True)
-    assert link.is_symlink() and Recording(file).num_steps == 30
+    assert link.is_symlink() and Recording(file).n_steps == 30
 
 
 class TestARecordingWithoutASteps:
@@ -274,7 +274,7 @@ class TestOneDirectoryForJournals:
         for env in live:
             roll(env, 20)
         for path in paths:
-            assert Recording(path).num_steps == len(states[paths.index(path)]) + 20
+            assert Recording(path).n_steps == len(states[paths.index(path)]) + 20
         for env in live:
             env.close()
         for path, before in zip(paths, states, strict=True):
@@ -311,7 +311,7 @@ class TestOneDirectoryForJournals:
         killed(path, journal_dir=fast)
         shutil.rmtree(fast)
         with pytest.warns(UserWarning, match=r"its journal was .*fast.*: bring that back"):
-            assert 0 < Recording(path).num_steps < 100
+            assert 0 < Recording(path).n_steps < 100
 
     def test_on_another_file_system(self, tmp_path: Path, other_file_system: Path) -> None:
         path = tmp_path / "a.mcap"
@@ -383,7 +383,7 @@ class TestAFileAndItsJournal:
         path.rename(moved)
         match = r"a\.mcap\.journal is its journal: rename that to b\.mcap\.journal"
         with pytest.warns(UserWarning, match=match):
-            assert Recording(moved).num_steps < 100
+            assert Recording(moved).n_steps < 100
         with pytest.raises(
             RecordingError, match=r"without its journal .*a\.mcap\.journal, whose steps would be lost"
         ):
@@ -400,7 +400,7 @@ class TestAFileAndItsJournal:
         assert np.array_equal(Recording(link).read().states, states)
         with cart_pole(link, mode="a") as env:
             roll(env, 5)
-        assert Recording(path).num_steps == 105
+        assert Recording(path).n_steps == 105
         assert list(link.parent.iterdir()) == [link]
 
     def test_written_through_a_hard_link(self, tmp_path: Path) -> None:
@@ -476,7 +476,7 @@ def test_the_child_of_a_killed_writer_keeps_no_lock(tmp_path: Path) -> None:
         os.kill(child, signal.SIGKILL)
         os.close(reading)
         os.close(writing)
-    assert Recording(path).num_steps == 20
+    assert Recording(path).n_steps == 20
 
 
 def test_numbers_of_episodes_are_not_given_twice(tmp_path: Path) -> None:

@@ -583,7 +583,7 @@ def test_a_half_whose_chunks_are_not_written_yet_is_in_the_journal(tmp_path: Pat
     shutil.copy(f"{path}.journal", f"{copied}.journal")
     recording = check(copied, taken)
     assert not recording.complete
-    assert recording.num_steps == sum(len(steps) for episodes in taken for steps in episodes) > 3 * 31
+    assert recording.n_steps == sum(len(steps) for episodes in taken for steps in episodes) > 3 * 31
 
 
 def test_many_large_metadata_end_at_one_step(tmp_path: Path) -> None:

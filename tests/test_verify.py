@@ -72,7 +72,7 @@ def test_golden_recordings_are_good(name: str, tmp_path: Path) -> None:
     assert report.ok
     assert report.state == ("unfinished" if name in UNFINISHED else "complete")
     with Recording(path) as recording:
-        assert (report.episodes, report.steps) == (len(recording), recording.num_steps)
+        assert (report.episodes, report.steps) == (len(recording), recording.n_steps)
     assert path.read_bytes() == before
     assert [problem.severity for problem in report.problems] == ["note"] * (name in UNFINISHED)
 

@@ -152,7 +152,7 @@ class _Chain:
 
     def _read(self, path: Path) -> tuple[list[Found], np.ndarray]:
         with Recording(path) as recording:
-            if recording.num_steps == 0:
+            if recording.n_steps == 0:
                 return [], recording.index
             if not np.array_equal(recording.read().terminals, _flags(found := found_in(recording))):
                 raise TupliError("columns and steps differ")
@@ -217,9 +217,9 @@ class _RotatingChain(_Chain):
         problems = [] if _same(self._read(path)[0], known) else ["what was there before has changed"]
         for file in _files(path):
             with Recording(file) as recording:
-                if recording.num_steps and not recording.complete:
+                if recording.n_steps and not recording.complete:
                     problems.append(f"{file.name} is not complete")
-                if recording.num_steps and journal_path(file).exists():
+                if recording.n_steps and journal_path(file).exists():
                     problems.append(f"the journal of {file.name} stays behind")
         return problems
 

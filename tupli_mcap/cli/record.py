@@ -202,7 +202,7 @@ def _held(output: Path, limit: float | None) -> str:
         for path in paths:
             with Recording(path) as recording:
                 episodes += len(recording)
-                steps += recording.num_steps
+                steps += recording.n_steps
     except TupliError as err:
         return str(err)
     if not paths:

@@ -155,7 +155,7 @@ class _Replays:
         try:
             with (
                 Recording(path) as recording,
-                step_progress(recording.num_steps, "running again") as progress,
+                step_progress(recording.n_steps, "running again") as progress,
             ):
                 numbers = self._numbers(recording)
                 if numbers == []:

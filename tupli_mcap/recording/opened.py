@@ -265,8 +265,8 @@ class OpenedRecording:
         return Topics.of(0).step in self._topics
 
     @property
-    def num_steps(self) -> int:
-        """Steps of all episodes."""
+    def n_steps(self) -> int:
+        """The number of steps of all episodes."""
         return int(self.index["length"].sum())
 
     @property

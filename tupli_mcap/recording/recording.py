@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
@@ -96,6 +97,16 @@ class Recording(DescribedRecording, DatasetVerbs):
     def episode_start(self, i: int) -> EpisodeStart:
         """The `/episode_start` message of episode `i`."""
         return self.episode_starts([i])[0]
+
+    @property
+    def lengths(self) -> Array:
+        """Steps of each episode: int64 (episodes,)."""
+        return self.index["length"].astype(np.int64)
+
+    @property
+    def returns(self) -> Array:
+        """The sum of each episode's rewards: float64 (episodes,), NaN if the rewards are no numbers."""
+        return self.index["return"].copy()
 
     @property
     def seeds(self) -> list[int | None]:
@@ -413,7 +424,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
-        return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.num_steps, 'step')}{state}>"
+        return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.n_steps, 'step')}{state}>"
 
 
 def _opened_again(source: str, uuid: str, cache_bytes: int) -> Recording:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from tupli_mcap.arrays import Array
     from tupli_mcap.dataset import Dataset
     from tupli_mcap.dataset.columns.statistics import FieldStatistics
     from tupli_mcap.dataset.columns.tables import Level
@@ -32,21 +31,6 @@ class DatasetVerbs(SaysWhatIsMeant):
     def dataset(self) -> Dataset:
         """Its episodes as a `Dataset`, which opens the file by its path."""
         raise NotImplementedError
-
-    @property
-    def n_steps(self) -> int:
-        """The number of steps of all episodes."""
-        return self.dataset.n_steps
-
-    @property
-    def lengths(self) -> Array:
-        """Steps of each episode: int64 (episodes,)."""
-        return self.dataset.lengths
-
-    @property
-    def returns(self) -> Array:
-        """The sum of each episode's rewards: float64 (episodes,)."""
-        return self.dataset.returns
 
     @property
     def keys(self) -> list[str]:

@@ -74,7 +74,7 @@ def write_layout(
 def foxglove_layout(recording: Recording) -> dict[str, Any]:
     """A layout with states and actions on the left, pictures, rewards and ends on the right. Of a vector environment,
     it shows the first sub-environment. RecordingError if the recording has no steps."""
-    if not recording.num_steps:
+    if not recording.n_steps:
         raise RecordingError(f"{recording.name} has no steps to plot")
     topics = Topics.of(0 if recording.is_vector else None)
     layout = recording.layout

@@ -51,7 +51,7 @@ def overhead(run: Run) -> Iterator[Target]:
             recorded.close()
         bare.close()
         with Recording(path) as recording:
-            check(recording.num_steps == steps, f"{recording.num_steps} steps")
+            check(recording.n_steps == steps, f"{recording.n_steps} steps")
             check(np.array_equal(recording.read(fields=["actions"]).actions, actions), "other actions")
         path.unlink()
         return {name: watch.seconds / steps * 1e6 for name, (_, watch) in sides.items()}

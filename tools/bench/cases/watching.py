@@ -159,7 +159,7 @@ def _check_steps(path: Path, steps: int) -> None:
     from tupli_mcap import Recording
 
     with Recording(path) as recording:
-        check(recording.num_steps == steps, f"{recording.num_steps} steps instead of {steps}")
+        check(recording.n_steps == steps, f"{recording.n_steps} steps instead of {steps}")
     path.unlink()
 
 

@@ -28,7 +28,7 @@ from tupli_mcap.spaces.leaves import Leaf
 def verify_episodes(recording: Recording, findings: Findings) -> None:
     """Compares the rows of all channels, the records of the episodes and the index with each other."""
     findings.report.episodes = len(recording.index)
-    findings.report.steps = recording.num_steps
+    findings.report.steps = recording.n_steps
     if not recording.num_envs:
         return
     checker = _Checker(recording, findings)
