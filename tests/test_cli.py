@@ -1121,6 +1121,7 @@ class TestSharing:
     def test_unknown_ids(self, lab: tuple[Path, str, str], benchmark: str) -> None:
         line = fails("bundle", benchmark, "-o", "b.mcap", "--storage", "lab")
         assert line.startswith("there is no benchmark with id ")
+        assert line.endswith("; list_benchmarks() (tupli-mcap list-benchmarks) names them all")
         assert not Path("b.mcap").exists()
 
     def test_places_that_cannot_be_written(self, lab: tuple[Path, str, str]) -> None:

@@ -318,7 +318,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         """
         if benchmark_id is None:
             raise NotFoundError(
-                "which benchmark? pass benchmark_id; storage.list_benchmarks() names them all"
+                "which benchmark? pass benchmark_id; list_benchmarks() (tupli-mcap list-benchmarks) names them all"
             )
         if isinstance(benchmark_id, TupliStorage):
             raise StorageError("expected a storage and then a benchmark_id, found them the other way round")

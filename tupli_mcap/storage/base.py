@@ -325,6 +325,13 @@ def is_episode_id(uri: object) -> bool:
     return isinstance(uri, str) and _EPISODE_ID.fullmatch(uri) is not None
 
 
+def no_such(kind: str, uri: object) -> NotFoundError:
+    """The error for an id that nothing of a kind (benchmark, artifact, episode) has."""
+    return NotFoundError(
+        f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() (tupli-mcap list-{kind}s) names them all"
+    )
+
+
 def uuid_of(header: EpisodeHeader) -> str:
     """The UUID of the recording that an episode is of."""
     return header.id.rpartition("-")[0]

@@ -16,6 +16,7 @@ from tupli_mcap.server.people.access import as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
+from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
 
@@ -101,7 +102,7 @@ def declare_key(library: Served, caller: Writer, told: Key) -> None:
 def delete_episode(library: Served, caller: Writer, uri: str) -> None:
     """Deletes one episode."""
     if not library.delete_episodes(caller, FilterEQ(key="id", value=uri)):
-        raise episodes.no_episode(uri)
+        raise no_such("episode", uri)
 
 
 @router.put("/{uri}/published")

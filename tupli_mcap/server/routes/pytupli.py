@@ -44,6 +44,7 @@ from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served,
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
+from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.texts import first_defect
 
@@ -392,7 +393,7 @@ def delete_episode(library: Served, caller: Changing, episode_id: str) -> None:
     """Deletes an episode."""
     with library.deleting(caller, "delete_episode", episode_id):
         if not library.delete_episodes(caller, FilterEQ(key="id", value=episode_id)):
-            raise episodes.no_episode(episode_id)
+            raise no_such("episode", episode_id)
 
 
 def _filter(told: dict[str, Any] | None) -> BaseFilter | None:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from sqlalchemy import Connection, insert, select
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audience, audit, settle
@@ -23,7 +23,7 @@ from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.stored.episodes import forget, whole_name
 from tupli_mcap.server.tables import CLAIM, FILE, ITEM
 from tupli_mcap.server.uploads import TooLargeError
-from tupli_mcap.storage.base import new_name
+from tupli_mcap.storage.base import new_name, no_such
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import rows_of, runs_of
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
@@ -44,9 +44,7 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
     seen = readable(caller, Right.BENCHMARK_READ, ITEM.c.created_by, ITEM.c.published_in)
     there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
     if not is_hash(benchmark_id) or not connection.execute(there).first():
-        raise NotFoundError(
-            f"there is no benchmark with id {benchmark_id[:80]!r}; list_benchmarks() names them all"
-        )
+        raise no_such("benchmark", benchmark_id)
 
 
 def demand_short(recording: Recording) -> None:

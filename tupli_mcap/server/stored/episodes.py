@@ -22,7 +22,7 @@ from tupli_mcap.server.people.access import (
     readable_episodes,
 )
 from tupli_mcap.server.tables import FILE, USER
-from tupli_mcap.storage.base import by_recording, published_in
+from tupli_mcap.storage.base import by_recording, no_such, published_in
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
@@ -149,7 +149,7 @@ def publish_one(
 ) -> None:
     """Publishes one episode in a group, or unpublishes it. Raises NotFoundError if there is none of this id."""
     if not publish(connection, caller, FilterEQ(key="id", value=uri), group, published=published):
-        raise no_episode(uri)
+        raise no_such("episode", uri)
 
 
 def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
@@ -182,11 +182,6 @@ def forget(connection: Connection, path: str) -> str:
     connection.execute(delete(FILE).where(FILE.c.path == escape_text(path)))
     pend(connection, unescape_text(place))
     return unescape_text(place)
-
-
-def no_episode(uri: str) -> NotFoundError:
-    """The error for an id that no readable episode has."""
-    return NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
 
 
 def _delete(connection: Connection, doomed: Sequence[EpisodeHeader]) -> list[str]:

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, Row, Select, delete, insert, select, update
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
-from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -37,7 +37,7 @@ from tupli_mcap.server.people.access import (
 )
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
-from tupli_mcap.storage.base import oldest_first, published_in
+from tupli_mcap.storage.base import no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
 from tupli_mcap.storage.files.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
@@ -240,9 +240,7 @@ class Items:
     def _find(self, connection: Connection, caller: Caller, kind: Kind, uri: str) -> Row[Any]:
         found = self._visible(connection, caller, kind, uri)
         if not found:
-            raise NotFoundError(
-                f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() names them all"
-            )
+            raise no_such(kind, uri)
         return found[0]
 
     def _readable(self, connection: Connection, caller: Caller, kind: Kind) -> list[Row[Any]]:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, TupliError
+from tupli_mcap.errors import FormatError, StorageError, TupliError
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -32,7 +32,7 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, is_episode_id, published_in
+from tupli_mcap.storage.base import TupliStorage, is_episode_id, no_such, published_in
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
@@ -256,7 +256,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
         known = _hash(benchmark_id, "benchmark") in self._benchmarks
         if not known and not self.list_benchmarks(FilterEQ(key="id", value=benchmark_id)):
-            raise _unknown("benchmark", benchmark_id)
+            raise no_such("benchmark", benchmark_id)
         return self._outbox.new_path(benchmark_id, name)
 
     def ingest(self, path: Path) -> None:
@@ -309,15 +309,11 @@ def _listing(filter: BaseFilter | str | None, model: Any) -> dict[str, Any]:
 def _hash(uri: str, kind: str) -> str:
     """An id for a path. NotFoundError for a text that cannot be an id."""
     if not is_hash(uri):
-        raise _unknown(kind, uri)
+        raise no_such(kind, uri)
     return uri
 
 
 def _episode(uri: str) -> str:
     if not is_episode_id(uri):
-        raise _unknown("episode", uri)
+        raise no_such("episode", uri)
     return uri
-
-
-def _unknown(kind: str, uri: object) -> NotFoundError:
-    return NotFoundError(f"there is no {kind} with id {str(uri)[:80]!r}; list_{kind}s() names them all")

@@ -7,11 +7,11 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from tupli_mcap.environment import sha256
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
+from tupli_mcap.errors import FormatError, StorageError, warn
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.base import LOCAL_USER, oldest_first, published_in
+from tupli_mcap.storage.base import LOCAL_USER, no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import plain, restored
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
 
@@ -82,9 +82,7 @@ class ArtifactFiles:
         """The file of an artifact; raises NotFoundError if there is none."""
         path = self._directory / uri if is_hash(uri) else None
         if path is None or not path.is_file():
-            raise NotFoundError(
-                f"there is no artifact with id {str(uri)[:80]!r}; list_artifacts() names them all"
-            )
+            raise no_such("artifact", uri)
         return path
 
     def _sidecar(self, uri: str) -> Path:

@@ -16,7 +16,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
-from tupli_mcap.storage.base import LOCAL_USER, oldest_first, published_in
+from tupli_mcap.storage.base import LOCAL_USER, no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import (
     artifacts_of,
     benchmark_entry,
@@ -172,9 +172,7 @@ class BenchmarkFiles:
 
     def _find(self, uri: str) -> Path:
         if not self.exists(uri):
-            raise NotFoundError(
-                f"there is no benchmark with id {str(uri)[:80]!r}; list_benchmarks() names them all"
-            )
+            raise no_such("benchmark", uri)
         return self._path(uri)
 
     def _path(self, uri: str) -> Path:

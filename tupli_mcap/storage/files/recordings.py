@@ -16,7 +16,15 @@ from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
 from tupli_mcap.storage.atomic import Lock, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, episode_id, is_episode_id, new_name, published_in, uuid_of
+from tupli_mcap.storage.base import (
+    LOCAL_USER,
+    episode_id,
+    is_episode_id,
+    new_name,
+    no_such,
+    published_in,
+    uuid_of,
+)
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
@@ -83,7 +91,7 @@ class RecordingFiles:
             found = self._catalog.headers(FilterEQ(key="id", value=uri), limit=1)
             if found:
                 return found[0]
-        raise NotFoundError(f"there is no episode with id {str(uri)[:80]!r}; list_episodes() names them all")
+        raise no_such("episode", uri)
 
     def _holds(self, header: EpisodeHeader) -> bool:
         path = self._root / header.recording
