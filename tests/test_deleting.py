@@ -100,6 +100,27 @@ def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "s_0002.mcap").exists()
 
 
+def test_importing_does_not_bring_them_back(runs: Path, tmp_path: Path) -> None:
+    lab, whole, part = tmp_path / "lab", tmp_path / "whole.mcap", tmp_path / "part.mcap"
+    run("bundle", str(runs / "a.mcap"), "-o", str(whole))
+    run("delete", str(runs / "a.mcap"), "--episodes", "2,3")
+    run("bundle", str(runs / "a.mcap"), "-o", str(part))  # none of its episodes is left in the storage below
+    run("import", str(whole), "--storage", str(lab))
+    run("delete", str(lab), "--filter", "episode < 2")
+    for bundle, count in ((whole, 4), (part, 2)):
+        for dry in ([], ["--dry-run"]):
+            told = run("import", str(bundle), "--storage", str(lab), *dry)
+            assert f"import{'' if dry else 'ed'} 0 of {count} episodes" in told
+            assert told.count("not copied: 2 episodes that had been deleted there; `tupli-mcap restore ") == 1
+    with pytest.warns(UserWarning, match="not copied: 2 episodes"):
+        FileStorage(lab).import_bundle(whole)
+    assert seeds(lab) == [2, 3]
+    assert "restored 1 episode" in run("restore", str(lab), "--episodes", "0")
+    run("compact", "--storage", str(lab))  # now nothing brings it back but a copy
+    assert "imported 1 of 4 episodes" in run("import", str(whole), "--storage", str(lab))
+    assert sorted(map(str, seeds(lab))) == ["0", "1", "2", "3"]
+
+
 def test_of_a_directory_by_filter(runs: Path) -> None:
     for place in (runs, runs / "a.mcap"):
         assert "no episode has metadata.lost" in run(

@@ -7,7 +7,7 @@ import itertools
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
+from tupli_mcap.storage.bundles.read import deleted_beside, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
@@ -102,7 +103,7 @@ def _copy(
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         absent = [header for header in headers if header.id not in held]
-        deleted = _deleted_beside(target, held.values())
+        deleted = deleted_beside(target, held.values()) if isinstance(target, FileStorage) else ()
         new = [header for header in absent if header.id not in deleted]
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = by_recording(new)
@@ -111,7 +112,7 @@ def _copy(
             if not dry_run:
                 numbers = [header.episode for header in of]
                 brought += _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
-        _say_what_was_deleted(target, len(absent) - brought)
+        say_what_was_deleted(len(absent) - brought, target.root if isinstance(target, FileStorage) else None)
         if uri and isinstance(target, FileStorage) and not dry_run:
             _vouch(target, uri)
         copied[uri] = Copied(artifacts, brought)
@@ -124,22 +125,6 @@ def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, 
     if differ:
         hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
         warn(f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}")
-
-
-def _deleted_beside(target: TupliStorage, held: Iterable[EpisodeHeader]) -> set[str]:
-    """The ids of deleted episodes that a directory can restore, of the recordings whose other episodes it lists: in
-    another file they would come back twice."""
-    if not isinstance(target, FileStorage):
-        return set()
-    return set(target.deleted_episodes({header.recording for header in held}))
-
-
-def _say_what_was_deleted(target: TupliStorage, episodes: int) -> None:
-    """Warns of episodes that were deleted at the target: they stay so."""
-    if not episodes:
-        return
-    hint = f"; `tupli-mcap restore {target.root}` restores them" if isinstance(target, FileStorage) else ""
-    warn(f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}")
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
@@ -271,7 +256,7 @@ def push_recording(
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
             sent = client.send(kept, bar.advance, path.name if name is None else file_name(name))
         stored = _stored(client, sent.name)
-        _say_what_was_deleted(client, len(recording) - stored)
+        say_what_was_deleted(len(recording) - stored, None)
         return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)
 
 

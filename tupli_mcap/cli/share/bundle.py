@@ -127,8 +127,9 @@ def import_(
 ) -> None:
     """Copy a bundle into a storage.
 
-    A missing storage is created. Importing a file twice changes nothing. Nothing in the file
-    is executed. If a key that you trust has signed it, its environment may be rebuilt later.
+    A missing storage is created. Importing a file twice changes nothing, and what was deleted
+    from the storage stays deleted until restore brings it back. Nothing in the file is
+    executed. If a key that you trust has signed it, its environment may be rebuilt later.
     """
     from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from tupli_mcap import trust as _trust
-from tupli_mcap.errors import FormatError, StorageError
+from tupli_mcap.errors import FormatError, StorageError, plural, warn
 from tupli_mcap.files import create
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.sign.sign import episodes_alike
-from tupli_mcap.schema import FilterIN
+from tupli_mcap.schema import EpisodeHeader, FilterEQ, FilterIN
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import artifacts_of
@@ -47,7 +47,8 @@ def read_bundle(
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
     needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
-    file twice changes nothing.
+    file twice changes nothing. Episodes that were deleted in the storage, and can be restored there, stay deleted; a
+    warning says how many.
 
     require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
         else by a key that this user trusts.
@@ -61,7 +62,7 @@ def read_bundle(
     with Recording(path) as recording:  # what is refused leaves nothing behind
         signature = checked_signature(recording, require_signature, signers)
         record, header, query = carried_benchmark(recording, path)
-        _missing(storage, recording)
+        say_what_was_deleted(_missing(storage, recording)[1], storage.root)
         for data, metadata in carried_artifacts(recording, record, path, storage):
             storage.store_artifact(data, metadata)
         if trust:
@@ -93,21 +94,39 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
         artifacts = artifacts_of(record, str(path))
         carried_artifacts(recording, record, path, storage)
         stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
+        missing, deleted = _missing(storage, recording)
+        if storage is not None:
+            say_what_was_deleted(deleted, storage.root)
         return ImportPreview(
             benchmark_id=header.id,
             name=header.metadata.name,
             episodes=len(recording),
-            new_episodes=len(_missing(storage, recording)),
+            new_episodes=len(missing),
             artifacts=len(artifacts),
             new_artifacts=len(set(artifacts) - stored),
         )
 
 
-def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
-    """Numbers of the episodes that the storage lacks. StorageError if it holds other episodes with the same ids."""
+def deleted_beside(storage: FileStorage, held: Iterable[EpisodeHeader]) -> set[str]:
+    """The ids of deleted episodes that a storage can restore, of the recordings whose other episodes are `held`: in
+    another file they would come back twice."""
+    return set(storage.deleted_episodes({header.recording for header in held}))
+
+
+def say_what_was_deleted(episodes: int, directory: Path | None) -> None:
+    """Warns of episodes that are not copied, as they were deleted at the target; `directory`: where they can be
+    restored."""
+    if episodes:
+        hint = "" if directory is None else f"; `tupli-mcap restore {directory}` restores them"
+        warn(f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}")
+
+
+def _missing(storage: FileStorage | None, recording: Recording) -> tuple[list[int], int]:
+    """Numbers of the episodes that the storage lacks, and how many others it can restore. StorageError if it holds
+    other episodes with the same ids."""
     ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
     if storage is None:
-        return list(ids.values())
+        return list(ids.values()), 0
     known = by_recording(storage.list_episodes(FilterIN(key="id", value=list(ids))))
     stored_numbers = {name: [header.episode for header in headers] for name, headers in known.items()}
     for name, numbers in stored_numbers.items():
@@ -120,7 +139,10 @@ def _missing(storage: FileStorage | None, recording: Recording) -> list[int]:
                     f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong"
                 )
     held = {number for numbers in stored_numbers.values() for number in numbers}
-    return [number for number in ids.values() if number not in held]
+    missing = {uri: number for uri, number in ids.items() if number not in held}
+    of_benchmark = FilterEQ(key="benchmark_id", value=recording.benchmark_id)
+    deleted = missing.keys() & deleted_beside(storage, storage.list_episodes(of_benchmark) if missing else ())
+    return [number for uri, number in missing.items() if uri not in deleted], len(deleted)
 
 
 def _same_file(one: Recording, other: Recording) -> bool:
@@ -158,7 +180,7 @@ def _copy(
                 rewrite_recording(recording, new)  # with what is in its journal
             with Recording(new) as copy:
                 check(copy)
-                missing = _missing(storage, copy)
+                missing, _ = _missing(storage, copy)
                 if not missing:
                     raise _NothingNewError
                 if len(missing) < len(copy):
