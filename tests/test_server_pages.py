@@ -157,6 +157,19 @@ class TestSigningIn:
             assert client.get("/v1/me").status_code == 401
             assert client.post("/v1/episodes/delete", json={"filter": None}).status_code == 401
 
+    def test_a_program_sends_a_token(self, server: str) -> None:
+        made = Api(server, "ann").post("/v1/api-tokens", name="robot", scope="write")
+        own, wrong = ({"Authorization": f"Bearer {text}"} for text in (made["token"], "nonsense"))
+        with browser(server, "ann") as ann, httpx.Client(base_url=server, headers=own) as program:
+            assert episodes_of(program) == episodes_of(ann) != []
+            assert program.get(f"/episode/{episodes_of(ann)[0]['id']}?format=json").status_code == 200
+            assert program.get("/account?format=json").status_code == 401
+            assert program.post("/groups", data={"code": code(ann), "name": "robots"}).status_code == 401
+            refused = ann.get("/episodes?format=json", headers=wrong)  # whatever the cookie says
+            assert (refused.status_code, list(refused.json())) == (401, ["error"])
+            assert program.delete(f"/v1/api-tokens/{made['id']}").status_code == 200
+            assert program.get("/episodes?format=json").status_code == 401
+
     def test_only_an_open_server_takes_everybody(self, server: str, tmp_path: Path) -> None:
         told = {"username": "eve", "password": "eve's password", "new": "1"}
         with browser(server) as client:

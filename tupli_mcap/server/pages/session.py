@@ -5,6 +5,8 @@
 2. The HTTP API (`/v1`) ignores cookies, so that a page of another site cannot call it for the user.
 3. A form is accepted only with a code that is made of the server's secret and the sign-in, and only if the browser does
    not report another origin.
+4. A program sends pages a token, as it does to the HTTP API. A page of another site has none that it could send. A
+   request with a token is answered by it alone, and is refused where only a browser that is signed in may come.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from urllib.parse import urlsplit
 
 from fastapi import Depends, Form, Request, Response
 from fastapi.responses import RedirectResponse
+from fastapi.security import HTTPBearer
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import TupliError
@@ -28,10 +31,12 @@ from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.wire import told
 
 COOKIE: Final = "tupli_mcap_session"
+_BEARER: Final = HTTPBearer(auto_error=False)
 
 
 class Visit(NamedTuple):
-    """A request for a page: its caller, refresh token of the sign-in (empty for a guest), and code for forms."""
+    """A request for a page: its caller, refresh token of the sign-in (empty for a guest and for a program that sends a
+    token), and code for forms."""
 
     request: Request
     library: Library
@@ -41,7 +46,7 @@ class Visit(NamedTuple):
 
     @property
     def is_signed_in(self) -> bool:
-        """Whether the caller is signed in, and no guest."""
+        """Whether the caller is signed in in a browser."""
         return bool(self.session)
 
     @property
@@ -60,7 +65,7 @@ class Visit(NamedTuple):
 
     def shelf(self) -> LibraryShelf:
         """The shelf of what the caller may see. SignInNeededError for a guest, if the server has no guests."""
-        if not self.is_signed_in and not self.library.settings.guests:
+        if self.caller.is_guest and not self.library.settings.guests:
             raise SignInNeededError("sign in to see what is here")
         url, kept = self.request.url, self.request.app.state.kept
         return LibraryShelf(self.library, self.caller, f"{url.scheme}://{url.netloc}", kept)
@@ -96,11 +101,16 @@ class Visit(NamedTuple):
         )  # fmt: skip
 
 
-def _known_visit(request: Request) -> Visit:
+def _known_visit(request: Request, token: str) -> Visit:
+    """A visit by the holder of a token, else by who has signed in, else by a guest. SignInError if a token is given and
+    not valid."""
     library: Library = request.app.state.library
-    session = request.cookies.get(COOKIE, "")
+    session = "" if token else request.cookies.get(COOKIE, "")
     with library.database.reading() as connection:
-        caller = library.tokens.of_session(connection, session) if session else None
+        if token:
+            caller: Caller | None = library.tokens.caller(connection, token)
+        else:
+            caller = library.tokens.of_session(connection, session) if session else None
         if caller is None:
             return Visit(request, library, accounts.guest(connection))
     request.state.user = caller.name  # for the log
@@ -108,7 +118,8 @@ def _known_visit(request: Request) -> Visit:
 
 
 async def _visit(request: Request) -> AsyncIterator[Visit]:
-    visit = await run_in_threadpool(_known_visit, request)
+    given = await _BEARER(request)
+    visit = await run_in_threadpool(_known_visit, request, "" if given is None else given.credentials)
     with contextlib.suppress(SignInNeededError):
         request.state.shelf = visit.shelf()  # for error pages
     async with request.app.state.turns.turn(visit.caller, visit.address):
