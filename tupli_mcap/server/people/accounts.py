@@ -23,7 +23,7 @@ from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, RE
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))
 _DUMMY: Final = _HASHES.hash("nobody has this password")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+-]{0,63}")
-_GROUP: Final = re.compile(r"(?!\.+$)[^/\\\x00-\x1f\x7f]{1,100}")  # addresses cannot have a part of dots
+_IN_ADDRESSES: Final = re.compile(r"(?!\.+$)[^/\\\x00-\x1f\x7f]{1,100}")  # which cannot have a part of dots
 _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's own name
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
@@ -191,11 +191,7 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
     if not caller.may(Right.ROLE_MANAGEMENT):
         demand_few(connection, caller.name, "create_group", _MOST_GROUPS)
     _demand_short(description)
-    if not isinstance(name, str) or not name.isprintable() or not _GROUP.fullmatch(name) or not _alike(name):
-        raise StorageError(
-            "expected a group name of 1 to 100 printable characters, without slashes and not only dots, "
-            f"found {name!r:.80}"
-        )
+    _demand_name("group", name)
     if not _reserve(connection, name, "group"):
         raise ConflictError("Group already exists")
     connection.execute(insert(GROUP).values(name=name, description=description))
@@ -300,18 +296,29 @@ def _known(connection: Connection, caller: Caller, group: str) -> None:
         raise NotFoundError("Group not found")
 
 
+def _demand_name(kind: str, name: str) -> None:
+    """Raises StorageError for a name of a group or a role that is not valid."""
+    if not (isinstance(name, str) and name.isprintable() and _IN_ADDRESSES.fullmatch(name) and _alike(name)):
+        raise StorageError(
+            f"expected a {kind} name of 1 to 100 printable characters, without slashes and not only dots, "
+            f"found {name!r:.80}"
+        )
+
+
 # --- roles ---
 
 
 def create_role(
     connection: Connection, caller: Caller, name: str, rights: Sequence[str], description: str | None
 ) -> None:
-    """Creates a role. Raises ConflictError if the name is taken, StorageError for an unknown right."""
+    """Creates a role. Raises ConflictError if the name is taken, StorageError if it is not valid, or for an unknown
+    right."""
     caller.demand(Right.ROLE_MANAGEMENT)
     _demand_short(description)
+    _demand_name("role", name)
     unknown = [right for right in rights if right not in set(Right)]
-    if unknown or not isinstance(name, str) or not name.isprintable() or not 1 <= len(name) <= 100:
-        raise StorageError(f"expected a role's name and its rights, found {name!r:.80}, {unknown!r:.200}")
+    if unknown:
+        raise StorageError(f"expected the rights of a role, found {unknown!r:.200}")
     if connection.execute(select(ROLE.c.name).where(ROLE.c.name == name)).first():
         raise ConflictError("Role already exists")
     _add_role(connection, name, rights, description, builtin=False)
