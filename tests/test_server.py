@@ -32,6 +32,7 @@ from tupli_mcap.schema import (
     GroupMembership,
     GroupMembershipQuery,
     UserRole,
+    format_filter,
 )
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
@@ -280,6 +281,15 @@ def test_groups_that_one_may_not_see_are_not_named(users: Users, things: Things)
 
     assert told(users.ann) == told(users.admin) == 6 * [["ann", "global", "spies", "bob"]]
     assert told(users.eve) == 6 * [["ann", "global", "bob"]]
+    place = F("published_in")
+    guesses = (place == "spies", place.isin(["spies", "x"]), place.contains("SPI"), ~(place != "spies"))
+    for user, count in ((users.eve, 0), (users.ann, 1)):
+        for guess in guesses:
+            assert user.count_episodes(guess) == len(user.list_episodes(guess)) == count, guess
+            assert len(user.list_benchmarks(guess)) == len(user.list_artifacts(guess)) == count
+            asked = {"filter": format_filter(guess), "format": "json"}
+            page = httpx.get(f"{user.url}/episodes", params=asked, headers=token_of(user), timeout=120).json()
+            assert (len(page["episodes"]), page["count"]) == (count, count)
     for user, shown in ((users.eve, False), (users.ann, True)):
         (ann,) = [each for each in user.list_users() if each.username == "ann"]
         assert ("spies" in [held.group for held in ann.memberships]) == shown
@@ -346,6 +356,14 @@ def test_users_and_groups_have_one_name_space(users: Users) -> None:
         users.ann.read_group("lab")
 
 
+def test_groups_and_roles_have_names_that_addresses_can_have(users: Users) -> None:
+    for name in (".", "..", "a/b", "", "\u3164"):
+        with pytest.raises(StorageError, match="expected a group name"):
+            users.eve.create_group(Group(name=name))
+        with pytest.raises(StorageError, match="expected a role name"):
+            users.admin.create_role(UserRole(role=name, rights=[]))
+
+
 def test_nobody_gives_rights_that_they_lack(users: Users) -> None:
     users.eve.create_group(Group(name="lab"))
     with pytest.raises(StorageError, match="Insufficient permissions in group: lab"):
@@ -356,14 +374,6 @@ def test_nobody_gives_rights_that_they_lack(users: Users) -> None:
         users.eve.create_role(UserRole(role="mighty", rights=[RIGHT.ROLE_MANAGEMENT]))
     with pytest.raises(StorageError, match="cannot be deleted"):
         users.admin.delete_role("admin")
-def test_groups_and_roles_have_names_that_addresses_can_have(users: Users) -> None:
-    for name in (".", "..", "a/b", "", "\u3164"):
-        with pytest.raises(StorageError, match="expected a group name"):
-            users.eve.create_group(Group(name=name))
-        with pytest.raises(StorageError, match="expected a role name"):
-            users.admin.create_role(UserRole(role=name, rights=[]))
-
-
 
 
 def test_a_new_password_ends_every_sign_in(users: Users) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
@@ -95,7 +96,8 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         of = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
-        return each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection), of=of))
+        only, told = seen_episodes(shelf, connection), partial(shelf.as_told, connection)
+        return each_once(find_episodes(connection, wanted, only=only, of=of, told=told))
 
     def ask(connection: Connection) -> tuple[EpisodeHeader | None, dict[str, list[int]]]:
         first: EpisodeHeader | None = None

@@ -154,7 +154,7 @@ def _neighbours(
         of = [of_recording(header.recording)]
     find = partial(
         find_episodes, connection, wanted, limit=1, after=After(header.recording, header.episode), sort=order,
-        only=seen_episodes(shelf, connection), of=seen_recordings(shelf, *of),
+        only=seen_episodes(shelf, connection), of=seen_recordings(shelf, *of), told=partial(shelf.as_told, connection),
     )  # fmt: skip
     before, after = (next(find(backwards=backwards), None) for backwards in (True, False))
     return Neighbours(None if before is None else before.id, None if after is None else after.id)

@@ -138,7 +138,8 @@ def table_of(
         of_some = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
         at = find_episode(shelf, connection, after or before) if after or before else None
         place = None if at is None else After(at.recording, at.episode)
-        find = functools.partial(find_episodes, connection, only=only, of=of_some)
+        told = functools.partial(shelf.as_told, connection)
+        find = functools.partial(find_episodes, connection, only=only, of=of_some, told=told)
         found = list(find(wanted, limit=_ROWS + 1, sort=order, after=place, backwards=bool(before)))
         if not found and at is None and wanted is not None:
             among = list(find(None, limit=_ASKED + 1))
@@ -146,12 +147,12 @@ def table_of(
                 check_metadata(wanted, among)
     except FilterError as err:
         return Table((), str(err), err.position)
-    more, rows = len(found) > _ROWS, shelf.as_told(connection, found[:_ROWS])
+    more, rows = len(found) > _ROWS, told(found[:_ROWS])
     if before:
         rows.reverse()
     count = len(rows)
     if more or at is not None:  # there are others
-        count = count_episodes(connection, wanted, only=only, of=of_some, most=_COUNTED + 1)
+        count = count_episodes(connection, wanted, only=only, of=of_some, told=told, most=_COUNTED + 1)
     return Table(
         rows,
         count=count if count <= _COUNTED else None,

@@ -16,6 +16,7 @@ from tupli_mcap.server.database import audience, audit, pend
 from tupli_mcap.server.people.access import (
     Caller,
     DeniedError,
+    as_told,
     demand_audience,
     left_alone,
     readable,
@@ -69,15 +70,17 @@ def find_episodes(
         else readable_episodes(connection, caller)
     )
     rows, of = rows if only is None else and_(rows, only), recordings_seen(seen)
+    told = partial(as_told, connection, caller)
     return queries.find_episodes(
-        connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of
+        connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of, told=told
     )
 
 
 def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | None) -> int:
     """The number of readable episodes that match a filter."""
     of = recordings_seen(_seen(caller))
-    return queries.count_episodes(connection, filter, only=readable_episodes(connection, caller), of=of)
+    rows, told = readable_episodes(connection, caller), partial(as_told, connection, caller)
+    return queries.count_episodes(connection, filter, only=rows, of=of, told=told)
 
 
 def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:

@@ -16,13 +16,13 @@ import contextlib
 import functools
 import itertools
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, or_, select, true
 
-from tupli_mcap.schema import BaseFilter
+from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.catalog.compare_sql import Narrowed
 from tupli_mcap.storage.catalog.filter_sql import Source, in_all, narrowed, recordings_of, sources
 from tupli_mcap.storage.catalog.order import After, Range, Sort, beyond, has_index, ranges
@@ -44,6 +44,8 @@ _NEAR: Final = 10_000
 _RECORDINGS: Final = 100  # at once
 _GROUP: Final = 500  # episodes that are worth a statement
 _FETCHED_FIRST, _FETCHED = 50, 500  # rows at once
+Told = Callable[[Sequence[EpisodeHeader]], Sequence[EpisodeHeader]]
+"""Makes headers that name only some of their groups."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ class Asked:
     """A query: which episodes, and in which order.
 
     filter: bound to headers of episodes. indexed: see `filter_sql.narrowed`. only, of: further conditions, on rows of
-    EPISODE, and on rows of RECORDING alone. after: where the page begins.
+    EPISODE, and on rows of RECORDING alone. after: where the page begins. told: makes the headers that the filter looks
+    at; None for those of the catalog.
     """
 
     filter: BaseFilter | None
@@ -61,6 +64,7 @@ class Asked:
     sort: Sort | None = None
     after: After | None = None
     backwards: bool = False
+    told: Told | None = None
 
     def recordings(self) -> ColumnElement[bool]:
         """The recordings that may have such episodes."""

@@ -35,13 +35,14 @@ from sqlalchemy.exc import DBAPIError
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, bound
-from tupli_mcap.schema.facts import path_in
+from tupli_mcap.schema.facts import comparisons, path_in
+from tupli_mcap.schema.filters import path_of
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.compare_sql import Condition, Narrowed
 from tupli_mcap.storage.catalog.filter_sql import merged, narrowed
 from tupli_mcap.storage.catalog.metadata_sql import among
 from tupli_mcap.storage.catalog.order import After, Sort
-from tupli_mcap.storage.catalog.pages import Asked, candidates
+from tupli_mcap.storage.catalog.pages import Asked, Told, candidates
 from tupli_mcap.storage.catalog.rows import (
     EpisodeRow,
     StoredRow,
@@ -107,19 +108,21 @@ def find_episodes(
     of: Condition | None = None,
     sort: Sort | None = None,
     backwards: bool = False,
+    told: Told | None = None,
 ) -> Iterator[EpisodeHeader]:
     """The episodes that match a filter, by default ordered by recording (path) and episode number.
 
     after: where to continue. only, of: further conditions, on rows of EPISODE and RECORDING, and on rows of RECORDING
     alone, which skips the episodes of other recordings.
     backwards: in the opposite order; `after` is then the episode before which they lie.
+    told: names the groups that a comparison with `published_in` sees; by default, it sees all.
 
     Raises:
         FilterError: The filter names an unknown top-level key, or compares a fact with what it can never be; or
             the key to sort by is unknown.
         NotFoundError: The episode to go on after is gone.
     """
-    asked = _asked(connection, filter, only, of, sort, after, backwards)
+    asked = _asked(connection, filter, only, of, told, sort, after, backwards)
     if limit is None:
         return _all_of_them(connection, asked, None, offset)
     wanted = offset + limit
@@ -149,10 +152,11 @@ def count_episodes(
     *,
     only: Condition | None = None,
     of: Condition | None = None,
+    told: Told | None = None,
     most: int | None = None,
 ) -> int:
-    """How many episodes match a filter, counted up to `most`. Raises as `find_episodes` does."""
-    asked = _asked(connection, filter, only, of)
+    """How many episodes match a filter, see `find_episodes`, counted up to `most`."""
+    asked = _asked(connection, filter, only, of, told)
     found = _narrowed(asked)
     unsure = or_(false(), *found.unsure)
     sure = _query(asked, found, EPISODE.c.id).where(not_(unsure)).limit(most).subquery()
@@ -228,14 +232,17 @@ def _asked(
     filter: BaseFilter | str | None,
     only: Condition | None,
     of: Condition | None,
+    told: Told | None = None,
     sort: Sort | None = None,
     after: After | None = None,
     backwards: bool = False,
 ) -> Asked:
     meant = None if filter is None else merged(bound(filter, EpisodeHeader))
+    if meant is None or all(path_of(each)[0] != "published_in" for each in comparisons(meant)):
+        told = None
     indexed = {} if filter is None and sort is None else _indexed(connection)
     only, of = (true() if condition is None else condition for condition in (only, of))
-    return Asked(meant, indexed, only, of, sort, after, backwards)
+    return Asked(meant, indexed, only, of, sort, after, backwards, told)
 
 
 def _narrowed(asked: Asked) -> Narrowed:
@@ -328,11 +335,18 @@ def _headers(
     matches = None if asked.filter is None or not found.unsure else bound_predicate(asked.filter)
     width, rows = len(_COLUMNS), list(rows)
     runs = _runs(connection, {row.recording_id for row in rows})
-    for row in rows:
+
+    def made(row: Any) -> EpisodeHeader:
         stored, (uuid, benchmark_id, path) = StoredRow(*row[:width]), row[width:]
-        made = header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
-        if matches is None or matches(made):
-            yield made
+        return header(stored, uuid, benchmark_id, path, runs[stored.recording_id][stored.run])
+
+    if matches is None:
+        yield from map(made, rows)
+    elif asked.told is None:
+        yield from filter(matches, map(made, rows))
+    else:
+        headers = [made(row) for row in rows]
+        yield from itertools.compress(headers, map(matches, asked.told(headers)))
 
 
 def _runs(connection: Connection, recordings: Collection[int]) -> dict[int, list[dict[str, Any]]]:
