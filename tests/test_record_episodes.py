@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import warnings
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -1219,6 +1220,17 @@ def test_a_thread_compresses_large_images(tmp_path: Path, monkeypatch: pytest.Mo
         taken += roll(env, 5)
     assert not any(thread.name.startswith("tupli-mcap-chunks") for thread in threading.enumerate())
     check_against(tmp_path / "r.mcap", taken)
+
+
+@pytest.mark.parametrize("length", [225, 243, 244, 255])
+def test_long_names(tmp_path: Path, length: int) -> None:
+    """The journal's name is longer, and that of one that another recording has pushed aside is longer still."""
+    path = tmp_path / f"{'n' * (length - 5)}.mcap"
+    refused = pytest.raises(RecordingError, match="File name too long; choose a shorter one")
+    with refused if length > 243 else nullcontext(), RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert list(tmp_path.iterdir()) == ([path] if length <= 243 else [])
 
 
 def test_a_closed_recorder_lets_go_of_its_journal_at_once(tmp_path: Path) -> None:

@@ -200,13 +200,12 @@ class Journal:
             try:
                 if os.path.samestat(place.stat(), self._status):
                     place.unlink()
-            except FileNotFoundError:
-                pass
             except OSError as err:
-                warn(
-                    f"{place}: the recording is finished, but its journal cannot be removed "
-                    f"({err.strerror}); delete it"
-                )
+                if err.errno not in (errno.ENOENT, errno.ENAMETOOLONG):  # else it is not there
+                    warn(
+                        f"{place}: the recording is finished, but its journal cannot be removed "
+                        f"({err.strerror}); delete it"
+                    )
 
 
 def journal_aside(path: Path, uuid: str) -> Path:
