@@ -626,7 +626,7 @@ def test_on_the_command_line(
 
     locked = write_key(tmp_path / "bob", passphrase="secret")
     assert fails("bundle", bundle, "-o", "b.mcap", "--sign", "bob").endswith(
-        "encrypted, and needs a passphrase"
+        "encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
     )
     assert not Path("b.mcap").exists()
     monkeypatch.setenv("TUPLI_MCAP_KEY_PASSPHRASE", "secret")

@@ -142,7 +142,9 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
                 raise
             key = load(data, password=None)  # the key has no passphrase
     except TypeError as err:
-        raise PassphraseNeededError(f"{path}: the key is encrypted, and needs a passphrase") from err
+        raise PassphraseNeededError(
+            f"{path}: the key is encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
+        ) from err
     except (ValueError, exceptions.UnsupportedAlgorithm) as err:
         if secret is not None:
             raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from err
