@@ -121,10 +121,10 @@ def ls(
 
     Columns are recording, run, environment, episodes, steps, return, success, started, size,
     state, split, tags, settings. The last three appear only with --columns; settings are the
-    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over
-    episodes. STATE is `complete`; `recording` while a process writes the file; `recovered` if
-    its writer was killed or failed: all finished steps are there; `incomplete` if its journal is
-    missing, too. A server does not tell SIZE and STATE.
+    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all
+    episodes, also interrupted ones. STATE is `complete`; `recording` while a process writes
+    the file; `recovered` if its writer was killed or failed: all finished steps are there;
+    `incomplete` if its journal is missing, too. A server does not tell SIZE and STATE.
     Deleted episodes are not counted. With --filter, only the episodes that match are counted.
     """
     wanted = filter_of(filter_text)
