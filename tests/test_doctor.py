@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -706,7 +707,13 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
         env.reset(seed=1)
         env.step(0)
         assert found(examine(tmp_path / "live.mcap"), "unfinished").message == "a process is writing to it"
+        for end in ("", ".journal"):
+            shutil.copy(tmp_path / f"live.mcap{end}", tmp_path / f"killed.mcap{end}")
     assert examine(tmp_path / "live.mcap").of("unfinished") == ()
+    finding = found(examine(tmp_path / "killed.mcap"), "unfinished")
+    assert finding.suggestion == "finish it with 'tupli-mcap recover --in-place'"
+    assert CliRunner().invoke(app, ["recover", "--in-place", str(tmp_path / "killed.mcap")]).exit_code == 0
+    assert examine(tmp_path / "killed.mcap").of("unfinished") == ()
 
 
 # --- what can be examined ---

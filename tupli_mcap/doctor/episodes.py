@@ -31,7 +31,7 @@ def unfinished(measured: Measurements) -> Iterator[Finding]:
         message, advice = "a process is writing to it", "examine it again when that has finished"
     elif state == "recovered":
         message = "its writer did not finish it; all steps of its chunks and its journal were examined"
-        advice = "finish it with 'tupli-mcap recover'"
+        advice = "finish it with 'tupli-mcap recover --in-place'"
     elif state == "incomplete":
         message = "its writer did not finish it and its journal is missing; only the steps of its chunks were examined"
         advice = "copy the journal beside it if you have it, or save these steps with 'tupli-mcap recover'"

@@ -209,7 +209,8 @@ def _left_out(evidence: Evidence, journal: JournalContents, channels: RecordedCh
         yield (
             f"{name}: the machine that recorded it was restarted afterwards, or this is another machine: {steps} "
             "step(s) in its journal cannot be shown to be whole and are left out; on the machine and boot that "
-            'recorded it, they can be read: finish the recording there, with "tupli-mcap recover" or by appending to it'
+            'recorded it, they can be read: finish the recording there, with "tupli-mcap recover --in-place", or by '
+            "appending to it"
         )
 
 
