@@ -508,9 +508,9 @@ class TestSplit:
     def test_nothing_is_replaced(self, tmp_path: Path) -> None:
         path = record(tmp_path / "run.mcap")
         (tmp_path / "part_0003.mcap").write_bytes(b"mine")
-        with pytest.raises(RecordingError, match=r"part_0003\.mcap exists; delete it"):
+        with pytest.raises(RecordingError, match=r"part_0003\.mcap exists; choose another path"):
             split_recording(path, tmp_path / "part.mcap", episodes=5)
-        with pytest.raises(RecordingError, match=r"run\.mcap exists"):
+        with pytest.raises(RecordingError, match=r"run\.mcap exists; choose another path$"):
             split_recording(path, path, episodes=5)
         for limits in (
             {},

@@ -72,7 +72,7 @@ def split_recording(
         paths = [target.with_stem(f"{target.stem}_{i:04}") if i else target for i in range(len(groups))]
         taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
         if taken:
-            raise RecordingError(f"{taken[0]} exists; delete it, or choose another path")
+            raise RecordingError(f"{taken[0]} exists; choose another path")
         parts = []
         for path, numbers in zip(paths, groups, strict=True):
             lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
