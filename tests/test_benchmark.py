@@ -16,13 +16,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from environments import Fails
 from gymnasium.envs.classic_control.mountain_car import MountainCarEnv
 from gymnasium.utils.env_checker import check_env
 
 from tupli_mcap import trust
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.environment import build
-from tupli_mcap.errors import NotFoundError, StorageError, TupliError, UntrustedError
+from tupli_mcap.errors import NotFoundError, StepError, StorageError, TupliError, UntrustedError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, F, FilterEQ, RLTuple
 from tupli_mcap.storage import FileStorage, TupliStorage
@@ -313,6 +314,23 @@ def test_metadata_of_an_episode_begins_anew_after_recording_was_off(storage: Fil
             env.step(0)
         leave()
     assert [(h.n_tuples, h.metadata["cum_eps_reward"]) for h in storage.list_episodes()] == [(5, 5.0)] * 3
+
+
+def test_a_step_that_raises_is_followed_by_a_reset(storage: FileStorage) -> None:
+    inner = Fails(gym.make("CartPole-v1"))
+    env = TupliEnvWrapper(inner, storage)
+    env.store(name="cart")
+    for _ in range(2):
+        env.reset()
+        env.step(0)
+        inner.fails = True
+        with pytest.raises(TimeoutError, match="no answer"):
+            env.step(0)
+        inner.fails = False
+        with pytest.raises(StepError, match=r"call env.reset\(\) to go on"):
+            env.step(0)
+    env.close()
+    assert [(header.n_tuples, header.end) for header in storage.list_episodes()] == [(1, "interrupted")] * 2
 
 
 def test_a_reset_before_store_is_recorded(storage: FileStorage) -> None:

@@ -42,7 +42,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     The policy sees what it would see without a recorder: the same objects are passed on and returned, and none is
     copied for the environment, so an action that it changes in place is recorded as changed. A step is safe, whatever
     happens to the process, as soon as `step()` has returned. A reset in mid-episode, `close()`, garbage collection
-    and the end of the interpreter end the running episode as "interrupted".
+    and the end of the interpreter end the running episode as "interrupted". So does a step of the environment that
+    raises, which may have been taken in part: a reset must follow.
 
     Args:
         env: any environment whose spaces are Gymnasium's own.
@@ -178,10 +179,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         try:
             result = self.env.step(action)
             state, reward, terminal, timeout, _ = result
-        except Exception:  # the environment may have taken no step
-            work.state = DONE
-            raise
-        except BaseException:  # Ctrl-C: the environment may have taken a part of the step
+        except BaseException:  # the environment may have taken a part of the step
             self._recorder.refuse()
             work.state = DONE
             raise
