@@ -173,14 +173,17 @@ def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:
 
     assert finals(autoreset="next-step") == [2, 6]
     assert finals(autoreset="same-step") == [None, None]
-    assert finals(autoreset="disabled") == [None, 6]
+    assert finals(autoreset="disabled") == [None, None]  # the caller has reset
     assert finals(autoreset="same-step", final_states=np.array([[8.0], [9.0]], np.float32)) == [8, 9]
     assert finals(autoreset="same-step", next_observations=states[1:] + 10) == [12, 16]
+    done[1] = False
+    assert finals() == [6]
 
 
 def test_many_episodes_of_which_one_has_a_final_state(tmp_path: Path) -> None:
     states, n = np.arange(3001, dtype=np.float32)[:, None], 3000  # one more than there are steps
     ends = np.arange(n) % 10 == 9
+    ends[-1] = False
     write_rollout(tmp_path / "r.mcap", states, np.zeros((n, 1)), np.ones(n), ends, autoreset="disabled")
     with Recording(tmp_path / "r.mcap") as recording:
         *others, last = recording.episodes

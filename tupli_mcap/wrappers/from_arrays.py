@@ -82,7 +82,8 @@ def write_rollout(
 
     Args:
         states: what the actions were chosen on. If there is one more than there are steps (T + 1), it is the state
-            after the last one.
+            after the last one; if that step ended an episode and `autoreset` is "same-step" or "disabled", it is the
+            first one of the next episode, and no final state.
         terminals, timeouts: whether a step ended its episode; in lists, one flag for each episode will do. By default
             false. Steps after the last end are an interrupted episode.
         next_states: the state after each step, in arrays as long as the actions; only final states are taken from it.
@@ -92,7 +93,7 @@ def write_rollout(
         metadata: of every episode; in lists, one for each or one for all.
         autoreset: what the row after an end is, if arrays continue after one. "next-step": a reset; its action and
             reward are left out. "same-step": a step of the next episode, whose first state follows the end.
-            "disabled": the same, and the caller has reset between the steps.
+            "disabled": the same, and the caller has reset between the steps, also after the last one if it is an end.
         observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds.
         reward_space: for rewards that are arrays.
         run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` takes them.
@@ -305,9 +306,9 @@ class _Finals:
         """Whether the states after these steps are known: bool, or an array of them."""
         if self._given.next_states is not None:
             return np.ones_like(last, np.bool_)
-        steps, done = len(self.done), self.done[last, *column]
-        is_next = ~done | (self._mode == "next-step") | ((last + 1 == steps) & (self._mode != "same-step"))
-        in_states = is_next & (last + 1 < _length(self._given.states))
+        done = self.done[last, *column]
+        # without a mode, an end is that of the last step, and no row is of a reset
+        in_states = (~done | (self._mode in ("", "next-step"))) & (last + 1 < _length(self._given.states))
         return in_states if self._given.final_states is None else in_states | done
 
     def at(self, last: Any, column: tuple[int, ...]) -> Any:
