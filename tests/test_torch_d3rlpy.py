@@ -53,11 +53,12 @@ def same_batch(one: Any, other: Any) -> None:
 
 
 @pytest.mark.d3rlpy
-@pytest.mark.parametrize("cut", [False, True])
-def test_samples_are_those_of_an_mdp_dataset(cartpole: TupliDataset, cut: bool) -> None:
+@pytest.mark.parametrize("left_out", [None, 5, 1])
+def test_samples_are_those_of_an_mdp_dataset(cartpole: TupliDataset, left_out: int | None) -> None:
+    """Without its second step, an episode begins with a piece of one step, which has no transition."""
     from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
 
-    dataset = cartpole.with_tuple_filter(F("step") != 5) if cut else cartpole
+    dataset = cartpole if left_out is None else cartpole.with_tuple_filter(F("step") != left_out)
     whole, lazy = mdp_dataset(dataset), replay_buffer(dataset)
     assert lazy.transition_count == whole.transition_count == len(lazy.buffer)
     assert lazy.size() == whole.size()
@@ -136,6 +137,18 @@ def test_what_d3rlpy_does_not_have(tmp_path: Path, cartpole: TupliDataset) -> No
     buffer = replay_buffer(cartpole)
     with pytest.raises(SamplingError, match="this buffer of recorded steps is read-only"):
         buffer.append_episode(buffer.episodes[0])
+
+
+@pytest.mark.d3rlpy
+def test_a_dataset_without_transitions(tmp_path: Path) -> None:
+    from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
+
+    with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+    dataset = TupliDataset.from_files(tmp_path / "r.mcap")
+    for buffer in (mdp_dataset(dataset), replay_buffer(dataset)):
+        assert (buffer.transition_count, buffer.size(), list(buffer.episodes)) == (0, 0, [])
 
 
 def test_without_d3rlpy_the_extra_is_named() -> None:

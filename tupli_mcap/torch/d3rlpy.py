@@ -144,9 +144,12 @@ class RecordedBuffer:
         self.steps = steps
         flags = steps.read(["rewards", "terminals"], rows)
         self.rewards = _two_dimensional(flags["rewards"]).astype(np.float32)
-        self.firsts = np.concatenate([[0], steps.breaks[:-1] + 1])
-        self.sizes = steps.breaks - self.firsts + 1
-        self.terminated = flags["terminals"][steps.breaks]
+        firsts, terminated = np.concatenate([[0], steps.breaks[:-1] + 1]), flags["terminals"][steps.breaks]
+        sizes = steps.breaks - firsts + 1
+        listed = (
+            sizes > ~terminated
+        )  # d3rlpy lists no episode without a transition: a single step that is no terminal
+        self.firsts, self.sizes, self.terminated = firsts[listed], sizes[listed], terminated[listed]
         self.transition_ends = np.cumsum(self.sizes - ~self.terminated)
         one = steps.read(["states", "actions"], rows[:1])
         states = _observations(one["states"])
@@ -168,7 +171,7 @@ class RecordedBuffer:
 
     @property
     def transition_count(self) -> int:
-        return int(self.transition_ends[-1])
+        return int(self.transition_ends[-1]) if len(self.transition_ends) else 0
 
     def __len__(self) -> int:
         return self.transition_count
