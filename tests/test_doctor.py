@@ -784,6 +784,9 @@ def test_what_cannot_be_examined(tmp_path: Path) -> None:
         examine(tmp_path, checks=["nam"])
     with pytest.raises(RecordingError, match="'nan' has no threshold 'least'; it has none"):
         examine(tmp_path, thresholds={"nan": {"least": 3}})
+    for wrong in (float("nan"), -1, "30", None, True):
+        with pytest.raises(RecordingError, match=f"from 0 on for frozen-frames.frames, found {wrong!r}"):
+            examine(tmp_path, thresholds={"frozen-frames": {"frames": wrong}})
     with pytest.raises(RecordingError, match="list of ids of checks"):
         examine(tmp_path, checks="nan")
 

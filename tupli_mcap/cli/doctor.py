@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of, pair_of
 from tupli_mcap.cli.output import Column, counted, number, print_json, print_rows, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
+from tupli_mcap.errors import RecordingError
 
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
@@ -71,11 +71,16 @@ def doctor(
     """
     from tupli_mcap.dataset.chosen import chosen_from
     from tupli_mcap.doctor import Severity, examine
+    from tupli_mcap.doctor.examine import check_settings
 
     if list_checks:
         _print_checks(as_json)
         return
-    checks, skipped, thresholds = _checked(check), _checked(skip), _thresholds(settings or ())
+    thresholds = _thresholds(settings or ())
+    try:
+        check_settings([*(check or ()), *(skip or ())], thresholds)
+    except RecordingError as err:
+        raise typer.BadParameter(str(err)) from err
     wanted, sources = filter_of(filter_text), paths or ["."]
     with (
         nullcontext(sources) if episodes is None else chosen_from(sources, episodes, wanted) as chosen,
@@ -83,8 +88,8 @@ def doctor(
     ):
         diagnosis = examine(
             chosen,
-            checks=checks,
-            skip=skipped or (),
+            checks=check,
+            skip=skip or (),
             thresholds=thresholds,
             episode_filter=wanted,
             progress=progress,
@@ -98,32 +103,12 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _checked(names: list[str] | None) -> list[str] | None:
-    """The ids of checks; BadParameter if there is no such check."""
-    from tupli_mcap.doctor import CHECKS
-
-    for name in names or ():
-        if name not in CHECKS:
-            raise typer.BadParameter(f"there is no check {name!r}; see tupli-mcap doctor --list")
-    return names
-
-
-def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, float]]:
+def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Thresholds by check, from texts such as `frozen-frames.frames=50`."""
-    from tupli_mcap.doctor import CHECKS
-
-    thresholds: dict[str, dict[str, float]] = {}
+    thresholds: dict[str, dict[str, Any]] = {}
     for setting in settings:
-        name, _, text = setting.partition("=")
+        name, value = pair_of(setting)
         check, _, threshold = name.partition(".")
-        if check not in CHECKS or threshold not in CHECKS[check].thresholds:
-            raise typer.BadParameter(f"there is no threshold {name!r}; see tupli-mcap doctor --list --json")
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not value >= 0:
-            raise typer.BadParameter(f"expected a number from 0 on for {name}, found {text!r}")
         thresholds.setdefault(check, {})[threshold] = value
     return thresholds
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap.dataset.chosen import Chosen, Examinable, Subject, subjects_of
 from tupli_mcap.doctor import episodes, steps, values
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
@@ -101,10 +103,11 @@ def examine(
         progress: called with the name of each recording before it is read.
 
     Raises:
-        RecordingError: the source cannot be examined, or there is no such check or threshold.
+        RecordingError: the source cannot be examined, there is no such check or threshold, or a threshold is no number
+            from 0 on.
         FilterError: the filter names an unknown field.
     """
-    _check_names([*_list(checks or ()), *_list(skip)], thresholds or {})
+    check_settings([*_list(checks or ()), *_list(skip)], thresholds or {})
     if episode_filter is not None:
         check_keys(episode_filter, EpisodeHeader)
     chosen = [
@@ -124,15 +127,19 @@ def _list(checks: Collection[str]) -> Collection[str]:
     return checks
 
 
-def _check_names(checks: Iterable[str], thresholds: Mapping[str, Mapping[str, Any]]) -> None:
+def check_settings(checks: Iterable[str], thresholds: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises RecordingError if there is no such check or threshold, or a threshold is no number from 0 on."""
     for name in [*checks, *thresholds]:
         if name not in CHECKS:
             raise RecordingError(f"there is no check {name!r}; checks are {', '.join(CHECKS)}")
     for name, given in thresholds.items():
-        for key in given:
+        for key, value in given.items():
             if key not in CHECKS[name].thresholds:
                 names = ", ".join(CHECKS[name].thresholds) or "none"
                 raise RecordingError(f"the check {name!r} has no threshold {key!r}; it has {names}")
+            is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not (is_number and value >= 0):
+                raise RecordingError(f"expected a number from 0 on for {name}.{key}, found {value!r:.80}")
 
 
 class _Examination:
