@@ -119,6 +119,8 @@ def test_what_is_no_server_of_this_version_is_one_error(
 
 
 def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path) -> None:
+    empty = CliRunner().invoke(app, ["doctor", url])
+    assert empty.exit_code == 1 and "there is nothing to examine; give recordings" in empty.output
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap", name="ppo") as env:
         for seed in range(5):
             env.reset(seed=seed)

@@ -94,6 +94,10 @@ def doctor(
             episode_filter=wanted,
             progress=progress,
         )
+    if not diagnosis.files and wanted is None:
+        raise RecordingError(
+            "there is nothing to examine; give recordings (.mcap), directories or storages of them"
+        )
     if as_json:
         print_json({key: value for key, value in diagnosis.to_dict().items() if key != "version"})
     else:
@@ -131,7 +135,8 @@ def _print(diagnosis: Diagnosis, level: Severity) -> None:
     for group in groups.values():
         _print_group(group, several=diagnosis.files > 1)
         say("")
-    verdict = ["healthy"] if diagnosis.healthy else []
+    good = "healthy" if diagnosis.episodes else "nothing to examine"
+    verdict = [good] if diagnosis.healthy else []
     severities = [str(finding.severity) for finding in diagnosis.findings]
     verdict += [
         f"{number(count)} info" if name == "info" else counted(count, name)
