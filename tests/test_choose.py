@@ -124,6 +124,17 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
         choose_episodes(recording, "all")
 
 
+def test_each_number_must_exist_in_a_directory_too(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", RETURNS)
+    with (
+        pytest.raises(RecordingError, match=r"has no episode '9'; see tupli-mcap episodes "),
+        chosen_from(tmp_path, "3,9", None),
+    ):
+        pass
+    with chosen_from(tmp_path, "4-9", None) as (chosen,):
+        assert list(chosen.positions) == [4, 5]
+
+
 def test_a_directory_without_recordings_is_said_to_hold_none(tmp_path: Path) -> None:
     with (
         pytest.raises(RecordingError, match=r"holds no recording \(\.mcap\)$"),

@@ -44,7 +44,7 @@ Episodes = Annotated[
         "--episode",
         "-e",
         metavar="WHICH",
-        help="Numbers such as 3,7-9, or best, worst, first, last, all.",
+        help="Numbers such as 3,7-9 (of a range, those that exist), or best, worst, first, last, all.",
     ),
 ]
 Sort = Annotated[

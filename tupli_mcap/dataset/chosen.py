@@ -235,10 +235,11 @@ def _of_many(
     returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
     named: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
-        named.update(dict.fromkeys(places_of(item, text, numbers, returns)))
-    if not named:
-        why = "" if filter is None else f" that matches {filter}"
-        raise RecordingError(f"{where} has no episode {text!r}{why}; see tupli-mcap episodes {where}")
+        places = places_of(item, text, numbers, returns)
+        if not places:
+            why = "" if filter is None else f" that matches {filter}"
+            raise RecordingError(f"{where} has no episode {item!r}{why}; see tupli-mcap episodes {where}")
+        named.update(dict.fromkeys(places))
     by_recording = numbers_by_recording([headers[i] for i in named])
     if len(by_recording) > _MOST_OPEN:
         raise RecordingError(
