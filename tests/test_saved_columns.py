@@ -91,6 +91,13 @@ def saved_libraries(
     return found
 
 
+def test_names_that_are_longer_than_file_systems_take(tmp_path: Path) -> None:
+    space = spaces.Dict({f"{'a' * 300}{i}": spaces.Box(-1, 1, (2,)) for i in range(2)})
+    record(tmp_path / "r.mcap", Sampler(space, spaces.Discrete(2)), 20)
+    dataset = TupliDataset.from_files(tmp_path / "r.mcap")
+    check(columns_of(dataset, tmp_path / "columns"), dataset)
+
+
 @FEW
 @given(number=st.integers(0, 7), data=st.data())
 def test_items_are_those_of_the_recordings(

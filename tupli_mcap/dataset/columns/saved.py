@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +35,7 @@ from tupli_mcap.storage.texts import first_defect
 
 _MANIFEST = "manifest.json"
 _BLOCK_BYTES = 16 << 20  # of steps that are written at once
+_LONGEST_NAME = 200
 _BLOCK = 4096  # steps in a block: cheap to read together
 _INT64, _BOOL = np.dtype("<i8"), np.dtype(np.bool_)
 _PLAIN = {"terminals": "terminal", "timeouts": "timeout", "times": "time"}
@@ -57,7 +59,7 @@ class _Manifest(BaseModel):
 
 
 def _plan(layout: StepLayout, manifest: _Manifest) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
-    """Dtype and shape of each array, by the name of its file without `.npy`."""
+    """Dtype and shape of each array, by its name."""
     steps, breaks = manifest.steps, manifest.breaks
     dtypes = {name: dtype.newbyteorder("<") for name, dtype in layout.dtypes.items()}
     return {
@@ -70,6 +72,13 @@ def _plan(layout: StepLayout, manifest: _Manifest) -> dict[str, tuple[np.dtype[A
         "next_known": (_BOOL, (breaks,)),
         "episode_length": (_INT64, (len(manifest.episodes),)),
     }
+
+
+def _file_name(name: str) -> str:
+    """The name of an array's file. Of a long one, the first characters and a checksum: file systems take 255 bytes."""
+    if len(name) > _LONGEST_NAME:
+        name = f"{name[:_LONGEST_NAME]}_{zlib.crc32(name.encode()):08x}"
+    return f"{name}.npy"
 
 
 # ---- writing
@@ -140,10 +149,10 @@ def _write(directory: Path, steps: Steps, layout: StepLayout, manifest: _Manifes
         header = io.BytesIO()
         fields = {"descr": dtype.str, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(header, fields)
-        (directory / f"{name}.npy").write_bytes(header.getvalue())
+        (directory / _file_name(name)).write_bytes(header.getvalue())
 
     def append(name: str, array: Array) -> None:
-        with (directory / f"{name}.npy").open("ab") as file:
+        with (directory / _file_name(name)).open("ab") as file:
             file.write(np.ascontiguousarray(array, plan[name][0]).data)
 
     append("break", steps.breaks)
@@ -305,7 +314,7 @@ def open_columns(directory: str | os.PathLike[str]) -> SavedColumns:
         if not layout.constant:
             raise _defect(place / _MANIFEST, "spaces of values of a fixed size", "others")
         arrays = {
-            name: _mapped(place / f"{name}.npy", *known) for name, known in _plan(layout, manifest).items()
+            name: _mapped(place / _file_name(name), *known) for name, known in _plan(layout, manifest).items()
         }
     _check_episodes(place, arrays, manifest.steps)
     return SavedColumns(place, manifest, SavedSteps(place, layout, manifest.identity, arrays))
