@@ -41,9 +41,9 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.cli import app
-from tupli_mcap.cli.output import bytes_of, number, numbers
+from tupli_mcap.cli.output import number, numbers
 from tupli_mcap.environment import EnvironmentRecord
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.recording.describe.description import space_lines
 from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.spaces.labels import Labels

@@ -503,6 +503,19 @@ class TestNothingActs:
             assert evil.request(method, "/episodes").status_code == 405
 
 
+def test_sizes_are_rounded_as_commands_round_them(tmp_path: Path) -> None:
+    notes = {"notes": ("application/octet-stream", bytes(999_960))}
+    with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", attachments=notes) as env:
+        env.reset()
+        env.step(0)
+    command = CliRunner().invoke(app, ["info", str(tmp_path / "r.mcap")])
+    with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+        (dataset,) = told(client, "/")["datasets"]
+        page = client.get(f"/dataset/{dataset['key']}").text
+    assert "1.0 MB" in command.output
+    assert "<td>1.0 MB" in page and "1000 kB" not in page
+
+
 @pytest.mark.filterwarnings("ignore:.*")  # of copies, and of files without their journals
 def test_every_kind_of_recording(tmp_path: Path) -> None:
     """The golden files hold every space, dtype, image and info that there is."""

@@ -147,6 +147,16 @@ def plural(count: int, noun: str) -> str:
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
+def bytes_of(size: int) -> str:
+    """A size: `512 B`, `18.3 kB`, `2.0 GB`."""
+    value, unit = float(size), "B"
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if value < 999.95 or unit == "TB":
+            break
+        value /= 1000
+    return f"{size} B" if unit == "B" else f"{value:.1f} {unit}"
+
+
 def did_you_mean(name: object, known: Iterable[str]) -> str:
     """` (did you mean 'return'?)` where one of the known names is like this one, else nothing."""
     names = list(known)

@@ -26,7 +26,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import (
     Column,
-    bytes_of,
     counted,
     number,
     pairs_of,
@@ -38,7 +37,7 @@ from tupli_mcap.cli.output import (
     print_wrapped,
 )
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:

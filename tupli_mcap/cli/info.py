@@ -11,7 +11,6 @@ import typer
 from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import (
     Column,
-    bytes_of,
     counted,
     number,
     numbers,
@@ -25,7 +24,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.remote import is_pattern, is_server, is_url, shown_name
 
 if TYPE_CHECKING:

@@ -24,7 +24,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import (
     Column,
-    bytes_of,
     number,
     numbers,
     pairs_of,
@@ -35,7 +34,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import fail, is_roomy
-from tupli_mcap.errors import did_you_mean
+from tupli_mcap.errors import bytes_of, did_you_mean
 from tupli_mcap.remote import is_server, is_url
 
 if TYPE_CHECKING:

@@ -238,16 +238,6 @@ def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:
     ]
 
 
-def bytes_of(size: int) -> str:
-    """A size: `512 B`, `18.3 kB`, `2.0 GB`."""
-    value, unit = float(size), "B"
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if value < 999.95 or unit == "TB":
-            break
-        value /= 1000
-    return f"{size} B" if unit == "B" else f"{value:.1f} {unit}"
-
-
 def time_of(time_ns: int) -> str:
     """A wall clock time (ns) as local time to the second, in the form that filters take; empty for 0."""
     if not time_ns:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tupli_mcap.cli.options import Json, pair_of
-from tupli_mcap.cli.output import bytes_of, counted, number, print_json
+from tupli_mcap.cli.output import counted, number, print_json
 from tupli_mcap.cli.terminal import say, step_progress
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import TupliError, bytes_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, filter_of
-from tupli_mcap.cli.output import bytes_of, counted, number, print_json, print_result
+from tupli_mcap.cli.output import counted, number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, bytes_of
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording

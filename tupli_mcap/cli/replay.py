@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, filter_of
-from tupli_mcap.cli.output import bytes_of
 from tupli_mcap.cli.terminal import flush, say
+from tupli_mcap.errors import bytes_of
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Apart = Annotated[

@@ -31,7 +31,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import (
     Column,
-    bytes_of,
     counted,
     number,
     print_facts,
@@ -43,7 +42,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import is_roomy, say
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 
 import tupli_mcap
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FilterError, MissingExtraError, NotFoundError, SpaceError, TupliError
+from tupli_mcap.errors import FilterError, MissingExtraError, NotFoundError, SpaceError, TupliError, bytes_of
 from tupli_mcap.page import texts
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.recording.edit.merge import UnmergeableError
@@ -127,7 +127,8 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {name: getattr(texts, name) for name in texts.__all__} | {"spelled": jsonvalue.spelled}
+    made.filters |= {name: getattr(texts, name) for name in texts.__all__}
+    made.filters |= {"size": bytes_of, "spelled": jsonvalue.spelled}
     made.globals |= {
         "can_film": importlib.util.find_spec("av") is not None,
         "can_replay": importlib.util.find_spec("rerun") is not None,

@@ -1,4 +1,4 @@
-"""Numbers, times and sizes as texts for people."""
+"""Numbers and times as texts for people."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from tupli_mcap.schema.times import time_ns
 
-__all__ = ["day", "duration", "iso", "minute", "number", "percent", "size", "spread"]
+__all__ = ["day", "duration", "iso", "minute", "number", "percent", "spread"]
 
 
 def number(value: float | None) -> str:
@@ -26,15 +26,6 @@ def number(value: float | None) -> str:
 def percent(part: int, whole: int) -> str:
     """A share such as `40%`; a dash if the whole is 0."""
     return f"{100 * part / whole:.0f}%" if whole else "–"
-
-
-def size(count: float) -> str:
-    """Bytes, in units of 1000."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if count < 1000:
-            return f"{count:.0f} {unit}" if unit == "B" or count >= 99.5 else f"{count:.1f} {unit}"
-        count /= 1000
-    return f"{count:.1f} TB"
 
 
 def iso(ns: int) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import plural
+from tupli_mcap.errors import bytes_of, plural
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.plots import style
 from tupli_mcap.plots.groups import Group
@@ -62,7 +62,7 @@ def facts_of(groups: Sequence[Group]) -> list[tuple[str, str]]:
         "environment": (about.environment or "none attached")
         + (f", {about.num_envs} sub-environments" if about.num_envs > 1 else ""),
         "recorded": _times_text(one),
-        "size": _bytes_text(about.size),
+        "size": bytes_of(about.size),
         "episodes": f"{len(rows):,}{chosen}{f' ({ends})' if ends else ''}",
         "steps": f"{one.steps:,}",
         "return": _spread_text(rows["return"]),
@@ -147,11 +147,6 @@ def _times_text(one: Measured) -> str:
     seconds = (int(one.rows["end_time"].max()) - start) / 1e9
     unit, size = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
     return f"{text}, {seconds / size:.1f} {unit}"
-
-
-def _bytes_text(size: int) -> str:
-    unit, scale = ("GB", 1e9) if size >= 999.5e6 else ("MB", 1e6) if size >= 999.5e3 else ("kB", 1e3)
-    return f"{size / scale:.1f} {unit}" if size >= 1000 else f"{size} B"
 
 
 def add_facts(page: Page, title: str, facts: Sequence[tuple[str, str]], *, several: bool) -> None:

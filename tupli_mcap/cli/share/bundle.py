@@ -18,8 +18,9 @@ from tupli_mcap.cli.options import (
     full_id,
     open_storage,
 )
-from tupli_mcap.cli.output import bytes_of, counted, number, print_facts, print_json, print_result
+from tupli_mcap.cli.output import counted, number, print_facts, print_json, print_result
 from tupli_mcap.cli.terminal import ask_secret, say
+from tupli_mcap.errors import bytes_of
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from tupli_mcap.cli.options import (
     open_storage,
     server_at,
 )
-from tupli_mcap.cli.output import bytes_of, counted, print_json, print_result
+from tupli_mcap.cli.output import counted, print_json, print_result
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, bytes_of
 from tupli_mcap.remote import copied, is_url, shown
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from tupli_mcap.cli.options import Json, local_path
-from tupli_mcap.cli.output import bytes_of, counted, print_result
+from tupli_mcap.cli.output import counted, print_result
 from tupli_mcap.cli.terminal import flush, say
-from tupli_mcap.errors import missing_extra
+from tupli_mcap.errors import bytes_of, missing_extra
 
 
 def browse(

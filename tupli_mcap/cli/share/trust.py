@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tupli_mcap.cli.options import Json
-from tupli_mcap.cli.output import bytes_of, print_facts, print_json, print_result
+from tupli_mcap.cli.output import print_facts, print_json, print_result
+from tupli_mcap.errors import bytes_of
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.sign.carried_code import CarriedCode
