@@ -552,6 +552,26 @@ def test_different_recordings_of_one_name(tmp_path: Path, monkeypatch: pytest.Mo
         found[0] + found[1]
 
 
+def test_the_working_directory_may_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    for seed, folder in enumerate((one, two)):
+        folder.mkdir()
+        record(folder / "r.mcap", seed, 2)
+    monkeypatch.chdir(one)
+    datasets = [tupli_mcap.open(place) for place in ("r.mcap", ".", "*.mcap", ["r.mcap"])]
+    with Recording("r.mcap") as recording:
+        expected = recording.read().states
+        monkeypatch.chdir(two)
+        recording.annotate(None, {"good": True})
+        assert recording.name == "r.mcap"
+    for dataset in datasets:
+        assert {header.recording for header in dataset.headers} == {"r.mcap"}
+        assert all(episode.metadata["good"] for episode in dataset)
+        assert np.array_equal(dataset.read().states, expected)
+    assert datasets[0].head(1).delete() == 1
+    assert [len(tupli_mcap.open(folder)) for folder in (one, two)] == [1, 2]
+
+
 def test_what_a_notebook_shows_of_an_episode(dataset: Dataset) -> None:
     shown = dataset[0]._repr_html_()
     assert f"<td>{dataset[0].return_:g}</td>" in shown

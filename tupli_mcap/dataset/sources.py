@@ -17,7 +17,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_url, matching, shown, shown_name
+from tupli_mcap.remote import is_url, matching, shown_name
 from tupli_mcap.schema import (
     BaseFilter,
     BenchmarkHeader,
@@ -125,13 +125,17 @@ class FilesSource:
                 "expected at least one recording, found an empty list; give paths or a pattern"
             )
         self.names = list(dict.fromkeys(names))
-        self._addresses = {shown(name): name for name in self.names if is_url(name)}
+        # by the names that are shown; of paths the absolute ones, since the working directory may change
+        self._places = {
+            shown_name(name): name if is_url(name) else os.path.abspath(name)  # noqa: PTH100 - links stay
+            for name in self.names
+        }
         self._folders: dict[Path, FileStorage] = {}
 
     def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
         matches = compile_predicate(filter, BenchmarkHeader)
         found: dict[tuple[str, str], BenchmarkHeader] = {}
-        for recording in self._each():
+        for _, recording in self._each():
             header = _benchmark_header(recording)
             if matches(header):
                 found.setdefault((header.id, header.metadata.name), header)
@@ -146,11 +150,10 @@ class FilesSource:
         by_uuid: dict[str, str] = {}  # the names of recordings
         made_of: dict[str, set[str]] = {}  # by name, the UUIDs of others
         found: list[EpisodeHeader] = []
-        for recording in self._each():
-            name = recording.name
+        for name, recording in self._each():
             if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
-            notes = None if is_url(name) else Notes.read(Path(name))
+            notes = None if recording.path is None else Notes.read(recording.path)
             deleted = set() if notes is None else notes.about(recording.metadata).deleted
             headers = list(episode_headers(recording, name, deleted))
             copies = [header for header in headers if header.id in known]
@@ -167,28 +170,30 @@ class FilesSource:
                 warn(f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice")
         return found
 
-    def _each(self) -> Iterator[Recording]:
-        """The recordings, each open until the next one."""
-        for name in self.names:
+    def _each(self) -> Iterator[tuple[str, Recording]]:
+        """The recordings and the names that are shown, each open until the next one."""
+        for name in self._places:
             try:
-                recording = Recording(name)
+                recording = self.open(name)
             except TupliError as err:
                 if not self._of_directory:
                     raise
                 warn(f"{err}; it is left out")
                 continue
             with recording:
-                yield recording
+                yield recording.name if is_url(name) else name, recording
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
-        return Recording(self._addresses.get(recording, recording), cache_bytes=_CACHE_BYTES)
+        place = self._places.get(recording, recording)
+        as_given = not is_url(place) and os.path.abspath(recording) == place  # noqa: PTH100 - links stay
+        return Recording(recording if as_given else place, cache_bytes=_CACHE_BYTES)
 
     def home_of(self, recording: str) -> tuple[TupliStorage, str]:
         if is_url(recording):
             raise RecordingError(f"{recording} cannot be changed here; download it, and open the copy")
         from tupli_mcap.storage import FileStorage  # and with it a database, which reading does not need
 
-        path = Path(recording).absolute()
+        path = Path(self._places.get(recording, recording)).absolute()
         if path.suffix != ".mcap":
             raise RecordingError(
                 f"expected a recording whose name ends in .mcap, found {recording}; rename it"

@@ -122,7 +122,8 @@ class OpenedRecording:
         self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)
         self._cache_bytes = cache_bytes
         self.name = self._source.name
-        self.path: Path | None = self._source.path
+        path = self._source.path
+        self.path: Path | None = None if path is None else Path(_absolute(path))
         try:
             with memory_for(lambda: f"{self.name}: opening a file of {self._source.size} bytes"):
                 self._contents: Contents = read_contents(self._source)
