@@ -698,12 +698,12 @@ def test_images_and_large_arrays_come_to_arrow(tmp_path: Path) -> None:
     dataset = tupli_mcap.open(tmp_path)
     table = dataset.to_arrow()
     cams = dataset.read(["states"]).states["cam"]
-    assert np.array_equal(np.array(table.column("state['cam']").to_pylist(), np.uint8), cams)
-    assert str(table.schema.field("state['cam']").type.value_type.value_type.value_type) == "uint8"
+    assert np.array_equal(np.array(table.column("state.cam").to_pylist(), np.uint8), cams)
+    assert str(table.schema.field("state.cam").type.value_type.value_type.value_type) == "uint8"
     frame = dataset.to_pandas()
     assert len([name for name in frame if "state" in name]) == 4
-    assert np.array_equal(np.stack(list(frame["state['depth']"])), dataset.read().states["depth"])
-    assert frame["state['depth']"][0].shape == (16, 32, 1)
+    assert np.array_equal(np.stack(list(frame["state.depth"])), dataset.read().states["depth"])
+    assert frame["state.depth"][0].shape == (16, 32, 1)
     assert set(dataset.stats()) == {"states['depth']", "states['x']", "actions", "rewards"}
 
 

@@ -14,7 +14,7 @@ from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.labels import common_labels, distinct, element_names
+from tupli_mcap.spaces.labels import common_labels, distinct, element_names, short_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,12 +175,13 @@ def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mappin
     columns: list[tuple[str, Any]] = []
     for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
         values = leaf.get(column)
-        if isinstance(values, list) or leaf.apart or leaf.size > _MOST_COLUMNS:
-            columns.append((leaf.path, _texts(list(values))))
-            continue
-        flat = values.reshape(len(values), leaf.size)
         begun = not isinstance(leaf.keys[0], str) if leaf.keys else leaf.path not in labels.dimensions
         prefix = "" if begun else f"{root}."  # names of other leaves begin with the root
+        if isinstance(values, list) or leaf.apart or leaf.size > _MOST_COLUMNS:
+            name = prefix + short_path(leaf) if leaf.keys else leaf.path
+            columns.append((name, _texts(list(values))))
+            continue
+        flat = values.reshape(len(values), leaf.size)
         columns += [(prefix + name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
     names = distinct([name for name, _ in columns])
     return {name: values for name, (_, values) in zip(names, columns, strict=True)}
