@@ -86,7 +86,8 @@ def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
     episodes = list(recording.episodes)
     assert film(episodes, tmp_path / "a.gif").pictures == 12
     np.testing.assert_allclose(shown(tmp_path / "a.gif"), [0, 10, 20, 30, 40, 50] * 2, atol=3)
-    assert film(episodes[:1], tmp_path / "b.gif", camera="state['wrist']", fps=5).pictures == 5
+    for i, name in enumerate(["state['wrist']", "state.wrist", "wrist"]):
+        assert film(episodes[:1], tmp_path / f"b{i}.gif", camera=name, fps=5).pictures == 5
     with pytest.raises(RecordingError, match="it has render, state"):
         film(episodes, tmp_path / "c.gif", camera="front")
 

@@ -147,14 +147,17 @@ def test_what_an_environment_says_of_its_actions_counts_more(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("state", "action"), [("state", "action"), ("states", "actions"), ("observations", "action")]
+    ("joints", "held", "action"),
+    [
+        ("state['joints']", "state['held']", "action"),
+        ("states['joints']", "states['held']", "actions"),
+        ("observations['joints']", "observation.held", "action"),
+        ("state.joints", "states.held", "action"),
+        ("joints", "held", "actions"),
+    ],
 )
-def test_names_may_be_chosen(state: str, action: str, tmp_path: Path) -> None:
-    given = {
-        f"{state}['joints']": ["shoulder", "elbow"],
-        f"{state}['held']": ["a", "b", "c"],
-        action: ["x", "y"],
-    }
+def test_names_may_be_chosen(joints: str, held: str, action: str, tmp_path: Path) -> None:
+    given = {joints: ["shoulder", "elbow"], held: ["a", "b", "c"], action: ["x", "y"]}
     labels = record(Arm(), tmp_path / "r.mcap", labels=given).labels
     assert labels.dimensions == {"state['joints']": ("shoulder", "elbow")}
     assert labels.values == {"state['held']": ("a", "b", "c"), "action": ("x", "y")}
@@ -164,7 +167,7 @@ def test_names_may_be_chosen(state: str, action: str, tmp_path: Path) -> None:
     ("given", "match"),
     [
         ({"action": ["a", "b"], "actions": ["a", "b"]}, "expected names for action once"),
-        ({"joints": ["a", "b"]}, r"labels: expected one of \[.*state\['joints'\].*found 'joints'"),
+        ({"elbows": ["a", "b"]}, r"labels: expected one of \[.*state\['joints'\].*found 'elbows'"),
         ({"state['joints']": ["a"]}, r"labels: expected 2 names for state\['joints'\] .* found 1"),
         ({"state['held']": ["a", "b"]}, r"expected 1 or 3 names for state\['held'\]"),
         ({"state['words']": ["a"]}, r"expected no names for state\['words'\]"),

@@ -34,7 +34,7 @@ _Camera = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Which recorded pictures, if there are several: a camera, or an image such as \"state['wrist']\".",
+        help="Which recorded pictures, if there are several: a camera, or an image of the states, such as wrist.",
     ),
 ]
 _FrameFormat = Annotated[

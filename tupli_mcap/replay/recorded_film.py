@@ -17,6 +17,7 @@ from tupli_mcap.messages.images.pictures import Picture, resized
 from tupli_mcap.recording import Episode
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.replay.movie import check_goal, check_pictures, film_rate, write_movie
+from tupli_mcap.spaces.labels import leaves_by_name
 from tupli_mcap.spaces.leaves import Leaf
 
 _KINDS = (".mp4", ".gif")
@@ -65,7 +66,7 @@ def film(
 
     Args:
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
-        camera: a camera, or the path of an image in the states, such as `state['wrist']`. By default, the camera
+        camera: a camera, or an image in the states, such as `state['wrist']` or `wrist`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
         fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`. A
             picture is shown for at most 10 minutes.
@@ -108,11 +109,12 @@ def _scaled(picture: Picture, width: int | None) -> Picture:
 
 
 def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Picture]]:
-    recording, images = episode.recording, {leaf.path: leaf for leaf in episode.recording.layout.images}
-    if camera in images:
-        return len(episode), _of_states(episode, images[camera])
+    recording, images = episode.recording, episode.recording.layout.images
     if camera is not None and camera not in recording.cameras:
-        known = [*recording.cameras, *images]
+        leaf = leaves_by_name(images).get(camera)
+        if leaf is not None:
+            return len(episode), _of_states(episode, leaf)
+        known = [*recording.cameras, *(leaf.path for leaf in images)]
         raise RecordingError(
             f"{recording.name} has no pictures {camera!r:.80}; it has {', '.join(known) or 'none'}"
         )
@@ -120,7 +122,7 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
     if len(frames):
         return len(frames), iter(frames)
     if camera is None and images:
-        return len(episode), _of_states(episode, next(iter(images.values())))
+        return len(episode), _of_states(episode, images[0])
     raise RecordingError(
         f"{recording.name}: episode {episode.number} was recorded without pictures; make them with `tupli-mcap render`"
     )

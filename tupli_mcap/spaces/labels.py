@@ -82,20 +82,22 @@ class Labels(NamedTuple):
 
 
 def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], known: Labels) -> Labels:
-    """`known`, replaced by `given` where it has names: leaf path -> names of its dimensions, or of its values. The path
-    may begin with the name of a column: `states['pos']` is the leaf `state['pos']`.
+    """`known`, replaced by `given` where it has names: leaf -> names of its dimensions, or of its values. Each name of
+    `leaves_by_name` will do; it may begin with the name of a column: `states['pos']` is the leaf `state['pos']`.
 
     Raises:
-        SpaceError: no leaf has the path, or the leaf has another number of dimensions or values.
+        SpaceError: no leaf has the name, or the leaf has another number of dimensions or values.
     """
-    by_path = {leaf.path: leaf for leaf in leaves}
+    by_name = leaves_by_name(leaves)
     dimensions, values, named = dict(known.dimensions), dict(known.values), set[str]()
     for key, names in given.items():
-        root, bracket, rest = str(key).partition("[")
-        path = f"{_OF_COLUMN.get(root, root)}{bracket}{rest}"
-        leaf = by_path.get(path)
+        root, *rest = re.split(r"(?=[\[.])", str(key), maxsplit=1)
+        leaf = by_name.get(str(key)) or by_name.get("".join([_OF_COLUMN.get(root, root), *rest]))
         if leaf is None:
-            raise SpaceError(f"labels: expected one of {sorted(by_path)}, found {key!r:.80}")
+            raise SpaceError(
+                f"labels: expected one of {sorted(leaf.path for leaf in leaves)}, found {key!r:.80}"
+            )
+        path = leaf.path
         if path in named:
             raise SpaceError(f"labels: expected names for {path} once, found them twice")
         named.add(path)
@@ -161,6 +163,16 @@ def short_path(leaf: Leaf) -> str:
     for key in leaf.keys:
         text += f".{key}" if isinstance(key, str) else f"[{key}]"
     return text.removeprefix(".")
+
+
+def leaves_by_name(leaves: Sequence[Leaf]) -> dict[str, Leaf]:
+    """Leaves by each of their names: the path, `state['arm']['x']`; that of columns and filters, `state.arm.x`; and
+    `arm.x`, as `short_path` has it, unless it could mean another leaf."""
+    shorts = [short_path(leaf) for leaf in leaves]
+    pairs = list(zip(shorts, leaves, strict=True))
+    found = {short: leaf for short, leaf in pairs if shorts.count(short) == 1}
+    found |= {f"{leaf.path.partition('[')[0]}.{short}": leaf for short, leaf in pairs}
+    return found | {leaf.path: leaf for leaf in leaves}
 
 
 def element_names(leaf: Leaf, labels: Labels, elements: Sequence[int] | None = None) -> tuple[str, ...]:
