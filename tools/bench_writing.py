@@ -1,0 +1,101 @@
+"""Measures what recording costs a learner, and how fast arrays are written.
+
+    python tools/bench_writing.py [--rounds 16]
+
+1. PPO of stable-baselines3 learns with and without `VecRecordEpisodes`, in turns, in this process: CPU time. Must
+   reach: at most 3 % more (the median of the rounds).
+2. `write_rollout` beside `numpy.save` of the same arrays, in turns: wall-clock time. Must reach: half of its speed.
+   Recordings are messages with checksums: with steps of few bytes, most of the time goes into these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from tupli_mcap import write_rollout
+from tupli_mcap.sb3 import VecRecordEpisodes
+
+ENVS, STEPS = 8, 256
+
+
+def learn(path: Path | None) -> None:
+    """Learns for two updates of the policy."""
+    env: Any = DummyVecEnv([lambda: gym.make("CartPole-v1")] * ENVS)
+    if path is not None:
+        env = VecRecordEpisodes(env, path, mode="w")
+    PPO("MlpPolicy", env, n_steps=STEPS, seed=0, device="cpu").learn(2 * ENVS * STEPS)
+    env.close()
+
+
+def rollout(width: int, steps: int) -> dict[str, Any]:
+    """Arrays of floats that do not compress."""
+    rng = np.random.default_rng(0)
+    wide = rng.random((steps, width), np.float32)
+    return {"states": wide, "actions": wide[:, :6].copy(), "rewards": rng.random(steps)}
+
+
+def save(path: Path, arrays: dict[str, Any]) -> None:
+    for name, array in arrays.items():
+        np.save(path.with_suffix(f".{name}.npy"), array)
+
+
+def in_turns(rounds: int, clock: Callable[[], float], *work: Callable[[], object]) -> tuple[list[float], ...]:
+    """The times (s) of each piece of work."""
+    times: tuple[list[float], ...] = tuple([] for _ in work)
+    for number in range(rounds + 1):
+        for took, each in zip(times, work, strict=True):
+            begun = clock()
+            each()
+            if number:  # the first round warms up
+                took.append(clock() - begun)
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rounds", type=int, default=16)
+    rounds = parser.parse_args().rounds
+    good = True
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        bare, recorded = in_turns(rounds, time.process_time, lambda: learn(None), lambda: learn(path))
+        more = statistics.median(recorded) / statistics.median(bare) - 1
+        print(f"PPO with recording: {more:+.1%} (must reach: at most +3%), {bare[0]:.2f} s without")
+        good &= more <= 0.03
+        for width, steps in ((17, 500_000), (1_000, 20_000), (30_000, 600)):
+            arrays = rollout(width, steps)
+            for compression in ("zstd", "none"):
+                saving, writing = in_turns(
+                    rounds,
+                    time.perf_counter,
+                    lambda arrays=arrays: save(path, arrays),
+                    lambda arrays=arrays, kind=compression: write_rollout(
+                        path, **arrays, mode="w", compression=kind
+                    ),
+                )
+                ratio = statistics.median(saving) / statistics.median(writing)
+                size = sum(array.nbytes for array in arrays.values()) / 1e6
+                print(
+                    f"write_rollout, {width} floats a step, {compression}: {ratio:.2f} of numpy.save "
+                    f"(must reach: 0.5), {size:.0f} MB in {statistics.median(writing):.2f} s"
+                )
+                good &= ratio >= 0.5
+    sys.exit(not good)
+
+
+if __name__ == "__main__":
+    main()
