@@ -216,6 +216,22 @@ def test_infos_are_dicts(tmp_path: Path) -> None:
     assert strong.infos == [{"wind": 2.5}] * 2
 
 
+def test_gymnasiums_names(tmp_path: Path) -> None:
+    env = Scripted(lambda step: step, gym.spaces.Discrete(50), length=5)
+    record(tmp_path / "a.mcap", env, 12)
+    dataset = TupliDataset.from_files(tmp_path / "a.mcap")
+    assert dataset.observations is dataset.states and dataset.next_observations is dataset.next_states
+    assert dataset.terminations is dataset.terminals and dataset.truncations is dataset.timeouts
+    for names in (
+        ("state", "observation", "observations"),
+        ("next_state", "next_observation", "next_observations"),
+        ("terminal", "terminated", "terminations"),
+        ("timeout", "truncated", "truncations"),
+    ):
+        found = [len(dataset.with_tuple_filter(F(name).isin([True, 3]))) for name in names]
+        assert found == [found[0]] * 3, names
+
+
 # --- one array from several recordings ---
 
 
@@ -335,8 +351,8 @@ def test_filters_are_checked_at_once(cart: tuple[TupliDataset, Taken]) -> None:
         dataset.with_episode_filter(F("nonsense") == 1)
     with pytest.raises(FilterError, match="unknown key 'score'"):
         dataset.with_benchmark_filter(F("score") == 1)
-    with pytest.raises(FilterError, match=r"unknown key 'observation'.*state"):
-        dataset.with_tuple_filter(F("observation") == 1)
+    with pytest.raises(FilterError, match=r"unknown key 'obs'.*state"):
+        dataset.with_tuple_filter(F("obs") == 1)
     with pytest.raises(FilterError, match="expected a filter, such as"):
         dataset.with_episode_filter(True)  # type: ignore[arg-type]
     with pytest.raises(FilterError, match="expected a function of one tuple or an expression"):

@@ -337,6 +337,11 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
     assert np.array_equal(columns.truncations[:n], episode.truncations)
     assert np.array_equal(columns.next_observations[:n], episode.next_observations)
     assert episode.observations is episode.states and columns.actions is None
+    assert episode.final_observation is episode.final_state
+    step = episode[-1]
+    assert (step.terminated, step.truncated) == (step.terminal, step.timeout) == (True, False)
+    assert np.array_equal(step.observation, step.state)
+    assert len(dataset.filter("truncated")) == 0 and len(dataset.filter("not truncated")) == len(dataset)
     windows = dataset.windows(4, fields=["observations", "rewards"])
     assert windows[0].states.shape == (4, 4)
     for wrong in ("rewrads", "observatoins", "x"):
@@ -778,7 +783,7 @@ def test_tensors_are_recorded_as_arrays(tmp_path: Path) -> None:
     ("name", "episode", "step", "window"),
     [
         ("obs", "states", "state", "states"),
-        ("observation", "states", "state", "states"),
+        ("act", "actions", "action", "actions"),
         ("acts", "actions", "action", "actions"),
         ("rews", "rewards", "reward", "rewards"),
         ("dones", "terminals", "terminal", "terminals"),
@@ -811,6 +816,7 @@ def test_fields_of_items_have_gymnasium_s_names_too(dataset: Dataset) -> None:
     around = dataset.delta_windows({"observations": [0, 1, 2], "action": [0], "truncations": [0]})[0]
     assert list(around.values) == ["observations", "action", "truncations"]
     assert np.array_equal(around["observations"], states)
+    assert np.array_equal(dataset.delta_windows({"observation": [0]})[0]["observation"], states[:1])
     assert "rewards: 1.0; " in repr(transition) and "terminals: False" in repr(transition)
     assert "states: float32 (3, 4)" in repr(dataset.windows(3)[0]) and len(repr(around)) < 500
 

@@ -175,6 +175,7 @@ def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:
     assert finals(autoreset="same-step") == [None, None]
     assert finals(autoreset="disabled") == [None, None]  # the caller has reset
     assert finals(autoreset="same-step", final_states=np.array([[8.0], [9.0]], np.float32)) == [8, 9]
+    assert finals(autoreset="same-step", final_observations=np.array([[8.0], [9.0]], np.float32)) == [8, 9]
     assert finals(autoreset="same-step", next_observations=states[1:] + 10) == [12, 16]
     done[1] = False
     assert finals() == [6]

@@ -19,7 +19,7 @@ from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import FilesSource, Source, StorageSource, checked_whole
-from tupli_mcap.recording.columns.fields import FIVE
+from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 SIX = (*FIVE, "infos")
 
 
-class TupliDataset(RandomAccess):
+class TupliDataset(RandomAccess, GymnasiumNames):
     """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
 
     A dataset reads on access, and only what is requested. Its filters never change: `with_benchmark_filter`,
@@ -109,9 +109,9 @@ class TupliDataset(RandomAccess):
 
         Args:
             filter_fcn: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time
-                (ns) and step (counted from 0 in each episode), such as `F("state.0") > 1` or "info.force > 2", which
-                is evaluated on whole columns; or a function of one `RLTuple` that returns True or False, called for
-                every step.
+                (ns) and step (counted from 0 in each episode), or Gymnasium's names of these (observation, terminated,
+                truncated), such as `F("state.0") > 1` or "info.force > 2", which is evaluated on whole columns; or a
+                function of one `RLTuple` that returns True or False, called for every step.
 
         Raises:
             FilterError: it is neither, or names an unknown field.
@@ -220,7 +220,7 @@ class TupliDataset(RandomAccess):
         return Tuples(self._query.read(SIX), self._query.layout)
 
     @property
-    def observations(self) -> Any:
+    def states(self) -> Any:
         """The state of each step, the observation its action was chosen on: a read-only column."""
         return self._query.read(["states"])["states"]
 

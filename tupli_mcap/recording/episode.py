@@ -43,6 +43,21 @@ class Step(_Step, SaysWhatIsMeant):
 
     env: int = 0
 
+    @property
+    def observation(self) -> Any:
+        """`state`."""
+        return self.state
+
+    @property
+    def terminated(self) -> bool:
+        """`terminal`."""
+        return self.terminal
+
+    @property
+    def truncated(self) -> bool:
+        """`timeout`."""
+        return self.timeout
+
 
 class Described(Protocol):
     """Knows the metadata of an episode."""
@@ -264,6 +279,11 @@ class Episode(GymnasiumNames):
     def final_state(self) -> Any:
         """The observation after the last step; None if it is not known (imported episodes, for example)."""
         return self._recording.final_state(self._position)
+
+    @property
+    def final_observation(self) -> Any:
+        """`final_state`."""
+        return self.final_state
 
     @cached_property
     def infos(self) -> list[dict[str, Any] | None] | None:

@@ -32,6 +32,7 @@ from tupli_mcap.schema.values import Scalar, classify
 TIME_KEY: Final = "created_at"
 TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
 _MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
+_OTHER_NAMES: Final = {**_MEANT, "truncated": "timeout"}
 _LIKE: Final = {
     "length": "steps",
     "reward": "return",
@@ -79,7 +80,7 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
     """
     name, *inside = split_key(key)
     if isinstance(fields, type) and issubclass(fields, EpisodeHeader):
-        name = _MEANT.get(name, name)
+        name = _OTHER_NAMES.get(name, name)
     if name not in (fields.model_fields if isinstance(fields, type) else fields):
         known = filter_keys(fields)
         nested = [there for there in _INSIDE if there.split(".")[0] in known]

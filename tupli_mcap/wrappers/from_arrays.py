@@ -70,6 +70,7 @@ def write_rollout(
     terminations: Any = None,
     truncations: Any = None,
     next_observations: Any = None,
+    final_observations: Any = None,
 ) -> None:
     """Writes a recording from arrays that hold whole rollouts.
 
@@ -98,8 +99,8 @@ def write_rollout(
         reward_space: for rewards that are arrays.
         run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` takes them.
         labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
-        observations, terminations, truncations, next_observations: Gymnasium's names of states, terminals, timeouts,
-            next_states.
+        observations, terminations, truncations, next_observations, final_observations: Gymnasium's names of states,
+            terminals, timeouts, next_states, final_states.
 
     Raises:
         StepError: arrays do not fit together, or values cannot be stored exactly; the episodes before the first that
@@ -112,7 +113,8 @@ def write_rollout(
         _one_of("terminals", terminals, "terminations", terminations),
         _one_of("timeouts", timeouts, "truncations", truncations),
         _one_of("next_states", next_states, "next_observations", next_observations),
-        final_states, infos, metadata,
+        _one_of("final_states", final_states, "final_observations", final_observations),
+        infos, metadata,
     )  # fmt: skip
     parts, first, lead, count = _rollout_of(given, autoreset, reward_space)
     observations = observation_space or _space(first.states, lead, "states")

@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIELDS, FIVE
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE, OTHER_NAMES, OTHER_STEP_NAMES
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
@@ -296,6 +296,8 @@ STEP_KEYS: Mapping[str, str] = {
     "info": "infos",
     "step": "steps",
     "time": "times",
+    **OTHER_NAMES,
+    **OTHER_STEP_NAMES,
 }
 """Name in an expression -> column; `step` counts from 0 within its episode."""
 

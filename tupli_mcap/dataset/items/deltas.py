@@ -13,7 +13,7 @@ from tupli_mcap.dataset.items.items import StepItems
 from tupli_mcap.dataset.items.steps import SamplingError, Steps
 from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
-from tupli_mcap.recording.columns.fields import OTHER_NAMES, Parts
+from tupli_mcap.recording.columns.fields import OTHER_NAMES, OTHER_STEP_NAMES, Parts
 
 Unit = Literal["steps", "seconds", "clock"]
 UNITS = ("steps", "seconds", "clock")
@@ -21,7 +21,7 @@ KEYS = {
     "state": "states", "action": "actions", "reward": "rewards", "terminal": "terminals",
     "timeout": "timeouts", "next_state": "next_states", "time": "times",
 }  # fmt: skip
-_FIELDS = {**KEYS, **{field: field for field in KEYS.values()}, **OTHER_NAMES}
+_FIELDS = {**KEYS, **{field: field for field in KEYS.values()}, **OTHER_NAMES, **OTHER_STEP_NAMES}
 _CLOSEST = 1e-4  # seconds by which a delta may miss a step
 _FARTHEST = 1 << 48  # steps: beyond every episode
 _LONGEST = 1e9  # seconds, 31 years: beyond every episode

@@ -21,6 +21,15 @@ OTHER_NAMES = MappingProxyType(
         "truncations": "timeouts",
     }
 )
+OTHER_STEP_NAMES = MappingProxyType(
+    {
+        "observation": "states",
+        "next_observation": "next_states",
+        "terminated": "terminals",
+        "truncated": "timeouts",
+    }
+)
+"""Gymnasium's names for the values of one step -> column."""
 
 
 def field_names(
