@@ -774,6 +774,19 @@ class TestLook:
         assert len(run("episodes", cartpole, "--filter", later, "--json").json) == len(rows)
         assert "expected a time, such as" in fails("episodes", cartpole, "--filter", "ended > 5", code=2)
 
+    def test_episodes_by_number_and_by_word(self, cartpole: Path, here: Path) -> None:
+        def numbers(*words: object) -> list[int]:
+            return [each["episode"] for each in run("episodes", *words, "--json").json]
+
+        returns = [each["return"] for each in run("episodes", cartpole, "--json").json]
+        best = returns.index(max(returns))
+        assert numbers(cartpole, "--episodes", "best") == [best]
+        assert numbers(cartpole, "-e", "2-3,0", "--sort", "-episode") == [3, 2, 0]
+        (here / "runs").mkdir()
+        shutil.copy(cartpole, here / "runs")
+        assert numbers("runs", "--episodes", "best", "--limit", 5) == [best]
+        assert "no episode" in fails("episodes", cartpole, "--episodes", "999")
+
     def test_episodes_of_a_storage(self, filled: tuple[Path, str, str], here: Path) -> None:
         told = run("episodes", filled[0], "--json").json
         assert len(told) == 5

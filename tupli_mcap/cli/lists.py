@@ -13,6 +13,7 @@ import typer
 
 from tupli_mcap.cli.options import (
     ColumnNames,
+    Episodes,
     FilterText,
     Json,
     Limit,
@@ -264,6 +265,7 @@ def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed], emp
 
 def episodes(
     paths: Sources,
+    which: Episodes = None,
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
@@ -278,13 +280,18 @@ def episodes(
     "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
     week stands for all of it. --sort and --columns take the same keys.
     """
-    if len(paths) == 1 and (is_server(paths[0]) or Path(paths[0]).is_dir()):
+    if which is None and len(paths) == 1 and (is_server(paths[0]) or Path(paths[0]).is_dir()):
         with any_storage(paths[0]) as storage:
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
-    _print_headers(
-        _headers_of(dataset_of(paths), filter_of(filter_text), sort)[:limit], columns, as_json=as_json
-    )
+    wanted = filter_of(filter_text)
+    headers = _headers_of(dataset_of(paths), wanted, sort)
+    if which is not None:
+        from tupli_mcap.dataset.chosen import chosen_ids
+
+        ids = chosen_ids(paths, which, wanted)
+        headers = [header for header in headers if header.id in ids]
+    _print_headers(headers[:limit], columns, as_json=as_json)
 
 
 def list_stored(
