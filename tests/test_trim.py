@@ -106,6 +106,15 @@ def test_of_a_part_of_several_recordings(tmp_path: Path) -> None:
     assert said["steps"] == {str(e.number): [3, len(e) + 3] for e in merged}
 
 
+def test_info_says_the_digests_of_the_sources_and_alike_trims_once(tmp_path: Path) -> None:
+    new = tupli_mcap.open(record(tmp_path / "r.mcap")).trim(slice(2, 9), tmp_path / "n.mcap")
+    said = Recording(new).made_of
+    assert said is not None
+    told = " ".join(CliRunner().invoke(app, ["info", str(new)]).output.split())
+    digest = said["sources"][0]["sha256"][:12]
+    assert f"r.mcap (sha256 {digest}) by trim to steps [2, 9] of episodes 0, 1, 2, 3" in told
+
+
 def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap")
     for steps in (slice(600, None), slice(0, 0), slice(None, None, 2)):

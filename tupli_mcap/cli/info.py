@@ -228,10 +228,17 @@ def _made_of_text(made_of: dict[str, Any]) -> str:
     facts = [f"{made_of.get(key)!s:.200}" for key in ("query", "function") if made_of.get(key)]
     steps = made_of.get("steps")
     if isinstance(steps, dict):  # of a trim
+        alike: dict[str, list[str]] = {}
+        for episode, kept in steps.items():
+            alike.setdefault(f"{kept!s:.40}", []).append(f"{episode!s:.20}")
         facts += [
-            f"to steps {kept!s:.40} of episode {number!s:.20}" for number, kept in list(steps.items())[:3]
+            f"to steps {kept} of episode{'s'[: len(those) > 1]} {_some(those)}"
+            for kept, those in list(alike.items())[:3]
         ]
-    names = [str(one.get("name", "")) if isinstance(one, dict) else "" for one in made_of["sources"]]
+    names = [
+        f"{one.get('name', '')} (sha256 {one.get('sha256', '')!s:.12})" if isinstance(one, dict) else ""
+        for one in made_of["sources"]
+    ]
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     return f"{listed} by {made_of.get('how', '')!s:.40}{''.join(f' {fact}' for fact in facts)}"
 
