@@ -40,7 +40,7 @@ def rollout(key):
 
 states, actions, rewards = rollout(jax.random.key(0))
 tupli_mcap.write_rollout(
-    "pendulum.mcap",
+    "jax_rollout.mcap",
     states,  # one more than there are actions: the last ones are the final states
     actions,
     rewards,
@@ -51,7 +51,7 @@ tupli_mcap.write_rollout(
     run={"name": "random torques", "metadata": {"seed": 0}},
 )
 
-dataset = tupli_mcap.open("pendulum.mcap")
+dataset = tupli_mcap.open("jax_rollout.mcap")
 print("recorded", dataset, "with returns from", dataset.returns.min(), "to", dataset.returns.max())
 
 steps = dataset.transitions()[:]

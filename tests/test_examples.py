@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -39,5 +40,6 @@ def test_it_runs(script: Path, tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*.mcap")), "an example records"
 
 
-def test_there_are_examples() -> None:
-    assert SCRIPTS
+def test_no_two_write_the_same_file() -> None:
+    written = [name for path in SCRIPTS for name in set(re.findall(r'"([\w/]+\.mcap)"', path.read_text()))]
+    assert len(written) == len(set(written)) > 5
