@@ -376,6 +376,20 @@ class TestRecord:
         result = CliRunner().invoke(app, ["ls"])
         assert (result.exit_code, result.stderr) == (130, "interrupted; nothing was changed\n")
 
+    def test_ctrl_c_while_the_commands_are_imported(self) -> None:
+        program = """if True:
+            import sys
+            class Interrupted:
+                def find_spec(self, name, *_):
+                    if name == "typer":
+                        raise KeyboardInterrupt
+            sys.meta_path.insert(0, Interrupted())
+            from tupli_mcap.cli import main
+            main()
+        """
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (130, "interrupted; nothing was changed\n")
+
     def test_ctrl_c_keeps_what_was_recorded(self, here: Path) -> None:
         args = [TOOL, "record", "CartPole-v1", "-o", "a.mcap", "--steps", "100000000"]
         with subprocess.Popen(args, stderr=subprocess.PIPE, text=True, cwd=here) as process:

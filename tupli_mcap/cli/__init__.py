@@ -15,6 +15,12 @@ output         formats what is printed
 terminal       prints it, and lets no control character of a file through
 """
 
-from tupli_mcap.cli.app import app, main
+import sys
+
+try:
+    from tupli_mcap.cli.app import app, main
+except KeyboardInterrupt:  # Ctrl-C before there is a command, which `app` would handle
+    sys.stderr.write("interrupted; nothing was changed\n")
+    sys.exit(130)
 
 __all__ = ["app", "main"]
