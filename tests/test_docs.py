@@ -9,6 +9,7 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -221,6 +222,13 @@ def wrong_change(path: Path) -> str:
 
 def test_changes_are_named_and_what_breaks_shows_how() -> None:
     assert [problem for path in sorted(CHANGES.glob("[!R]*")) if (problem := wrong_change(path))] == []
+
+
+def test_only_the_version_of_the_package_is_unreleased() -> None:
+    heading = f"## {version('tupli-mcap')} (unreleased)"
+    shown = generated.replaced("<!-- generated: changes -->")
+    assert shown.splitlines()[0] == heading if any(CHANGES.glob("+*.md")) else not shown
+    assert "unreleased" not in (ROOT / "CHANGELOG.md").read_text()
 
 
 def test_wrong_changes_are_found(tmp_path: Path) -> None:
