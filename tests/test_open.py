@@ -946,3 +946,28 @@ def test_numbers_of_infos_keep_their_digits_in_tables(tmp_path: Path) -> None:
     assert table["info.wave"].tolist() == [1 + 2j, None, 1 + 2j]
     assert dataset.to_arrow()["info.id"].to_pylist() == [2**60 + 1, None, 2**60 + 3]
     assert dataset.to_arrow()["info.wave"].to_pylist()[1] is None
+
+
+def test_reprs_are_short(tmp_path: Path) -> None:
+    image = spaces.Dict(
+        {"camera": spaces.Box(0, 255, (48, 48, 3), np.uint8), "joints": spaces.Box(-1, 1, (2,))}
+    )
+    with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", image, SPACE) as writer:
+        writer.begin()
+        for _ in range(2):
+            writer.step(image.sample(), SPACE.sample(), 1.0, False, False)
+        writer.end(image.sample())
+    dataset = tupli_mcap.open(tmp_path / "run.mcap")
+    dataset[0].annotate(success=True)
+    (step, _), (item, _) = dataset[0], dataset[0].tuples
+    for shown in (repr(step), repr(item), str(item)):
+        assert "'camera': <uint8 (48, 48, 3)>, 'joints': array([" in shown and "reward=1.0" in shown
+        assert len(shown) < 300 and "\n" not in shown
+    assert (
+        repr(dataset.steps)
+        == repr(TupliDataset.from_files(tmp_path / "run.mcap").steps)
+        == "<2 steps of 1 episode>"
+    )
+    assert repr(Recording(tmp_path / "run.mcap").annotations) == "<1 annotation of 1 episode>"
+    TupliDataset.from_files(tmp_path / "run.mcap").save_columns(tmp_path / "columns")
+    assert repr(tupli_mcap.dataset.open_columns(tmp_path / "columns").steps) == "<2 steps of 1 episode>"

@@ -10,6 +10,7 @@ import numpy as np
 
 Array = np.ndarray[Any, Any]
 DType = np.dtype[Any]
+_SHOWN, _LONGEST = 20, 300  # numbers of an array, characters of a value, in a repr
 
 
 def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
@@ -26,3 +27,17 @@ def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
 def arrays_at(tree: Any, place: Any) -> Any:
     """Indexes each array of nested dicts and tuples with `place`: an index, a slice, or a tuple of these."""
     return map_arrays(tree, operator.itemgetter(place))
+
+
+def short_repr(value: Any) -> str:
+    """A repr in at most a line: of a large array its dtype and shape, of all else the first characters."""
+    if isinstance(value, np.ndarray) and value.size > _SHOWN:
+        return f"<{value.dtype} {value.shape}>"
+    if isinstance(value, dict):
+        inner = ", ".join(f"{key!r}: {short_repr(part)}" for key, part in value.items())
+        text = f"{{{inner}}}"
+    elif type(value) is tuple:
+        text = f"({', '.join(map(short_repr, value))})"
+    else:
+        text = " ".join(repr(value).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import short_repr
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.columns.fields import GymnasiumNames
@@ -42,6 +43,9 @@ class Step(_Step, SaysWhatIsMeant):
     """
 
     env: int = 0
+
+    def __repr__(self) -> str:
+        return f"Step({', '.join(f'{name}={short_repr(value)}' for name, value in self._asdict().items())})"
 
     @property
     def observation(self) -> Any:

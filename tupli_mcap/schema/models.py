@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, Field, PrivateAttr
 
+from tupli_mcap.arrays import short_repr
 from tupli_mcap.errors import StorageError
 
 
@@ -114,6 +115,12 @@ class RLTuple(BaseModel):
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and _equal(self.__dict__, other.__dict__)
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={short_repr(value)}" for name, value in self.__dict__.items())
+        return f"{type(self).__name__}({values})"
+
+    __str__ = __repr__
 
     @classmethod
     def from_env_step(

@@ -257,6 +257,9 @@ class SavedSteps:
     def __len__(self) -> int:
         return len(self._columns["terminals"])
 
+    def __repr__(self) -> str:
+        return f"<{plural(len(self), 'step')} of {plural(len(self.episode_lengths), 'episode')}>"
+
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         where = following(rows, len(self))
         return {

@@ -14,7 +14,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
 from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, checked_fields, rows_of_runs
-from tupli_mcap.errors import FormatError, memory_for
+from tupli_mcap.errors import FormatError, memory_for, plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.chunk_store import ChunkCache
@@ -101,6 +101,9 @@ class RecordedSteps:
 
     def __len__(self) -> int:
         return int(self._index.lengths.sum()) if self._wanted is None else len(self._wanted)
+
+    def __repr__(self) -> str:
+        return f"<{plural(len(self), 'step')} of {plural(len(self.episode_lengths), 'episode')}>"
 
     def blocks(self, rows: Array) -> Array:
         """The chunk of each row: that of the image if states have one."""

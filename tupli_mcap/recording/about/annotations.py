@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, plural
 
 ANNOTATIONS_NAME: Final = "annotations.json"
 ANNOTATIONS_MEDIA_TYPE: Final = "application/json"
@@ -35,6 +35,9 @@ class Annotations:
         for annotation in self.said:
             for number in dict.fromkeys(annotation.episodes):
                 self._of_episode.setdefault(number, []).append(annotation)
+
+    def __repr__(self) -> str:
+        return f"<{plural(len(self.said), 'annotation')} of {plural(len(self._of_episode), 'episode')}>"
 
     def of(self, episode: int) -> Sequence[Annotation]:
         """The annotations of the episode with this number, the earliest first."""
