@@ -658,6 +658,24 @@ class TestCommands:
         assert wrong.exit_code == 2
         assert "did you mean 'return'" in wrong.output
 
+    def test_a_filter_for_what_no_run_has_says_what_is_meant(self, tmp_path: Path) -> None:
+        for seed in range(2):
+            record(tmp_path / f"{seed}.mcap", 1, name=f"ppo-seed{seed}", split="train")
+        for key, wrong, right in (
+            ("run.name", "ppo-sed1", "ppo-seed1"),
+            ("run.split", "trian", "train"),
+            ("run.environment", "CartPole-v0", "CartPole-v1"),
+        ):
+            for words in (("ls",), ("episodes",), ("episodes", "--sort", "return"), ("episodes", "--json")):
+                for text in (f'{key} = "{wrong}"', f'steps > 0 and {key} in ["{wrong}"]'):
+                    done = CliRunner().invoke(app, [*words, str(tmp_path), "--filter", text])
+                    assert done.exit_code == 0
+                    assert done.stderr == f"warning: no {key} is '{wrong}' (did you mean '{right}'?)\n"
+        far = CliRunner().invoke(
+            app, ["ls", str(tmp_path), "--filter", "run.name = 'sac' or run.name = 'ppo-seed1' and steps < 0"]
+        )
+        assert (far.stdout, far.stderr) == ("no recording matches\n", "")
+
     def test_info_leaves_out_bounds_that_say_nothing(self, tmp_path: Path) -> None:
         states, actions = np.zeros((3, 4)), np.zeros(3, np.int64)
         write_rollout(tmp_path / "w.mcap", states, actions, np.ones(3))

@@ -35,7 +35,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import fail, is_roomy
-from tupli_mcap.errors import bytes_of, did_you_mean
+from tupli_mcap.errors import bytes_of, did_you_mean, warn
 from tupli_mcap.remote import is_server, is_url
 
 if TYPE_CHECKING:
@@ -167,7 +167,8 @@ def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]
 
 
 def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
-    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has."""
+    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has;
+    warns of a text that none has there."""
     from tupli_mcap.storage.listing import recordings_at
 
     if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
@@ -175,7 +176,17 @@ def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
     is_one = is_server(sources[0])
     found = sources if is_one else [str(file) for source in sources for file in recordings_at(source)]
     if found:
-        len(dataset_of(found).filter(wanted))
+        _matching(dataset_of(found), wanted)
+
+
+def _matching(dataset: Dataset, wanted: BaseFilter) -> Dataset:
+    """The episodes that match. If there is none, a warning or a FilterError says what the filter may mean."""
+    from tupli_mcap.dataset.keys import unlike_any
+
+    found = dataset.filter(wanted)
+    if not len(found) and (meant := unlike_any(wanted, dataset.headers)):
+        warn(meant)
+    return found
 
 
 def _sorted(
@@ -308,14 +319,14 @@ def list_stored(
     if sort is None:  # the storage stops at the limit
         headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
         if wanted is not None and not headers and limit != 0:
-            len(open_dataset(storage).filter(wanted))  # raises FilterError if no episode has such a key
+            _matching(open_dataset(storage), wanted)
     else:
         headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
     _print_headers(headers, columns, as_json=as_json)
 
 
 def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
-    found = dataset if wanted is None else dataset.filter(wanted)
+    found = dataset if wanted is None else _matching(dataset, wanted)
     if sort is not None:
         found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
     return found.headers

@@ -8,6 +8,7 @@ from typing import Any
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, format_key
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
+from tupli_mcap.schema.filters import FilterType
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
 
@@ -54,3 +55,17 @@ def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
                     f"no episode has {comparison.key}{meant}; "
                     f"{'.'.join(there)} has {', '.join(written) or 'no keys'}"
                 )
+
+
+def unlike_any(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> str:
+    """What a filter that matches no episode may mean, if it compares a key with a text that no episode has there, and
+    one has a text like it; else nothing."""
+    for comparison in comparisons(wanted):
+        path = path_in(comparison.key or "", EpisodeHeader)
+        known = {found for header in among if isinstance(found := look_up(header, path), str)}
+        texts = {FilterType.EQ: [comparison.value], FilterType.IN: comparison.value}
+        for text in texts.get(comparison.type, ()):
+            hint = did_you_mean(text, sorted(known)) if isinstance(text, str) and text not in known else ""
+            if hint:
+                return f"no {comparison.key} is {text!r}{hint}"
+    return ""
