@@ -376,6 +376,26 @@ class TestRecord:
         result = CliRunner().invoke(app, ["ls"])
         assert (result.exit_code, result.stderr) == (130, "interrupted; nothing was changed\n")
 
+    @pytest.mark.parametrize(
+        ("words", "extras"),
+        [
+            ("record CartPole-v1 -o a.mcap --frames --live rerun", "frames,rerun"),
+            ("record CartPole-v1 -o a.mcap --frames --live foxglove://127.0.0.1:1", "frames,foxglove"),
+            ("view https://example.org/a.mcap", "rerun,remote"),
+            ("plot http://127.0.0.1:1/ a.mcap", "plot,remote"),
+            ("render s3://some/a.mcap -o a.mp4", "video,remote"),
+            ("render s3://some/a.mcap -o a.gif", "frames,remote"),
+        ],
+    )
+    def test_all_missing_extras_are_named_at_once(
+        self, words: str, extras: str, here: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for module in ("PIL", "rerun", "foxglove", "av", "matplotlib", "obstore", "httpx"):
+            monkeypatch.setitem(sys.modules, module, None)
+        told = fails(*words.split())
+        assert f"needs the extras {' and '.join(extras.split(','))}: pip install" in told
+        assert f"[{extras}]" in told and not list(here.iterdir())
+
     def test_ctrl_c_while_the_commands_are_imported(self) -> None:
         program = """if True:
             import sys

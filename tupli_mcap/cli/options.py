@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.errors import NotFoundError, StorageError, missing_extra
 from tupli_mcap.remote import is_server, is_url, shown
 
 if TYPE_CHECKING:
@@ -97,6 +98,16 @@ AnyStorage = Annotated[
     ),
 ]
 _SHORTEST_ID = 4
+
+
+def check_extras(sources: Sequence[str] = (), **needed: str) -> None:
+    """MissingExtraError if more than one extra is missing, of those whose modules are `needed`, and that of URLs; what
+    needs one says so itself."""
+    for source in filter(is_url, sources):
+        needed["remote"] = "httpx" if is_server(source) else "obstore"
+    missing = [extra for extra, module in needed.items() if find_spec(module) is None]
+    if len(missing) > 1:
+        raise missing_extra(f"this command needs the extras {' and '.join(missing)}", ",".join(missing))
 
 
 def dataset_of(sources: Sequence[str]) -> Dataset:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Json, pair_of
+from tupli_mcap.cli.options import Json, check_extras, pair_of
 from tupli_mcap.cli.output import counted, number, print_json
 from tupli_mcap.cli.terminal import say, step_progress
 from tupli_mcap.errors import TupliError, bytes_of
@@ -141,6 +141,11 @@ def record(
         raise typer.BadParameter("--every thins out frames; give --frames too")
     if frames:  # nothing is shown on a screen: pygame must not look for one
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    if frames and live is not None:
+        from tupli_mcap.viewer.live.target import parse_target
+
+        kind = parse_target(live).kind
+        check_extras(frames="PIL", **{kind: kind})
     from tupli_mcap.wrappers.rollout import STEPS, load_policy, record_rollouts
 
     if policy is not None or ":" in env_id:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, check_extras, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, bytes_of
@@ -78,6 +78,7 @@ def render(
     before that step, names the difference, and exits with 1. It also exits with 1 if an
     episode cannot be run again.
     """
+    check_extras([source], **({"video": "av"} if output.suffix.lower() == ".mp4" else {"frames": "PIL"}))
     from tupli_mcap.replay import film, has_pictures, render
 
     # nothing is shown on a screen: pygame must not look for one
@@ -234,6 +235,7 @@ def plot(
     of the output sets its format; an .html needs no network. Nothing in a file is executed.
     Needs the extra `plot` (matplotlib).
     """
+    check_extras(paths, plot="matplotlib")
     from tupli_mcap.plots import check_goal, report
 
     goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")

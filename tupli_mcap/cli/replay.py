@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, check_extras, filter_of
 from tupli_mcap.cli.terminal import flush, say
 from tupli_mcap.errors import bytes_of
 
@@ -71,6 +71,7 @@ def view(
         raise typer.BadParameter("--save, --web and --connect exclude each other; give one of them")
     if force and save is None:
         raise typer.BadParameter("--force goes with --save or --layout, whose file it replaces")
+    check_extras(sources, rerun="rerun")
     from tupli_mcap import viewer
     from tupli_mcap.viewer.sdk import import_quickly
 
