@@ -971,3 +971,31 @@ def test_reprs_are_short(tmp_path: Path) -> None:
     assert repr(Recording(tmp_path / "run.mcap").annotations) == "<1 annotation of 1 episode>"
     TupliDataset.from_files(tmp_path / "run.mcap").save_columns(tmp_path / "columns")
     assert repr(tupli_mcap.dataset.open_columns(tmp_path / "columns").steps) == "<2 steps of 1 episode>"
+
+
+def test_a_recorded_nan_is_not_missing_in_arrow(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    space = gym.spaces.Dict({"x": gym.spaces.Box(-9, 9, (1,)), "depth": gym.spaces.Box(0, 9, (501,))})
+    nan = {"x": np.full(1, np.nan, np.float32), "depth": np.full(501, np.nan, np.float32)}
+    infos = [{"force": np.nan, "list": [np.nan, 1.0]}, {"force": 1.5}, {}]
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
+        for metadata in ({"score": np.nan}, {}):
+            writer.begin(metadata=metadata)
+            for i, info in enumerate(infos):
+                writer.step(nan, 0, np.nan if i else 1.0, info=info)
+            writer.end()
+    dataset = tupli_mcap.open(tmp_path)
+    table = dataset.to_arrow()
+    missing = {name: table[name].null_count for name in table.column_names}
+    assert {name: count for name, count in missing.items() if count} == {
+        "seed": 6, "info.force": 2, "info.list": 4, "metadata.score": 3,
+    }  # fmt: skip
+    for name in ("state.x[0]", "state['depth']"):
+        assert np.isnan(table[name].to_pylist()).all()
+    assert np.isnan(table["reward"].to_pylist()).tolist() == [False, True, True] * 2
+    assert str(table["info.force"].to_pylist()) == "[nan, 1.5, None, nan, 1.5, None]"
+    assert str(table["info.list"][0].as_py()) == "[nan, 1.0]"
+    assert str(dataset.to_arrow("episodes")["metadata.score"].to_pylist()) == "[nan, None]"
+    frame = dataset.to_pandas()
+    assert frame["info.force"].dtype == frame["metadata.score"].dtype == np.float64
+    assert frame["info.force"].isna().sum() == 4

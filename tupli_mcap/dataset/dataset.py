@@ -417,7 +417,8 @@ class Dataset(RandomAccess):
         return tables.dataframe(self, level)
 
     def to_arrow(self, level: Level = "steps") -> pa.Table:
-        """The same as an Arrow table. Where Arrow has no type for all values of a column, they are texts of JSON.
+        """The same as an Arrow table, in which null is what is missing. Where Arrow has no type for all values of a
+        column, they are texts of JSON.
 
         Raises:
             MissingExtraError: pandas or pyarrow is not installed.

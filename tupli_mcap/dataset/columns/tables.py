@@ -26,39 +26,50 @@ if TYPE_CHECKING:
 
 Level: TypeAlias = Literal["steps", "episodes"]
 _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is of no use to anybody
+_REAL = (int, float, np.integer, np.floating)
 
 
 def dataframe(dataset: Dataset, level: Level) -> pd.DataFrame:
     """See `Dataset.to_pandas`."""
+    return import_pandas().DataFrame(_columns(dataset, level))
+
+
+def _columns(dataset: Dataset, level: Level) -> dict[str, Any]:
+    """Columns that pandas takes; lists and masked arrays say what is missing, where a DataFrame has NaN."""
     pandas = import_pandas()
     if level == "episodes":
-        return pandas.DataFrame(_episode_columns(dataset))
+        return _episode_columns(dataset)
     if level != "steps":
         raise DatasetError(f"expected the level 'steps' or 'episodes', found {level!r:.80}")
-    return pandas.DataFrame(_step_columns(dataset, pandas))
+    return _step_columns(dataset, pandas)
 
 
 def arrow(dataset: Dataset, level: Level) -> pa.Table:
     """See `Dataset.to_arrow`."""
-    frame = dataframe(dataset, level)
+    columns = _columns(dataset, level)
+    frame = import_pandas().DataFrame(columns)
     try:
         import pyarrow
     except ImportError as err:
         raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
     typed = {}
-    for name in frame.columns:
+    for name, column in columns.items():
         dtype = frame[name].dtype
         if dtype.kind in "Oc" or dtype.itemsize > 8:  # Arrow has no complex numbers, and no longer floats
-            typed[name] = _arrow_column(list(frame[name]), pyarrow)
+            listed = column if isinstance(column, list) else frame[name]
+            typed[name] = _arrow_column(list(listed), pyarrow, is_pandas=listed is not column)
             frame[name] = None
+        elif dtype.kind == "f":
+            typed[name] = pyarrow.array(column)
     table = pyarrow.Table.from_pandas(frame, preserve_index=False)
     for name, column in typed.items():
         table = table.set_column(table.schema.get_field_index(name), name, column)
     return table
 
 
-def _arrow_column(values: Sequence[Any], pyarrow: Any) -> Any:
-    """Values as Arrow has them: arrays as lists of their dtype, and what has no common type as texts of JSON."""
+def _arrow_column(values: Sequence[Any], pyarrow: Any, *, is_pandas: bool) -> Any:
+    """Values as Arrow has them: arrays as lists of their dtype, and what has no common type as texts of JSON. NaN is
+    what is missing if they are pandas'."""
     kind, arrays = None, [value for value in values if isinstance(value, np.ndarray)]
     kinds = {(value.dtype, value.ndim) for value in arrays}
     if len(arrays) == len(values) and len(kinds) == 1:
@@ -69,7 +80,7 @@ def _arrow_column(values: Sequence[Any], pyarrow: Any) -> Any:
                 kind = pyarrow.list_(kind)
     listed = [value.tolist() if isinstance(value, np.ndarray) else value for value in values]
     try:
-        return pyarrow.array(listed, kind, from_pandas=True)
+        return pyarrow.array(listed, kind, from_pandas=is_pandas)
     except (pyarrow.ArrowException, OverflowError, UnicodeEncodeError):  # numbers beside texts, say
         return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
@@ -123,15 +134,26 @@ def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     for key in keys:
         values = [item.get(key) for item in items]
         given = [value for value in values if value is not None]
-        if len(given) == len(values):
+        numbers = all(isinstance(value, _REAL) and not isinstance(value, bool) for value in given)
+        if numbers and any(isinstance(value, float | np.floating) for value in given):
+            columns[f"{root}.{key}"] = _floats(values)
+        elif len(given) == len(values):
             columns[f"{root}.{key}"] = _texts(values)
-        elif all(isinstance(value, int | np.integer) and not isinstance(value, bool) for value in given):
+        elif numbers:
             columns[f"{root}.{key}"] = _whole_numbers(values)
         elif any(map(np.iscomplexobj, given)):  # pandas would make a number of None
             columns[f"{root}.{key}"] = import_pandas().Series(values, dtype=object)
         else:
             columns[f"{root}.{key}"] = _texts(values)
     return columns
+
+
+def _floats(values: Sequence[Any]) -> Any:
+    """Numbers, some of which may be None: as a masked array, which tells them from NaN, if a float can hold all."""
+    numbers = np.array([np.nan if value is None else value for value in values])
+    if numbers.dtype.kind != "f":  # an integer is too large
+        return values
+    return np.ma.masked_array(numbers, [value is None for value in values])
 
 
 def _texts(values: Sequence[Any]) -> Any:
@@ -165,8 +187,11 @@ def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
     repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:
-            values = pandas.Series(episodes[key])
-            columns[key] = values.iloc[of_episode].reset_index(drop=True)
+            values = episodes[key]
+            if isinstance(values, np.ndarray):
+                columns[key] = values[of_episode]
+            else:
+                columns[key] = pandas.Series(values).iloc[of_episode].reset_index(drop=True)
     return columns
 
 
