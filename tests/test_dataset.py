@@ -359,6 +359,20 @@ def test_filters_are_checked_at_once(cart: tuple[TupliDataset, Taken]) -> None:
         dataset.with_tuple_filter(3)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("key", ["metadata.goood", "run.metadata.goood"])
+def test_metadata_that_no_episode_has_is_an_error(
+    cart: tuple[TupliDataset, Taken], lab: FileStorage, key: str
+) -> None:
+    store(lab, "CartPole-v1", 5)
+    for dataset in (cart[0], TupliDataset(lab)):
+        wrong = dataset.with_episode_filter(F(key) > 0)
+        for read in (wrong.preview, wrong.load, wrong.convert_to_numpy, lambda wrong=wrong: len(wrong)):
+            with pytest.raises(FilterError, match=f"no episode has {key}"):
+                read()
+    with pytest.raises(FilterError, match=r"did you mean 'good'\?"):
+        cart[0].with_episode_filter("metadata.goood > 0").preview()
+
+
 def test_a_tuple_filter_that_does_not_fit_says_so(cart: tuple[TupliDataset, Taken]) -> None:
     dataset, _ = cart
     with pytest.raises(FilterError, match=r"'state\.7' needs a position from 0 to 3"):

@@ -21,7 +21,7 @@ from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, 
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.beside import INFOS, info_columns, info_keys
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.keys import check_metadata, keys_of, values_at
+from tupli_mcap.dataset.keys import check_metadata, keys_of, matching, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
     FilesSource,
@@ -74,9 +74,7 @@ class Dataset(RandomAccess):
     def headers(self) -> Sequence[EpisodeHeader]:
         """The facts about the episodes, in their order, without their steps."""
         if self._listed is None:
-            self._listed = self._source.episodes(self._filter)
-            if not self._listed and self._filter is not None:
-                check_metadata(self._filter, self._source.episodes(None))
+            self._listed = matching(self._filter, self._source.episodes)
         return self._listed
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tupli_mcap.errors import FilterError, did_you_mean
@@ -35,6 +35,16 @@ def _value(header: EpisodeHeader, key: str) -> Any:
         return header.run.get("id") or uuid_of(header)
     value = look_up(header, path_in(key, EpisodeHeader))
     return None if value is MISSING else value
+
+
+def matching(
+    wanted: BaseFilter | None, episodes: Callable[[BaseFilter | None], list[EpisodeHeader]]
+) -> list[EpisodeHeader]:
+    """What `episodes` lists by a filter; FilterError if it names metadata that no episode has."""
+    found = episodes(wanted)
+    if not found and wanted is not None:
+        check_metadata(wanted, episodes(None))
+    return found
 
 
 def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:

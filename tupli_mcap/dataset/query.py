@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -10,6 +11,7 @@ from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
+from tupli_mcap.dataset.keys import matching
 from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, check_keys
@@ -86,8 +88,10 @@ class Query:
         return self._selected
 
     def refresh(self) -> list[EpisodeHeader]:
-        """Lists the episodes again; columns are kept if the episodes are the same."""
-        headers = self.source.episodes(self.episode_filter, self.benchmark_filter)
+        """Lists the episodes again; columns are kept if the episodes are the same. FilterError if no episode has the
+        metadata that the filter names."""
+        episodes = functools.partial(self.source.episodes, benchmark_filter=self.benchmark_filter)
+        headers = matching(self.episode_filter, episodes)
         if self._headers is None or _identity(headers) != _identity(self._headers):
             self._selected, self.layout, self._columns, self._recorded = None, None, {}, None
         self._headers, self._benchmarks = headers, None

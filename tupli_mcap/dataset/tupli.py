@@ -100,7 +100,8 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         `n_tuples`, `end`, …); None removes it.
 
         Raises:
-            FilterError: the filter names an unknown field.
+            FilterError: the filter names an unknown field. Metadata that no episode has are found out, and raise it, as
+                soon as the episodes are listed.
         """
         return self._with(episode_filter=filter)
 
