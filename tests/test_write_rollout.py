@@ -261,6 +261,8 @@ ENDS = np.array([True, True, False, False])
         ((STATES[1:], ACTIONS, REWARDS), r"states: expected arrays that begin with \(4,\) or \(5,\), as rewards"),
         ((STATES, ACTIONS, REWARDS, REWARDS + 2), r"terminals: expected flags of shape \(4,\), .* found float64"),
         ((STATES, ACTIONS, np.zeros((4, 2, 2))), r"rewards: expected an array \[T\] or \[T, N\]"),
+        (({"a": np.zeros((5, 1)), "b": STATES}, ACTIONS, REWARDS), "states: .* of one length, found 5 and 4"),
+        (([{"a": STATES, "b": np.zeros(5)}], [ACTIONS], [REWARDS]), "episode 0: states: .* found 4 and 5"),
         ((STATES, ACTIONS, None), "rewards: expected arrays, or a list of one for each episode, found None"),
         (([STATES], [ACTIONS], [REWARDS, REWARDS]), "states: expected a list of one for each of 2 episodes, found 1"),
         (([STATES], [ACTIONS], [REWARDS[1:]]), r"episode 0: actions: expected arrays that begin with \(3,\)"),

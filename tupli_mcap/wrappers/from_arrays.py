@@ -352,11 +352,16 @@ def _check_infos(infos: Any) -> None:
 
 
 def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> None:
-    for array in _leaves(tree):
+    leaves = _leaves(tree)
+    for array in leaves:
         if array.shape[: len(shape)] not in [(t, *shape[1:]) for t in steps]:
             expected = " or ".join(str((t, *shape[1:])) for t in steps)
             raise StepError(
                 f"{name}: expected arrays that begin with {expected}, as rewards, found {array.shape}"
+            )
+        if len(array) != len(leaves[0]):
+            raise StepError(
+                f"{name}: expected arrays of one length, found {len(leaves[0])} and {len(array)} entries"
             )
 
 
