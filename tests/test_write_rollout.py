@@ -181,6 +181,15 @@ def test_final_states_come_from_where_they_are_known(tmp_path: Path) -> None:
     assert finals() == [6]
 
 
+@pytest.mark.parametrize("listed", [True, False])
+def test_next_states_say_the_final_state(tmp_path: Path, listed: bool) -> None:
+    states = np.arange(4.0)[:, None]  # one more than there are steps
+    given = [states, np.zeros((3, 1)), np.zeros(3), np.array([False, False, True]), states[1:] + 10]
+    *arrays, after = [[array] for array in given] if listed else given
+    write_rollout(tmp_path / "r.mcap", *arrays, next_states=after)
+    assert tupli_mcap.open(tmp_path / "r.mcap")[0].final_state == [13.0]
+
+
 def test_many_episodes_of_which_one_has_a_final_state(tmp_path: Path) -> None:
     states, n = np.arange(3001, dtype=np.float32)[:, None], 3000  # one more than there are steps
     ends = np.arange(n) % 10 == 9

@@ -83,11 +83,12 @@ def write_rollout(
 
     Args:
         states: what the actions were chosen on. If there is one more than there are steps (T + 1), it is the state
-            after the last one; if that step ended an episode and `autoreset` is "same-step" or "disabled", it is the
-            first one of the next episode, and no final state.
+            after the last one, unless `next_states` or `final_states` say it; if that step ended an episode and
+            `autoreset` is "same-step" or "disabled", it is the first one of the next episode, and no final state.
         terminals, timeouts: whether a step ended its episode; in lists, one flag for each episode will do. By default
             false. Steps after the last end are an interrupted episode.
-        next_states: the state after each step, in arrays as long as the actions; only final states are taken from it.
+        next_states: the state after each step, in arrays as long as the actions; final states are taken from it,
+            also that of the last step, and nothing else.
         final_states: instead of that, one for each episode that a flag ends, in the order of
             `numpy.argwhere(terminals | timeouts)`; in lists, one for each episode, None if it is not known.
         infos: name -> array, along the same axes as the rewards; in lists, one such dict for each episode.
@@ -194,7 +195,8 @@ def _episodes(given: _Given) -> Iterator[_Part]:
         _check_shape(f"episode {i}: states", states, (n,), n, n + 1)
         final = one.final_states
         if final is None:
-            final = arrays_at(one.next_states, n - 1) if _length(states) == n else arrays_at(states, n)
+            told = one.next_states is not None or _length(states) == n
+            final = arrays_at(one.next_states, n - 1) if told else arrays_at(states, n)
         flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
         metadata, infos = one.metadata or {}, one.infos or {}
         yield _Part(
