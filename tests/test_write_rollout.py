@@ -275,7 +275,7 @@ ENDS = np.array([True, True, False, False])
         ((STATES, ACTIONS, None), "rewards: expected arrays, or a list of one for each episode, found None"),
         (([STATES], [ACTIONS], [REWARDS, REWARDS]), "states: expected a list of one for each of 2 episodes, found 1"),
         (([STATES], [ACTIONS], [REWARDS[1:]]), r"episode 0: actions: expected arrays that begin with \(3,\)"),
-        (([STATES], [ACTIONS], [REWARDS], [ENDS]), "expected no flag before the last step, 3, found one at step 0"),
+        (([STATES], [ACTIONS], [REWARDS], [ENDS]), "^episode 0: expected no flag before the last step, 3, found one"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(tmp_path: Path, given: tuple[Any, ...], message: str) -> None:

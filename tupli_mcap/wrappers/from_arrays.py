@@ -42,6 +42,7 @@ class _Part(NamedTuple):
     infos: Mapping[str, Any]
     metadata: Mapping[str, Any]
     whole: bool = False
+    name: str = ""  # for messages
 
 
 def write_rollout(
@@ -125,7 +126,10 @@ def write_rollout(
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **_checked_run(run or {}),
     ) as writer:  # fmt: skip
         for part in parts:
-            _write(writer, part)
+            try:
+                _write(writer, part)
+            except StepError as err:
+                raise StepError(f"{part.name}{err}") from err
 
 
 def _checked_run(run: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -200,8 +204,9 @@ def _episodes(given: _Given) -> Iterator[_Part]:
         flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
         metadata, infos = one.metadata or {}, one.infos or {}
         yield _Part(
-            0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, infos, metadata
-        )
+            0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, infos, metadata,
+            name=f"episode {i}: ",
+        )  # fmt: skip
 
 
 def _episode(given: _Given, i: int) -> _Given:
