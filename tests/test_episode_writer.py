@@ -572,3 +572,24 @@ def test_what_was_discarded_goes_where_the_recording_is(
     monkeypatch.chdir(tmp_path / "elsewhere")
     writer.close()
     assert [episode.seed for episode in Recording(tmp_path / "r.mcap").episodes] == [1]
+
+
+def test_the_info_of_the_last_step_says_whether_it_succeeded(tmp_path: Path) -> None:
+    space = spaces.Discrete(2)
+    said: dict[str, Any] = {"is_success": True}
+    with EpisodeWriter(tmp_path / "r.mcap", space, space) as writer:
+        for infos, metadata, ended in (
+            ([{}, said], {"k": 1}, True),
+            ([said, {}], {}, True),  # not of the last step
+            ([{}, said], {"success": False}, True),
+            ([{}, said], {}, False),  # interrupted
+        ):
+            writer.begin(metadata=metadata)
+            for i, info in enumerate(infos):
+                writer.step(0, 0, 0.0, terminal=ended and i == 1, info=info)
+            writer.end()
+    found = [episode.metadata for episode in tupli_mcap.open(tmp_path / "r.mcap")]
+    assert found == [{"k": 1, "success": True}, {}, {"success": False}, {}]
+    arrays = [np.zeros((2, 1))], [np.zeros((2, 1))], [np.zeros(2)], [True]
+    tupli_mcap.write_rollout(tmp_path / "w.mcap", *arrays, infos=[{"is_success": np.array([False, True])}])
+    assert tupli_mcap.open(tmp_path / "w.mcap")[0].metadata == {"success": True}

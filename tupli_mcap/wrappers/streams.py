@@ -16,6 +16,7 @@ from tupli_mcap.journal.derive import ENDS, STARTS, EpisodeBatch, StartedEpisode
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import with_success
 from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, ResetFacts
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import decide_layout
@@ -72,6 +73,7 @@ class Stream:
         self._metadata: dict[str, Any] = {}
         self._episode: StartedEpisode | None = None
         self._store: StepStore | None = None
+        self._last_info: tuple[int, Mapping[str, Any]] = (0, {})  # and the number of rows up to its step
 
     def begin(self, facts: ResetFacts, metadata: dict[str, Any]) -> None:
         """Begins an episode, which is written with its first step."""
@@ -194,6 +196,8 @@ class Stream:
             first = self._store.count - self._episode.first_row - len(infos)
             for step, info in enumerate(infos, first):
                 self._streams.infos.put(self._writer, self._episode.number, step, info)
+            if infos:
+                self._last_info = self._store.count, infos[-1]
 
     def end(self, final_state: Any = None, metadata: Mapping[str, Any] | None = None) -> None:
         """Ends the running episode, if there is one with a step."""
@@ -202,6 +206,9 @@ class Stream:
             text = jsonvalue.dumps_plain({**self._metadata, **(metadata or {})})
             length = store.count - episode.first_row
             how = INTERRUPTED if self.over is None else self.over
+            rows, info = self._last_info
+            if how != INTERRUPTED and rows == store.count:
+                text = with_success(text, info)
             writer.end_episode(episode, how, length, store.total, self._encoded(final_state), text)
         self._episode = None
         self.is_running, self.over = False, None
