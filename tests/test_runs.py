@@ -67,6 +67,11 @@ def check_schema(path: Path, name: str) -> Any:
     return document
 
 
+def git(folder: Path, *words: str) -> str:
+    command = ["git", "-c", "user.name=a", "-c", "user.email=a@b", *words]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+
+
 def command(*words: str) -> str:
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 0, result.output
@@ -108,25 +113,35 @@ class TestRun:
             "print(tupli_mcap.Recording('r.mcap').run.git)\n"
         )
 
-        def git(*words: str) -> str:
-            who = ["-c", "user.name=a", "-c", "user.email=a@b"]
-            done = subprocess.run(
-                ["git", *who, *words], cwd=tmp_path, check=True, capture_output=True, text=True
-            )
-            return done.stdout.strip()
-
         def program() -> str:
             words = [sys.executable, "program.py"]
             return subprocess.run(words, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
 
-        git("init", "-q")
-        git("add", "program.py")
-        git("commit", "-qm", "one")
-        commit = git("rev-parse", "HEAD")
+        git(tmp_path, "init", "-q")
+        git(tmp_path, "add", "program.py")
+        git(tmp_path, "commit", "-qm", "one")
+        commit = git(tmp_path, "rev-parse", "HEAD")
         assert program() == str({"commit": commit, "dirty": False}) + "\n"
         with (tmp_path / "program.py").open("a") as file:
             file.write("# changed\n")
         assert "'dirty': True" in program()
+
+    def test_names_the_commit_of_the_working_directory_for_an_installed_program(self, tmp_path: Path) -> None:
+        words = [
+            str(Path(sys.executable).parent / "tupli-mcap"),
+            "record",
+            "CartPole-v1",
+            "--steps",
+            "1",
+            "-o",
+        ]
+
+        subprocess.run([*words, "a.mcap"], cwd=tmp_path, check=True)
+        assert Recording(tmp_path / "a.mcap").run.git == {}, "the environment may be in a repository"
+        git(tmp_path, "init", "-q")
+        git(tmp_path, "commit", "-q", "--allow-empty", "-m", "one")
+        subprocess.run([*words, "b.mcap"], cwd=tmp_path, check=True)
+        assert Recording(tmp_path / "b.mcap").run.git["commit"] == git(tmp_path, "rev-parse", "HEAD")
 
     def test_without_a_name_has_that_of_the_file(self, tmp_path: Path) -> None:
         assert Recording(record(tmp_path / "walk.mcap")).run.name == "walk"

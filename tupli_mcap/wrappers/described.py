@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
+import site
 import subprocess
 import sys
+import sysconfig
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -172,9 +174,13 @@ def _versions(modules: tuple[str, ...]) -> dict[str, str]:
 
 
 def _program_folder() -> str:
-    """The directory of the program's file; without a file, as in a notebook, the working directory."""
+    """The directory of the program's file; the working directory if there is no file, as in a notebook, or if it is
+    installed, as `tupli-mcap` and `pytest` are: an environment may lie in a repository that is not the user's."""
     file = getattr(sys.modules.get("__main__"), "__file__", None)
-    return str(Path(file).absolute().parent) if file else os.getcwd()  # noqa: PTH109 - gone, perhaps
+    installed = (sys.prefix, sys.base_prefix, site.getuserbase(), sysconfig.get_path("scripts"))
+    if not file or any(Path(file).resolve().is_relative_to(Path(folder).resolve()) for folder in installed):
+        return os.getcwd()  # noqa: PTH109 - gone, perhaps
+    return str(Path(file).absolute().parent)
 
 
 @lru_cache(maxsize=8)

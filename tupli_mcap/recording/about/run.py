@@ -36,7 +36,7 @@ class Run(SaysWhatIsMeant):
         environment: the Gymnasium id, else the class.
         started, ended: ISO 8601 in UTC.
         command: the arguments of the process.
-        git: `commit` and `dirty` of the program's directory.
+        git: `commit` and `dirty` of the program's directory, or of the working directory if the program is installed.
         versions: of Python and of packages.
         host: the machine's name.
     """
