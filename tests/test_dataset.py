@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import sys
 import threading
 import tracemalloc
@@ -181,7 +182,9 @@ def test_cuts_by_a_tuple_filter_are_marked(tmp_path: Path) -> None:
     assert len(terminals) == 12
     assert not terminals.any()
     assert timeouts.tolist() == [False, True] * 6
-    *_, terminals, timeouts = dataset.with_tuple_filter(F("step") > 3).convert_to_numpy()
+    *_, terminals, timeouts = (
+        dataset.with_tuple_filter(None).with_tuple_filter(F("step") > 3).convert_to_numpy()
+    )
     assert terminals.tolist() == [False, True, False, True, False, False]
     assert timeouts.tolist() == [False, False, False, False, False, True]
 
@@ -306,6 +309,21 @@ def test_expressions_and_functions_choose_the_same_steps(
     assert len(dataset) == 700
 
 
+def test_tuple_filters_narrow(cart: tuple[TupliDataset, Taken], blocks: int) -> None:
+    dataset, taken = cart
+    asked: list[RLTuple] = []
+    right = dataset.with_tuple_filter(F("action") == 1)
+    both = right.with_tuple_filter(lambda t: asked.append(t) or t.state[0] > 0).with_tuple_filter(
+        "state.2 < 0"
+    )  # type: ignore[func-returns-value]
+    wanted = [step for step in taken if step[1] == 1 and step[0][0] > 0 and step[0][2] < 0]
+    assert 0 < len(wanted) < 700
+    np.testing.assert_array_equal(both.convert_to_numpy()[0], column(wanted, 0))
+    assert len(asked) == len(right), "a function is asked about steps that earlier filters chose"
+    assert re.search(r'tuples where F\("action"\) == 1 and .*<lambda> and F\("state.2"\) < 0', repr(both))
+    assert len(both.with_tuple_filter(None)) == 700
+
+
 def test_steps_count_within_their_episode(cart: tuple[TupliDataset, Taken], blocks: int) -> None:
     dataset, _ = cart
     starts = dataset.with_tuple_filter(F("step") == 0)
@@ -333,14 +351,19 @@ def test_a_pickled_dataset_reads_the_same(cart: tuple[TupliDataset, Taken]) -> N
     assert np.array_equal(copy.observations, left.observations)
 
 
-def test_episode_filters_and_their_replacement(cart: tuple[TupliDataset, Taken]) -> None:
+def test_episode_filters_narrow(cart: tuple[TupliDataset, Taken]) -> None:
     dataset, _ = cart
     good = dataset.with_episode_filter(F("metadata.good") == True)  # noqa: E712
     assert {header.metadata["good"] for header in good.preview()} == {True}
-    bad = good.with_episode_filter(F("metadata.good") == False)  # noqa: E712
+    bad = dataset.with_episode_filter(F("metadata.good") == False)  # noqa: E712
     assert len(bad.preview()) + len(good.preview()) == len(dataset.preview())
     assert len(good) + len(bad) == 700
+    first = good.with_episode_filter("episode < 10").with_episode_filter("env == 0")
+    assert first.preview() == [header for header in good.preview() if header.episode < 10]
+    assert good.with_episode_filter(F("metadata.good") == False).preview() == []  # noqa: E712
     assert len(good.with_episode_filter(None)) == 700
+    with pytest.raises(FilterError, match="expected a filter, such as"):
+        good.with_episode_filter(True)  # type: ignore[arg-type]
     cut = dataset.with_episode_filter(F("end") == "interrupted")
     assert [header.recording[-6:] for header in cut.preview()] == ["a.mcap", "b.mcap"]
 
@@ -416,7 +439,7 @@ def test_nothing_is_read_before_it_is_needed(
     assert asked == [("rewards",)] * 2, "one field of each recording, once"
     asked.clear()
     assert len(good.with_tuple_filter(F("action") == 1).rewards) > 0
-    assert asked == [("rewards", "terminals", "actions")] * 2
+    assert asked == [("rewards", "actions", "terminals")] * 2
     asked.clear()
     good.load()
     good.convert_to_numpy()
@@ -474,7 +497,7 @@ def test_a_derived_dataset_is_another_one(cart: tuple[TupliDataset, Taken]) -> N
     dataset, _ = cart
     dataset.load()
     left = dataset.with_tuple_filter(F("action") == 0)
-    right = left.with_tuple_filter(F("action") == 1)
+    right = dataset.with_tuple_filter(F("action") == 1)
     assert len(left) + len(right) == len(dataset) == 700
     assert not left.actions.any()
     assert right.actions.all()
@@ -796,6 +819,7 @@ def test_a_storage_by_benchmark(lab: FileStorage) -> None:
     assert {header.benchmark_id for header in good.preview()} == {cart}
     assert all(item.metadata["score"] > 20 for item in good.episodes)
     named = dataset.with_benchmark_filter(F("metadata.name") == "MountainCar-v0")
+    assert carts.with_benchmark_filter(F("metadata.name") == "MountainCar-v0").preview() == []
     assert named.observations.shape == (250, 2)
     assert dataset.with_benchmark_filter(F("metadata.name") == "nobody").preview() == []
     with pytest.raises(SpaceError, match="with_benchmark_filter"):

@@ -56,6 +56,8 @@ def _filters(facts: Facts) -> list[str]:
 
 
 def _filter(filter: Any) -> str:
+    if isinstance(filter, tuple):
+        return " and ".join(map(_filter, filter))
     if isinstance(filter, BaseFilter):
         return str(filter)
     return str(getattr(filter, "__qualname__", None) or repr(filter))

@@ -37,9 +37,8 @@ class Query:
         self.source = source
         self.benchmark_filter = benchmark_filter
         self.episode_filter = episode_filter
-        self.tuple_filter = tuple_filter
+        self.tuple_filter = None if tuple_filter is None else TupleSelector(tuple_filter)
         self.layout: StepLayout | None = None
-        self._selector = None if tuple_filter is None else TupleSelector(tuple_filter)
         self._benchmarks: list[BenchmarkHeader] | None = None
         self._headers: list[EpisodeHeader] | None = None
         self._selected: Selected | None = None
@@ -51,14 +50,14 @@ class Query:
         # A copy reads the same episodes itself; a layout cannot be pickled.
         return {**self.__dict__, "layout": None, "_columns": {}, "_recorded": None}
 
-    def with_filters(self, **filters: Any) -> Self:
-        """A new query with some filters replaced; names are those of the constructor's arguments."""
-        mine = {
-            "benchmark_filter": self.benchmark_filter,
-            "episode_filter": self.episode_filter,
-            "tuple_filter": self.tuple_filter,
-        }
-        made = type(self)(self.source, **{**mine, **filters})
+    def narrowed(self, **filters: Any) -> Self:
+        """A new query whose filters must hold beside those of this one; None removes one. Names are those of the
+        constructor's arguments."""
+        made = type(self)(self.source, **filters)
+        for name in ("benchmark_filter", "episode_filter", "tuple_filter"):
+            own, new = getattr(self, name), getattr(made, name)
+            if own is not None and (new is not None or name not in filters):
+                setattr(made, name, own if new is None else own & new)
         made.cache_bytes, made.threads = self.cache_bytes, self.threads
         return made
 
@@ -101,7 +100,7 @@ class Query:
         """The wanted steps by number: from columns in memory, else from the recordings, on access."""
         if self._recorded is None:
             headers = self.headers
-            mask = None if self._selector is None else self.selected.mask
+            mask = None if self.tuple_filter is None else self.selected.mask
             chosen = numbers_by_recording(headers)
             self._recorded = RecordedSteps(
                 ListedEpisodes.each(headers),
@@ -132,7 +131,7 @@ class Query:
         if _identity(headers) == _identity(self.headers):
             columns = self.read(fields)
             return columns, self.selected.lengths, self.layout
-        columns, selected, layout = read_columns(self.source, headers, fields, self._selector)
+        columns, selected, layout = read_columns(self.source, headers, fields, self.tuple_filter)
         return columns, selected.lengths, layout
 
     def _missing(self, fields: Sequence[str]) -> dict[str, Any]:
@@ -140,7 +139,7 @@ class Query:
         if not missing:
             return {}
         found, self._selected, layout = read_columns(
-            self.source, self.headers, missing, self._selector, self._selected
+            self.source, self.headers, missing, self.tuple_filter, self._selected
         )
         self.layout = layout or self.layout
         return found

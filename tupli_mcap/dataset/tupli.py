@@ -34,8 +34,8 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     """Episodes of a storage (or of files, see `from_files`), and the steps in them, as filters choose them.
 
     A dataset reads on access, and only what is requested. Its filters never change: `with_benchmark_filter`,
-    `with_episode_filter` and `with_tuple_filter` return another dataset with that one filter replaced (None
-    removes it; combine conditions with `&` and `|`), which lists its own episodes.
+    `with_episode_filter` and `with_tuple_filter` return another dataset, which lists its own episodes and where the
+    new filter holds beside the earlier ones (None removes those of its kind).
 
     The episodes are listed once, and all results agree with that list until `preview()` or `load()` list them
     anew. Properties keep the columns they have read, as read-only arrays; the `convert_to_…` methods return
@@ -88,7 +88,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     # --- filters ---
 
     def with_benchmark_filter(self, filter: BaseFilter | str | None) -> Self:
-        """The dataset with a new benchmark filter, over the fields of `BenchmarkHeader`; None removes it.
+        """The dataset with a further benchmark filter, over the fields of `BenchmarkHeader`; None removes all.
 
         Raises:
             FilterError: the filter names an unknown field.
@@ -96,8 +96,8 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         return self._with(benchmark_filter=filter)
 
     def with_episode_filter(self, filter: BaseFilter | str | None) -> Self:
-        """The dataset with a new episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
-        `n_tuples`, `end`, …); None removes it.
+        """The dataset with a further episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
+        `n_tuples`, `end`, …); None removes all.
 
         Raises:
             FilterError: the filter names an unknown field. Metadata that no episode has are found out, and raise it, as
@@ -106,13 +106,14 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         return self._with(episode_filter=filter)
 
     def with_tuple_filter(self, filter_fcn: TupleFilter | str | None) -> Self:
-        """The dataset with a new tuple filter, which chooses steps; None removes it.
+        """The dataset with a further tuple filter, which chooses steps; None removes all.
 
         Args:
             filter_fcn: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time
                 (ns) and step (counted from 0 in each episode), or Gymnasium's names of these (observation, terminated,
                 truncated), such as `F("state.0") > 1` or "info.force > 2", which is evaluated on whole columns; or a
-                function of one `RLTuple` that returns True or False, called for every step.
+                function of one `RLTuple` that returns True or False, called for every step that
+                earlier filters chose.
 
         Raises:
             FilterError: it is neither, or names an unknown field.
@@ -125,7 +126,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         parsed = {
             name: parse_filter(given) if isinstance(given, str) else given for name, given in filters.items()
         }
-        made._query = self._query.with_filters(**parsed)
+        made._query = self._query.narrowed(**parsed)
         made.set_seed(self._seed)
         return made
 
@@ -189,9 +190,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes, listed again, that also match the filter."""
-        own = self._query.episode_filter
-        narrowed = filter if own is None or filter is None else own & filter
-        dataset = self if filter is None else self.with_episode_filter(narrowed)
+        dataset = self if filter is None else self.with_episode_filter(filter)
         return dataset._query.source, dataset.preview()
 
     def _step_seconds(self) -> float | None:
@@ -381,10 +380,11 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     def _facts(self) -> display.Facts:
         headers, selected = self._query.known
+        tuples = self._query.tuple_filter
         filters = {
             "benchmarks": self._query.benchmark_filter,
             "episodes": self._query.episode_filter,
-            "tuples": self._query.tuple_filter,
+            "tuples": None if tuples is None else tuples.filters,
         }
         return display.Facts(
             repr(self._query.source), headers, None if selected is None else selected.steps, filters

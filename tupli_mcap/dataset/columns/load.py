@@ -149,7 +149,7 @@ class _Reader:
                 lengths = np.diff(wanted[ends])
             selected = Selected(lengths, self._mask)
             if self._selector is not None and self._done and not selected.steps:
-                _warn_of_unseen(self._selector.filter, self._info_keys)
+                _warn_of_unseen(self._selector.filters, self._info_keys)
         columns = {field: builder.finish() for field, builder in self._builders.items()}
         if self._layout is None:
             columns = {field: _empty_column(field) for field in self._fields}
@@ -306,38 +306,46 @@ Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 class TupleSelector:
-    """A tuple filter, and the `fields` of the columns that it needs.
-    FilterError if it is neither an expression nor a function, or if it names an unknown field of a step."""
+    """Tuple filters that must all hold, and the `fields` of the columns that they need.
+    FilterError if one is neither an expression nor a function, or if it names an unknown field of a step."""
 
-    fields: tuple[str, ...]
+    def __init__(self, *filters: TupleFilter) -> None:
+        needed = {"terminals"}
+        for one in filters:
+            if isinstance(one, BaseFilter):
+                check_keys(one, STEP_KEYS)
+                needed |= {field for key, field in STEP_KEYS.items() if _names(one, key)}
+            elif callable(one):
+                needed |= {*FIVE, "infos"}
+            else:
+                raise FilterError(
+                    f"expected a function of one tuple or an expression like F('reward') > 0, found {one!r:.80}"
+                )
+        self.filters = filters
+        self.fields = tuple(sorted(needed))
+        self._tests = [with_times(one, "time") if isinstance(one, BaseFilter) else one for one in filters]
 
-    def __init__(self, filter: TupleFilter) -> None:
-        self.filter = filter
-        if isinstance(filter, BaseFilter):
-            check_keys(filter, STEP_KEYS)
-            needed = {field for key, field in STEP_KEYS.items() if _names(filter, key)}
-            self.fields = ("terminals", *sorted(needed - {"terminals"}))
-            self.filter = with_times(filter, "time")
-        elif callable(filter):
-            self.fields = (*FIVE, "infos")
-        else:
-            raise FilterError(
-                f"expected a function of one tuple or an expression like F('reward') > 0, found {filter!r:.80}"
-            )
+    def __and__(self, other: TupleSelector) -> TupleSelector:
+        return TupleSelector(*self.filters, *other.filters)
 
     def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
         """A mask of the wanted steps of `columns` (by field, at least `self.fields`).
-        FilterError if the expression does not fit the columns, or the function returned no flag."""
-        if isinstance(self.filter, BaseFilter):
-            steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
-            return evaluate_columns(self.filter, steps)
-        tuples = Tuples(columns, layout)
-        return np.fromiter((_flag(self.filter(item)) for item in tuples), np.bool_, len(tuples))
+        FilterError if an expression does not fit the columns, or a function returned no flag."""
+        mask = np.ones(len(columns["terminals"]), np.bool_)
+        for test in self._tests:
+            if isinstance(test, BaseFilter):
+                steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
+                mask &= evaluate_columns(test, steps)
+            else:
+                tuples, rows = Tuples(columns, layout), np.flatnonzero(mask)
+                mask[rows] = [_flag(test(tuples[row])) for row in rows.tolist()]
+        return mask
 
 
-def _warn_of_unseen(filter: TupleFilter, keys: Collection[str]) -> None:
+def _warn_of_unseen(filters: Sequence[TupleFilter], keys: Collection[str]) -> None:
     """Warns of infos that an expression names and that no step has; `keys` are those that steps have."""
-    for comparison in comparisons(filter) if isinstance(filter, BaseFilter) else ():
+    expressions = (one for one in filters if isinstance(one, BaseFilter))
+    for comparison in itertools.chain.from_iterable(map(comparisons, expressions)):
         name, *inside = path_of(comparison)
         if name == "info" and inside and inside[0] not in keys:
             known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
