@@ -760,6 +760,21 @@ def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
             ["Cart-v1__ppo"],
         ),
         ({"name": "ppo-seed1"}, {"name": "ppo-seed2", "split": "eval"}, ["ppo-seed1", "ppo-seed2"]),
+        (
+            {"name": "ppo-seed1", "metadata": {"lr": 0.1, "env": {"seed": 1}, "eval_seeds": [1, 2]}},
+            {"name": "ppo-seed2", "metadata": {"env": {"seed": 2}, "eval_seeds": [3], "lr": 0.1}},
+            ["ppo"],
+        ),
+        (
+            {"name": "ppo-seed1", "metadata": {"env": {"wind": 0}}},
+            {"name": "ppo-seed2", "metadata": {"env": {"wind": 3}}},
+            ["ppo-seed1", "ppo-seed2"],
+        ),
+        (
+            {"name": "ppo", "metadata": {"env_seed": 1}},
+            {"name": "ppo", "metadata": {"env_seed": 2}},
+            ["ppo"],
+        ),
         ({"name": "ppo"}, {"name": "ppo"}, ["a", "b"]),
         ({}, {}, ["a", "b"]),
     ],
@@ -778,8 +793,13 @@ def test_groups_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
             scored(tmp_path / split / f"{split}{seed}.mcap", [2, 3], name=f"ppo-seed{seed}", split=split)
         for folder in ("x", "y"):
             scored(tmp_path / folder / f"sac-seed{seed}.mcap", [2, 3])
+        for lr in (0.1, 0.001):
+            metadata = {"lr": lr, "gamma": 0.9, "seed": seed}
+            scored(tmp_path / f"td3-{lr}-{seed}.mcap", [2, 3], name="td3", metadata=metadata)
     names = [group.name for group in report(tmp_path).groups]
-    assert names == ["ppo (eval)", "ppo (train)", "sac (x)", "sac (y)"]
+    assert sorted(names) == [
+        "ppo (eval)", "ppo (train)", "sac (x)", "sac (y)", "td3 (lr=0.001)", "td3 (lr=0.1)",
+    ]  # fmt: skip
 
 
 def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:

@@ -230,7 +230,7 @@ def plot(
 
     It shows returns, lengths, success, numbers in infos and metadata, states, actions,
     rewards, and one episode step by step. Several recordings are compared. Runs whose names
-    or settings differ only by their seeds are drawn as one: a thin line for each, and their
+    and settings differ only by their seeds are drawn as one: a thin line for each, and their
     mean with its 95% interval (percentile bootstrap) as far as all of them go. The extension
     of the output sets its format; an .html needs no network. Nothing in a file is executed.
     Needs the extra `plot` (matplotlib).

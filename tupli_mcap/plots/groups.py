@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -17,6 +17,7 @@ X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
 _LONGEST = 200  # characters of a run's name that are looked at
 _SEED = re.compile(r"[-_. ]*seed[-_=. ]*\d+", re.IGNORECASE)
+_SEED_KEY = re.compile(r"(.*[_.])?seeds?", re.IGNORECASE | re.DOTALL)
 _STARTED = re.compile(r"[-_. ]+\d{10}$")  # the time (s) at the end of CleanRL's names
 
 
@@ -83,8 +84,8 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
     """Groups in the order of their first recordings.
 
     Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
-    settings, and the same environment and split. A run that names no seed is a group by itself, with all its files; so
-    is a recording that was made of others.
+    settings, the same other settings, and the same environment and split. A run that names no seed is a group by
+    itself, with all its files; so is a recording that was made of others.
     """
     found: dict[Any, dict[Any, list[Measured]]] = {}
     uuids = set()
@@ -106,24 +107,38 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 
 
 def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
-    """The name of a group, with the parts of its key that differ from other groups of the same name."""
-    differing = [parts for parts in zip(key, *keys, strict=False) if len(set(parts)) > 1]
-    told = ", ".join(Path(str(own)).name for own, *_ in differing if own)
-    return f"{name} ({told})" if told else name
+    """The name of a group, with the parts of its key, and the settings, that differ from other groups of that name."""
+    differing = [
+        parts for parts in zip(*(one[:4] for one in (key, *keys)), strict=False) if len(set(parts)) > 1
+    ]
+    told = [Path(str(own)).name for own, *_ in differing if own]
+    settings = [one[4] for one in (key, *keys) if len(one) > 4]
+    told += sorted(key[4] - frozenset.intersection(*settings)) if len(key) > 4 else []
+    return f"{name} ({', '.join(told)})" if told else name
 
 
-def _seedless(one: Measured) -> tuple[str, ...] | None:
+def _seedless(one: Measured) -> tuple[Any, ...] | None:
     """The key that runs of a group share: the name without the seed (with the directory, if the run is named after its
-    file), the environment and the split. None if the run names no seed."""
+    file), the environment, the split, and the settings that are no seeds. None if the run names no seed."""
+    told = dict(_settings(one.run.metadata))
+    settings = frozenset(f"{key}={value}" for key, value in told.items() if not _SEED_KEY.fullmatch(key))
     seed, path, given = one.run.metadata.get("seed"), Path(one.facts.name), one.run.name[:_LONGEST]
     name = _SEED.sub("", given)
-    if name == given and seed is None:
+    if name == given and len(settings) == len(told):
         return None
     if name == given and isinstance(seed, int):
         name = re.sub(rf"[-_. ]+s?{seed}(?!\d)", "", _STARTED.sub("", name), count=1)
     own = one.run.name != path.stem
     folder = "" if own else _SEED.sub("", str(path.parent))
-    return folder, name.strip("-_. "), one.run.environment, one.run.split
+    return folder, name.strip("-_. "), one.run.environment, one.run.split, settings
+
+
+def _settings(metadata: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in metadata.items():
+        if isinstance(value, dict):
+            yield from _settings(value, f"{within}{key}.")
+        else:
+            yield f"{within}{key}", value
 
 
 def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:

@@ -43,7 +43,8 @@ def report(
     The numbers are returns, lengths, success, and some of infos (their means) and of metadata.
     Runs that differ only by their seeds are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
     the runs, see `plots.statistics.mean_interval`), up to the end of the shortest. Two runs differ only by their seeds
-    if their names are equal without `seed3`, or without the `seed` of their settings.
+    if their names are equal without `seed3`, or without the `seed` of their settings, and all settings (`metadata`)
+    are equal but those named seed, seeds or something_seed.
 
     At most 128 MiB of steps and 20,000 infos of a recording are read. Of a longer one, randomly chosen episodes are
     read, and the report says so. Nothing in a file is executed.
