@@ -47,6 +47,7 @@ from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean
 from tupli_mcap.recording import edit_run
 from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.recording.describe.series import sketch
+from tupli_mcap.schema.times import local_text
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
 UNIT = spaces.Box(-1, 1, (3,), np.float32)
@@ -506,6 +507,8 @@ def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     assert dict(made.facts)["seeds"] == f"3 from 7 to {max(drawn, 2**100):.4g}"
     assert f", seed {drawn:.4g}" in "".join(texts(made))
     assert dict(alone.facts)["seeds"] == str(drawn)
+    start = min(alone.measured[0].rows["start_time"].tolist())
+    assert dict(alone.facts)["recorded"].startswith(f"{local_text(start)}, "), "as in tables"
     assert dict(others.facts)["seeds"] == "7"
     assert dict(seedless.facts)["seeds"] == "none known"
 

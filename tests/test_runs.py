@@ -43,6 +43,7 @@ from tupli_mcap.recording import (
     verify_recording,
 )
 from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.schema.times import local_text, time_ns
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
@@ -829,6 +830,10 @@ class TestCommands:
         assert [line.split() for line in lines[1:]] == [
             [str(i), str(steps), "0.001"] for i, steps in enumerate(lengths)
         ]
+        times = "ended,run.started,run.ended"
+        shown = command("episodes", str(path), "--columns", times).splitlines()[-1]
+        (*_, told) = json.loads(command("episodes", str(path), "--columns", times, "--json"))["result"]
+        assert shown.split("  ") == [local_text(time_ns(told[key]) or 0) for key in times.split(",")]
         for wrong, message in (("metadata.none", "no episode has metadata.none"), ("retrun", "'return'")):
             result = CliRunner().invoke(app, ["episodes", str(path), "--columns", wrong])
             assert result.exit_code and message in f"{result.output}{result.exception}"

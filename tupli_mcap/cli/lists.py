@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
     from tupli_mcap.storage.listing import ListedRecording
+
+
+_TIMES: Final = (("created_at",), ("run", "started"), ("run", "ended"))  # paths in an `EpisodeHeader`
 
 
 class _Listed(NamedTuple):
@@ -355,6 +358,13 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     if as_json:
         print_json([dict(zip(keys, row, strict=True)) for row in rows])
         return
+    rows = [
+        [
+            when(value) if path in _TIMES and isinstance(value, str) else value
+            for path, value in zip(paths, row, strict=True)
+        ]
+        for row in rows
+    ]
     numeric = [any(isinstance(value, int | float) for value in column) for column in zip(*rows, strict=True)]
     aligned = zip(keys, numeric or [False] * len(keys), strict=True)
     print_table(

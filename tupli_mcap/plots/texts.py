@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from html import escape
 from typing import Any
 
@@ -19,6 +18,7 @@ from tupli_mcap.plots.groups import Group
 from tupli_mcap.plots.measure import SUCCESS, Measured
 from tupli_mcap.plots.style import Cell, Page, cut
 from tupli_mcap.recording.describe.description import RecordingDescription, nan_text, spread_of
+from tupli_mcap.schema.times import local_text
 
 _MOST_SEEDS, _LONGEST_SEEDS = 6, 56  # that are listed; characters
 _MOST_LISTED = 12  # recordings
@@ -137,11 +137,11 @@ def _seeds_text(seeds: Sequence[int]) -> str:
 
 
 def _times_text(one: Measured) -> str:
-    """When it was recorded, in UTC: a report says the same wherever it is made; and how long that took."""
+    """When it was recorded, and how long that took."""
     start = int(one.rows["start_time"].min()) if len(one.rows) else one.facts.created_ns
     if start <= 0:
         return "at an unknown time"
-    text = datetime.fromtimestamp(start // 10**9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = local_text(start)
     if not len(one.rows):
         return text
     seconds = (int(one.rows["end_time"].max()) - start) / 1e9
