@@ -197,6 +197,23 @@ def test_artifacts_are_deduplicated(storage: FileStorage) -> None:
     assert len(storage.list_artifacts()) == 1
 
 
+def test_a_function_makes_metadata_of_own_tuples(storage: FileStorage) -> None:
+    class Mine(RLTuple):
+        pass
+
+    env = TupliEnvWrapper(
+        gym.make("CartPole-v1"),
+        storage,
+        metadata_callback=lambda step: {"success": step.terminal, "class": type(step).__name__},
+        rl_tuple_cls=Mine,
+    )
+    env.store(name="cartpole")
+    roll(env, 75)
+    env.close()
+    *ended, _ = storage.list_episodes()
+    assert [header.metadata for header in ended] == [{"success": True, "class": "Mine"}] * len(ended)
+
+
 def test_delete_takes_everything_along(storage: FileStorage) -> None:
     env = WindyWrapper(windy(), storage, metadata_callback=Returns())
     benchmark = env.store(name="windy")

@@ -752,9 +752,23 @@ def test_missing_directories_are_made(tmp_path: Path) -> None:
         assert len(Recording(path)) == 1
 
 
-def test_a_metadata_callback_without_reset_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="metadata_callback: expected an EpisodeMetadataCallback"):
-        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback=lambda step: {})  # type: ignore[arg-type, return-value]
+def test_a_function_makes_metadata(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(
+        gym.make("CartPole-v1"), path, metadata_callback=lambda step: {"success": step.state[2] > 0}
+    ) as env:
+        roll(env, 100)
+    recording = Recording(path)
+    *ended, _ = recording.episodes
+    assert [one.metadata for one in ended] == [{"success": bool(one.states[-1, 2] > 0)} for one in ended]
+    assert len({one.metadata["success"] for one in ended}) == 2
+
+
+def test_what_is_no_callback_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        RecordingError, match="metadata_callback: expected a function of a step, or an Episode"
+    ):
+        RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata_callback={"a": 1})  # type: ignore[arg-type]
     assert not any(tmp_path.iterdir())
     with pytest.raises(RecordingError, match="step_callback: expected a function, found 3"):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=3)  # type: ignore[arg-type]

@@ -260,6 +260,17 @@ def test_metadata_and_infos(tmp_path: Path, mode: Any) -> None:
         assert [info["first"] for info in episode.infos if info] == episode.states[:, 0].tolist()
 
 
+def test_a_function_makes_metadata(tmp_path: Path) -> None:
+    with RecordEpisodes(
+        make(SPACES["box"], None),
+        tmp_path / "r.mcap",
+        metadata_callback=lambda step: {"success": step.reward > 0},
+    ) as env:
+        run(env, None, 30)
+    for episode in Recording(tmp_path / "r.mcap").episodes:
+        assert episode.metadata == {"success": bool(episode.rewards[-1] > 0)}
+
+
 def test_appending_goes_on_with_every_stream(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with RecordEpisodes(make(SPACES["box"], None), path) as env:

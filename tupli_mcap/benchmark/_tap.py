@@ -3,12 +3,15 @@ again."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.recording.write.options import MetadataCallback
+from tupli_mcap.schema import RLTuple
+from tupli_mcap.wrappers.base import reset_callback
 
 
 class PendingReset(NamedTuple):
@@ -43,17 +46,17 @@ class Tap(gym.Wrapper[Any, Any, Any, Any]):
         pass
 
 
-class Retyped(EpisodeMetadataCallback):
+class Retyped:
     """A callback that is given tuples of another class."""
 
-    def __init__(self, callback: EpisodeMetadataCallback, tuple_class: type[RLTuple]) -> None:
+    def __init__(self, callback: MetadataCallback, tuple_class: type[RLTuple]) -> None:
         self._callback = callback
         self._tuple_class = tuple_class
 
     def reset(self) -> None:
-        self._callback.reset()
+        reset_callback(self._callback)
 
-    def __call__(self, tuple: RLTuple) -> dict[str, Any]:
+    def __call__(self, tuple: RLTuple) -> Mapping[str, Any]:
         return self._callback(
             self._tuple_class.from_env_step(
                 tuple.state, tuple.action, tuple.reward, tuple.terminal, tuple.timeout, tuple.info

@@ -18,8 +18,8 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
-from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, EpisodeMetadataCallback, RLTuple
+from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
+from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
@@ -81,7 +81,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         env: gym.Env[Any, Any],
         storage: TupliStorage | str | os.PathLike[str] | None,
         benchmark_id: str | None = None,
-        metadata_callback: EpisodeMetadataCallback | None = None,
+        metadata_callback: MetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
         **recording_options: Any,
     ) -> None:
@@ -304,7 +304,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         cls,
         storage: TupliStorage | str | os.PathLike[str],
         benchmark_id: str | None = None,
-        metadata_callback: EpisodeMetadataCallback | None = None,
+        metadata_callback: MetadataCallback | None = None,
         rl_tuple_cls: type[RLTuple] = RLTuple,
         *,
         trust: bool = False,

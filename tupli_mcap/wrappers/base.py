@@ -16,13 +16,13 @@ from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import Step
-from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
+from tupli_mcap.schema import RLTuple
 from tupli_mcap.wrappers.described import Captured, format_version, with_run, with_stacks
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ class EpisodeWrapper(Recorder):
         """Called after the files are finished."""
 
 
-def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
+def metadata_of(callback: MetadataCallback, step: Step) -> str:
     """The metadata that a callback returned, as JSON. Raises RecordingError unless it is a dict of JSON values."""
     state, action, reward, terminal, timeout, info = step
     rl_tuple = RLTuple.model_construct(
@@ -214,6 +214,13 @@ def metadata_of(callback: EpisodeMetadataCallback, step: Step) -> str:
         return jsonvalue.dumps_plain(dict(metadata))
     except (TypeError, ValueError) as err:
         raise RecordingError(f"metadata_callback: {err}") from err
+
+
+def reset_callback(callback: MetadataCallback) -> None:
+    """Tells a callback that an episode begins; a plain function has no `reset`."""
+    reset = getattr(callback, "reset", None)
+    if reset is not None:
+        reset()
 
 
 def drawn_seed(env: gym.Env[Any, Any]) -> int | None:

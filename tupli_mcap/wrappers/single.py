@@ -24,6 +24,7 @@ from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
     Durability,
+    MetadataCallback,
     Mode,
     RecordInfo,
     RecordOptions,
@@ -32,8 +33,7 @@ from tupli_mcap.recording.write.options import (
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.schema import EpisodeMetadataCallback
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of, reset_callback
 
 
 class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
@@ -51,8 +51,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             directories are made.
         mode: if the file exists, "x" refuses, "w" replaces it, and "a" continues it. "a" also makes a missing file.
         metadata_callback: called with every step (an RLTuple); the dict it returns at the last one is the episode's
-            metadata. It is reset before each episode. If the info of the step that ends an episode has `is_success` or
-            `success`, the metadata gets that as `success`, unless the callback sets it.
+            metadata. If it has a `reset()`, that is called before each episode. If the info of the step that ends an
+            episode has `is_success` or `success`, the metadata gets that as `success`, unless the callback sets it.
         record_info: False, True (everything), a list of names, or a function from an info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".
@@ -110,7 +110,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         env: gym.Env[Any, Any],
         path: str | os.PathLike[str],
         *,
-        metadata_callback: EpisodeMetadataCallback | None = None,
+        metadata_callback: MetadataCallback | None = None,
         record_info: RecordInfo = False,
         step_callback: StepCallback | None = None,
         compression: str = "zstd",
@@ -294,7 +294,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     def _reset_callback(self) -> None:
         self._stepped = False
         if self._metadata_callback is not None:
-            self._metadata_callback.reset()
+            reset_callback(self._metadata_callback)
 
     def _go_on(self, action: Any, result: Any) -> None:
         """Goes on in another file if this one is full, and syncs to the disk if `durability` asks for it."""

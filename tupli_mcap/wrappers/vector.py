@@ -23,6 +23,7 @@ from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
     Durability,
+    MetadataCallback,
     Mode,
     RecordInfo,
     RecordOptions,
@@ -33,8 +34,7 @@ from tupli_mcap.recording.write.recorders.infos import final_infos_of, infos_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.schema import EpisodeMetadataCallback
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of
+from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of, reset_callback
 
 
 class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
@@ -62,7 +62,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         env: gym.vector.VectorEnv[Any, Any, Any],
         path: str | os.PathLike[str],
         *,
-        metadata_callback: EpisodeMetadataCallback | None = None,
+        metadata_callback: MetadataCallback | None = None,
         record_info: RecordInfo = False,
         step_callback: StepCallback | None = None,
         compression: str = "zstd",
@@ -272,5 +272,5 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
     def _forget(self, chosen: Any) -> None:
         for i in chosen:
             if self._callbacks is not None:
-                self._callbacks[i].reset()
+                reset_callback(self._callbacks[i])
             self._texts[i] = "{}"

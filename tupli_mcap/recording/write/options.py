@@ -20,13 +20,16 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from tupli_mcap.recording.episode import Step
-    from tupli_mcap.schema import EpisodeMetadataCallback
+    from tupli_mcap.schema import RLTuple
 
 Mode = Literal["x", "w", "a"]
 Durability = Literal["os", "chunk", "step"]
 CaptureEnv = Literal["spec", "pickle"] | None
 Capture = Literal["all", "versions", "none"]
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
+MetadataCallback = Callable[
+    ["RLTuple"], Mapping[str, Any]
+]  # also an EpisodeMetadataCallback, which has reset()
 StepCallback = Callable[["Step"], Mapping[str, Any] | None]
 
 CAMERA: Final = "render"
@@ -46,7 +49,7 @@ class RecordOptions:
         MissingExtraError: the extra that `image_format` needs is not installed.
     """
 
-    metadata_callback: EpisodeMetadataCallback | None = None
+    metadata_callback: MetadataCallback | None = None
     record_info: RecordInfo = False
     step_callback: StepCallback | None = None
     compression: str = "zstd"
@@ -95,10 +98,10 @@ class RecordOptions:
         if self.capture not in ("all", "versions", "none"):
             raise RecordingError(f"capture: expected 'all', 'versions' or 'none', found {self.capture!r:.80}")
         callback = self.metadata_callback
-        if callback is not None and not (callable(callback) and callable(getattr(callback, "reset", None))):
+        if not (callback is None or callable(callback)):
             raise RecordingError(
-                "metadata_callback: expected an EpisodeMetadataCallback, which is called with each step and has "
-                f"reset(), found {callback!r:.80}; what is the same for all episodes of a run is metadata="
+                "metadata_callback: expected a function of a step, or an EpisodeMetadataCallback, "
+                f"found {callback!r:.80}; what is the same for all episodes of a run is metadata="
             )
         if not (self.step_callback is None or callable(self.step_callback)):
             raise RecordingError(f"step_callback: expected a function, found {self.step_callback!r:.80}")
