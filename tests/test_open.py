@@ -990,7 +990,7 @@ def test_a_recorded_nan_is_not_missing_in_arrow(tmp_path: Path) -> None:
     assert {name: count for name, count in missing.items() if count} == {
         "seed": 6, "info.force": 2, "info.list": 4, "metadata.score": 3,
     }  # fmt: skip
-    for name in ("state.x[0]", "state['depth']"):
+    for name in ("state.x[0]", "state.depth"):
         assert np.isnan(table[name].to_pylist()).all()
     assert np.isnan(table["reward"].to_pylist()).tolist() == [False, True, True] * 2
     assert str(table["info.force"].to_pylist()) == "[nan, 1.5, None, nan, 1.5, None]"
