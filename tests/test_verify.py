@@ -427,7 +427,7 @@ def test_the_command(tmp_path: Path) -> None:
     both = CliRunner().invoke(app, ["verify", str(path), str(other)])
     assert both.exit_code == 1
     assert f"{other}: ok" in both.output
-    assert "2 verified, 1 damaged" in both.output
+    assert "1 of 2 undamaged" in both.output
     assert "save what is good with tupli-mcap recover" in both.output
     report = json.loads(CliRunner().invoke(app, ["verify", str(path), "--json"]).output)["result"]
     assert (report["ok"], report["damaged"]) == (False, 1)

@@ -10,16 +10,6 @@ import gymnasium as gym
 import tupli_mcap
 
 
-class _Stood(tupli_mcap.EpisodeMetadataCallback):
-    """An episode is a success if the pole stood to the end."""
-
-    def reset(self) -> None:
-        pass
-
-    def __call__(self, tuple: tupli_mcap.RLTuple) -> dict[str, Any]:
-        return {"success": bool(tuple.timeout)}
-
-
 def make(directory: Path) -> None:
     """Writes run.mcap, and runs/gain-0.0.mcap and two others, which differ in the gain of their policy."""
     record(directory / "run.mcap", 0.5, 0, 12, name="balance", metadata={"gain": 0.5}, tags=["baseline"])
@@ -32,7 +22,9 @@ def record(path: Path, gain: float, seed: int, episodes: int, **run: Any) -> Non
     """Episodes of a policy that pushes the way the pole falls; each fourth one is random."""
     env = gym.make("CartPole-v1", max_episode_steps=200)
     tilt = {"step_callback": lambda step: {"tilt": abs(float(step.state[2]))}}
-    with tupli_mcap.RecordEpisodes(env, path, metadata_callback=_Stood(), **tilt, **run) as recorder:
+    with tupli_mcap.RecordEpisodes(
+        env, path, metadata_callback=lambda step: {"success": bool(step.timeout)}, **tilt, **run
+    ) as recorder:
         recorder.action_space.seed(seed)
         for i in range(episodes):
             state, _ = recorder.reset(seed=100 * seed + i)

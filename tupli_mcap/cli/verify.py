@@ -78,7 +78,7 @@ def verify(
         told["replays"] = None if replays is None else replays.to_json()
         print_json(told)
     elif len(reports) > 1:
-        say(f"{number(len(reports))} verified, {number(damaged)} damaged")
+        say(f"{number(len(reports) - damaged)} of {number(len(reports))} undamaged")
     if replays is not None and not replays.tried and not as_json:
         fail("no episode was run again: no undamaged recording has such an episode")
     if damaged or (replays is not None and not replays.ok):

@@ -97,7 +97,8 @@ def write_rollout(
         autoreset: what the row after an end is, if arrays continue after one. "next-step": a reset; its action and
             reward are left out. "same-step": a step of the next episode, whose first state follows the end.
             "disabled": the same, and the caller has reset between the steps, also after the last one if it is an end.
-        observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds.
+        observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds; of
+            flags (bool), MultiBinary or Discrete(2), whose values are integers.
         reward_space: for rewards that are arrays.
         run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` takes them.
         labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
