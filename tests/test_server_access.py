@@ -1,10 +1,11 @@
 """Who may do what with an item of somebody else: every route that names one, each role, private or published.
 
-The routes come from the OpenAPI document: one that names an item, and that this table does not know, fails it.
+The routes come from the OpenAPI document: an operation that is neither in this table nor in NO_ITEM fails it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -19,13 +20,41 @@ from tupli_mcap.wrappers.rollout import record_rollouts
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
 
 ROLES = ("user", "member", "contributor", "user_admin", "group_admin", "content_admin", "admin")
+LAB = "lab"  # a group of ann and the colleague
+AUDIENCES = (None, "global", LAB)  # where a thing may be published
 MAY_DELETE = ("content_admin", "admin")
 METADATA = {"Artifact-Metadata": "eyJuYW1lIjogIndpbmQifQ=="}  # {"name": "wind"}
 GROUP = dict.fromkeys(("group", "publish_in", "unpublish_from"), "global")
 
+# The other operations, by the reason: what they name is no item, is the caller's own, or is selected by a filter from
+# what the caller may read.
+NO_ITEM = {
+    "the server": "GET /health, GET /ready, GET /metrics",
+    "sign-ins": "POST /v1/tokens, POST /v1/tokens/refresh, POST /v1/tokens/end, GET /v1/api-tokens, "
+    "POST /v1/api-tokens, DELETE /v1/api-tokens/{token}, POST /access/users/token, POST /access/users/refresh-token",
+    "users": "GET /v1/me, GET /v1/users, POST /v1/users, DELETE /v1/users/{username}, "
+    "PUT /v1/users/{username}/quota, PUT /v1/users/{username}/password, POST /access/users/create, "
+    "GET /access/users/list, DELETE /access/users/delete, PUT /access/users/change-password",
+    "groups": "GET /v1/groups, POST /v1/groups, GET /v1/groups/{name}, DELETE /v1/groups/{name}, "
+    "PUT /v1/groups/{name}/members, DELETE /v1/groups/{name}/members/{user}, POST /access/groups/create, "
+    "GET /access/groups/list, GET /access/groups/read, DELETE /access/groups/delete, "
+    "POST /access/groups/add-members, POST /access/groups/remove-members",
+    "roles": "GET /v1/roles, POST /v1/roles, DELETE /v1/roles/{role}, POST /access/roles/create, "
+    "GET /access/roles/list, DELETE /access/roles/delete",
+    "new items": "POST /v1/benchmarks, POST /v1/artifacts, POST /v1/uploads, POST /benchmarks/create, "
+    "POST /artifacts/upload, POST /episodes/record",
+    "the caller's uploads": "HEAD /v1/uploads/{upload_id}, PATCH /v1/uploads/{upload_id}, "
+    "DELETE /v1/uploads/{upload_id}",
+    "lists": "POST /v1/benchmarks/list, POST /v1/artifacts/list, POST /v1/episodes/list, POST /v1/episodes/count, "
+    "POST /v1/episodes/keys, POST /benchmarks/list, POST /artifacts/list, POST /episodes/list",
+    "queries": "POST /v1/episodes/delete, POST /v1/episodes/publish, POST /v1/query, POST /v1/query/tickets, "
+    "GET /v1/manifest, GET /v1/data",
+}
+
 
 class Route(NamedTuple):
-    """method, path. kind: of what it names one; name: the parameter of the query that does, if it is not the path."""
+    """method, path. kind: of what it names one; name: the parameter of the query, or of a body, that does, if it is not
+    the path."""
 
     method: str
     path: str
@@ -38,16 +67,25 @@ class Route(NamedTuple):
 
     @property
     def verb(self) -> str:
-        if self.method == "GET":
+        if self.method in ("GET", "HEAD") or self.path == "/v1/tickets":
             return "read"
         if "publish" in self.path:
             return "unpublish" if "unpublish" in self.path or self.method == "DELETE" else "publish"
         assert self.method == "DELETE", self
         return "delete"
 
-    def status(self, role: str, published: bool) -> int:
+    def ask(self, person: Person, item: str) -> httpx.Response:
+        """The answer to a person who asks for an item."""
+        told = {self.name: item} if self.name else {}
+        body = told if self.method == "POST" else None
+        path = self.path.replace("{uri}", item).replace("{name}", item)
+        return person.call(self.method, path, body, params={**GROUP, **told})
+
+    def status(self, role: str, audience: str | None) -> int:
         """What who has a role, and owns nothing, is answered."""
-        if not published:  # it does not exist for them
+        if role == "guest" and self.is_ours and self.verb != "read":
+            return 401
+        if audience is None or (audience == LAB and role != "colleague"):  # it does not exist for them
             if self.is_ours:
                 return 404
             if role == "admin":  # PyTupli's: what is gone is deleted, for an admin
@@ -58,17 +96,22 @@ class Route(NamedTuple):
 
 
 def routes(url: str) -> list[Route]:
-    """The routes that name an item."""
+    """The routes that name an item; each other operation must be in NO_ITEM."""
     found = []
+    others = set()
     document = httpx.get(f"{url}/openapi.json", timeout=120).json()
     for path, item in document["paths"].items():
         for method, told in item.items():
             names = [each["name"] for each in told.get("parameters", ()) if each["name"].endswith("_id")]
-            if "{uri}" in path:
+            if "{uri}" in path or path == "/v1/files/{name}":
                 found.append(Route(method.upper(), path, path.split("/")[2], ""))
+            elif path == "/v1/tickets":
+                found.append(Route(method.upper(), path, "files", "recording"))
             elif names and "{" not in path:
                 found.append(Route(method.upper(), path, f"{names[0].removesuffix('_id')}s", names[0]))
-    assert len(found) == 13 + 11
+            else:
+                others.add(f"{method.upper()} {path}")
+    assert others == {each for listed in NO_ITEM.values() for each in listed.split(", ")}
     return found
 
 
@@ -80,15 +123,18 @@ class Lab:
         record_rollouts("CartPole-v1", folder / "run.mcap", steps=20, seed=1)
         self._recording = (folder / "run.mcap").read_bytes()
         admin = Person(url, "admin")
-        for name in ("ann", *ROLES[:-1]):
+        for name in ("ann", "colleague", *ROLES[:-1]):
             admin.ask("POST", "/v1/users", {"username": name, "password": f"{name}'s password"})
-            if name not in ("ann", "user"):
+            if name not in ("ann", "colleague", "user"):
                 admin.ask("PUT", "/v1/groups/global/members", [{"user": name, "roles": [name]}])
         self.ann = Person(url, "ann")
-        self.people = {role: Person(url, role) for role in ROLES[:-1]} | {"admin": admin}
+        self.ann.ask("POST", "/v1/groups", {"name": LAB})
+        self.ann.ask("PUT", f"/v1/groups/{LAB}/members", [{"user": "colleague", "roles": ["member"]}])
+        self.people = {name: Person(url, name) for name in (*ROLES[:-1], "colleague")}
+        self.people |= {"admin": admin, "guest": Person(url)}
 
-    def stock(self, published: bool) -> dict[str, str]:
-        """Ids of ann's things by kind; they are stored where they are not, and all published or none."""
+    def stock(self, audience: str | None) -> dict[str, str]:
+        """Ids of ann's things by kind; they are stored where they are not, and published for an audience alone."""
         recording = self.ann.send(self._recording)
         wanted = {"type": "EQ", "key": "recording", "value": recording}
         ids = {
@@ -97,38 +143,39 @@ class Lab:
             "episodes": self.ann.ask("POST", "/v1/episodes/list", {"filter": wanted})["items"][0]["id"],
         }
         for kind, uri in ids.items():
-            method = "PUT" if published else "DELETE"
-            self.ann.ask(method, f"/v1/{kind}/{uri}/published", params={"group": "global"})
-        return ids
+            for group in AUDIENCES[1:]:
+                method = "PUT" if group == audience else "DELETE"
+                self.ann.ask(method, f"/v1/{kind}/{uri}/published", params={"group": group})
+        return {**ids, "files": recording}
 
 
-@pytest.fixture(scope="module", params=ENGINES)
-def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
-    root = tmp_path_factory.mktemp("lab")
-    with settings_of(request.param, request, root / "served") as settings, serving(settings) as url:
-        yield Lab(url, root)
+@pytest.fixture(params=ENGINES)  # for each test, since PyTupli's client may delete again what it has deleted
+def lab(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Lab]:
+    with settings_of(request.param, request, tmp_path / "served") as settings:
+        with serving(dataclasses.replace(settings, guests=True)) as url:
+            yield Lab(url, tmp_path)
 
 
-@pytest.mark.sampled(0, keep=["sqlite and a directory-published", "postgresql and s3-private"])
-@pytest.mark.parametrize("published", [False, True], ids=["private", "published"])
-def test_every_route_for_each_role(lab: Lab, published: bool) -> None:
+@pytest.mark.sampled(0, keep=[f"{ENGINES[0]}-global", f"{ENGINES[0]}-{LAB}", f"{ENGINES[1]}-private"])
+@pytest.mark.parametrize("audience", AUDIENCES, ids=["private", *AUDIENCES[1:]])
+def test_every_route_for_each_role(lab: Lab, audience: str | None) -> None:
     wrong = []
+    named = routes(lab.url)
+    ids = lab.stock(audience)
     for role, person in lab.people.items():
-        ids = lab.stock(published)
-        for route in routes(lab.url):
-            uri = ids[route.kind]
-            told = {**GROUP, route.name: uri} if route.name else GROUP
-            status = person.call(route.method, route.path.format(uri=uri), params=told).status_code
-            if status != route.status(role, published):
+        for route in named:
+            status = route.ask(person, ids[route.kind]).status_code
+            if status != route.status(role, audience):
                 wrong.append((role, route, status))
             if status == 200 and route.verb != "read":
-                ids = lab.stock(published)
+                ids = lab.stock(audience)
     assert wrong == []
 
 
 def test_every_route_for_the_owner(lab: Lab) -> None:
+    ids = lab.stock(None)
     for route in routes(lab.url):
-        uri = lab.stock(published=False)[route.kind]
-        told = {**GROUP, route.name: uri} if route.name else GROUP
-        answer = lab.ann.call(route.method, route.path.format(uri=uri), params=told)
+        answer = route.ask(lab.ann, ids[route.kind])
         assert answer.status_code == 200, (route, answer.text)
+        if route.verb != "read":
+            ids = lab.stock(None)
