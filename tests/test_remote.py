@@ -164,26 +164,46 @@ def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
         recording.read([3])
 
 
-def test_a_server_that_knows_no_suffixes(server: WebServer) -> None:
-    server.suffixes = False
+@pytest.mark.parametrize("status", [400, 403, 404, 405, 416, 500, 501])
+def test_a_server_that_knows_no_suffixes(server: WebServer, status: int) -> None:
+    server.no_suffix, server.heads = status, False
     assert Recording(server.url()).n_steps == EPISODES * STEPS
-    assert [asked.method for asked in server.asked] == ["GET", "HEAD", "GET"]
+    size = len(server.files["/r.mcap"])
+    asked = [asked.range for asked in server.asked if asked.range != "bytes=-131072"]
+    assert asked == ["bytes=0-0", f"bytes={size - 131072}-{size - 1}"]
+    with pytest.raises(RecordingError, match=r"nothing\.mcap does not exist"):
+        Recording(server.url("/nothing.mcap"))
+    server.files["/empty.mcap"] = b""
+    with pytest.raises(tupli_mcap.FormatError, match="is empty"):
+        Recording(server.url("/empty.mcap"))
 
 
 def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:
-    server.ranges = False
+    server.ranges = server.heads = False
     with pytest.warns(UserWarning, match="sends whole files only"):
         recording = Recording(server.url())
     with recording:
         assert np.array_equal(recording.read().states, Recording(large).read().states)
 
 
+def test_azure_which_has_no_suffixes(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"ACCOUNT_NAME": "lab", "ACCOUNT_KEY": "c2VjcmV0", "ENDPOINT": server.url("")}.items():
+        monkeypatch.setenv(f"AZURE_STORAGE_{name}", value)
+    server.files["/lab/runs/r.mcap"] = server.files["/r.mcap"]
+    assert Recording("az://lab/runs/r.mcap").n_steps == EPISODES * STEPS
+    assert [asked.method for asked in server.asked] == ["GET", "GET"]
+    with pytest.raises(RecordingError, match=r"az://lab/runs/nothing\.mcap does not exist"):
+        Recording("az://lab/runs/nothing.mcap")
+    server.failures = [403]
+    with pytest.raises(RecordingError, match=r"az://lab/runs/r\.mcap may not be read with the credentials"):
+        Recording("az://lab/runs/r.mcap")
+
+
 def test_a_server_that_tells_no_length(server: WebServer) -> None:
-    server.ranges = server.heads = False
-    with pytest.raises(RecordingError, match="its server does not tell how long it is; download the file"):
-        Recording(server.url())
-    server.heads, server.lengths = True, False
-    with pytest.raises(RecordingError, match="its server does not tell how long it is; download the file"):
+    server.ranges = server.lengths = False
+    with pytest.raises(
+        RecordingError, match=r"r\.mcap cannot be read: .* does not tell how long it is; download"
+    ):
         Recording(server.url())
     with pytest.raises(RecordingError, match="does not exist"):
         Recording(server.url("/nothing.mcap"))

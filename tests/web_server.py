@@ -32,7 +32,8 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.files: dict[str, bytes] = {}
         self.tags: dict[str, str] = {}
         self.asked: list[Asked] = []
-        self.suffixes = self.ranges = self.conditions = True
+        self.ranges = self.conditions = True
+        self.no_suffix = 0  # the status code of the answer to a suffix range, if that is refused
         self.lengths = self.heads = True  # whether it says how long files are, and answers HEAD
         self.failures: list[int] = []  # status codes of the next answers
         self.delay = 0.0  # seconds before each answer
@@ -75,8 +76,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             status, body = 404, b"no"
         elif server.conditions and match not in (None, tag):
             status, body = 412, b"no"
-        elif wanted and not wanted[1] and not server.suffixes:
-            status, body = 416, b"no"
+        elif wanted and not wanted[1] and server.no_suffix:
+            status, body = server.no_suffix, b"no"
         elif wanted:
             size = len(data)
             start = int(wanted[1]) if wanted[1] else max(0, size - int(wanted[2]))

@@ -22,6 +22,7 @@ _CAUSES: Final = (
     ("NetworkUnreachable", "there is no way to {}", "check the network"),
     ("HostUnreachable", "there is no way to {}", "check the network"),
     ("InvalidCertificate", "the certificate of {} is not trusted here", f"check the address; {AUTHORITY}"),
+    ("Content-Length", "{} does not tell how long it is", "download the file, and open that"),
     (
         "kind: Timeout",
         "{} does not answer in time",
@@ -34,6 +35,10 @@ _STATUS: Final = re.compile(r"status code: (\d{3}(?: [A-Z][A-Za-z]*)*)")
 
 class BrokenOffError(RecordingError):
     """The server does not answer, or stops in the middle of it."""
+
+
+class FailedError(BrokenOffError):
+    """The server answers that it fails."""
 
 
 class RefusedError(Exception):
@@ -69,7 +74,8 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
             raise RecordingError(
                 f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
             ) from None
-        raise BrokenOffError(f"{shown(url)} cannot be read: {why(str(err))}") from None
+        failed = FailedError if _STATUS.search(said) else BrokenOffError
+        raise failed(f"{shown(url)} cannot be read: {why(str(err))}") from None
 
 
 def why(told: str) -> str:

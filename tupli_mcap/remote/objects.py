@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import RecordingError, missing_extra
-from tupli_mcap.remote.failures import SECONDS_VARIABLE, BrokenOffError, RefusedError, asked
+from tupli_mcap.remote.failures import SECONDS_VARIABLE, BrokenOffError, FailedError, RefusedError, asked
 from tupli_mcap.remote.names import is_web, shown
 
 _T = TypeVar("_T")
@@ -179,32 +179,25 @@ class _StoredObject:
 
         try:
             found = self._ask({"range": {"suffix": length}})
-        except (RefusedError, NotSupportedError) as err:
-            size = self._size(answered=isinstance(err, NotSupportedError))
-            if not size:
-                return End(memoryview(b""), 0, "")
-            try:
-                found = self._ask({"range": (max(0, size - length), size)})
-            except (RefusedError, NotSupportedError) as err:
-                raise NoRangesError from err
+        except (RefusedError, NotSupportedError, RecordingError) as err:
+            # Servers that know no suffixes fail, or say that there is no such file, or that it may not be read.
+            if isinstance(err, BrokenOffError) and not isinstance(err, FailedError):
+                raise
+            return self._tail_by_size(length)
         return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
-    def _size(self, *, answered: bool) -> int:
-        """Its size. answered: whether the server has sent it whole, so that it is there."""
+    def _tail_by_size(self, length: int) -> End:
+        """Its tail, from a server that knows no suffixes."""
+        from obstore.exceptions import NotSupportedError
+
         try:
-            return int(asked(self._url, lambda: self._store.head(self._path))["size"])
-        except RefusedError:
-            pass
-        except BrokenOffError as err:
-            if "Content-Length" not in str(err):
-                raise
-        except RecordingError:  # some say so of requests that they do not know
-            if not answered:
-                raise
-        raise RecordingError(
-            f"{shown(self._url)} cannot be read in place, as its server does not tell how long it is; download the "
-            "file, and open that"
-        )
+            meta = self._ask({"range": (0, 1)}).meta
+        except (RefusedError, NotSupportedError) as err:
+            if not self._ask({}).meta["size"]:
+                return End(memoryview(b""), 0, "")
+            raise NoRangesError from err
+        size, version = meta["size"], _version(meta)
+        return End(self.get(max(0, size - length), size, version), size, version)
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data, at = bytearray(stop - start), 0
