@@ -416,11 +416,32 @@ def test_other_addresses_go_through_fsspec(large: Path) -> None:
 
     fsspec.filesystem("memory").pipe("/runs/x.mcap", large.read_bytes())
     assert np.array_equal(Recording("memory://runs/x.mcap").read().states, Recording(large).read().states)
-    assert matching("memory:///runs/*.mcap") == ["memory:///runs/x.mcap"]
+    for folder in ("memory://runs", "memory:///runs"):
+        assert matching(f"{folder}/*.mcap") == matching(f"{folder}/**") == [f"{folder}/x.mcap"]
     with pytest.raises(RecordingError, match="does not exist"):
         Recording("memory://runs/y.mcap")
     with pytest.raises(RecordingError, match="cannot be opened"):
         Recording("nosuch://runs/y.mcap")
+
+
+def test_patterns_with_a_host(large: Path) -> None:
+    import fsspec
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    class Hosted(MemoryFileSystem):
+        """As of SFTP: the host is an option of the file system, and no part of its paths."""
+
+        protocol = "hosted"
+
+        @classmethod
+        def _strip_protocol(cls, path: str) -> str:
+            return fsspec.utils.infer_storage_options(path)["path"].rstrip("/")
+
+    fsspec.register_implementation("hosted", Hosted, clobber=True)
+    fsspec.filesystem("hosted").pipe("/hosted/x.mcap", large.read_bytes())
+    assert matching("hosted://me@lab/hosted/*.mcap") == ["hosted://me@lab/hosted/x.mcap"]
+    assert "hosted://lab/hosted/x.mcap" in matching("hosted://lab/**/*.mcap")
+    assert len(TupliDataset.from_files("hosted://lab/hosted/*.mcap").preview()) == EPISODES
 
 
 def test_fsspec_gives_a_whole_file_in_pieces(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:

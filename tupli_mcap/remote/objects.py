@@ -82,9 +82,8 @@ def listed(folder: str) -> Iterator[str]:
     """The URLs of all objects below a folder of a bucket, at any depth."""
     if not _is_bucket(folder):
         system, path = _fsspec(folder)
-        scheme = folder.partition("://")[0]
         for name in asked(folder, lambda: system.find(path)):
-            yield f"{scheme}://{name.lstrip('/') if not path.startswith('/') else name}"
+            yield f"{folder}/{name.removeprefix(path).lstrip('/')}"
         return
     store, path = open_store(folder)
     bucket = folder.removesuffix(path).rstrip("/")
