@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
 import shutil
+import sqlite3
 import subprocess
 import sys
+import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,8 +18,11 @@ from typing import Any
 import nginx
 import typer
 import yaml
+from persons import Person
+from serving import serving
 
 from tupli_mcap.cli import app
+from tupli_mcap.server.settings import Settings
 
 ROOT = Path(__file__).parent.parent
 DEPLOY = ROOT / "docs/howto/deploy"
@@ -111,6 +117,17 @@ def test_what_is_copied_makes_the_wheel(tmp_path: Path) -> None:
     }
     assert wanted <= names
     assert any(name.startswith("tupli_mcap/schemas/") for name in names)
+
+
+def test_changes_can_be_read_as_the_operators_page_says(tmp_path: Path) -> None:
+    page = (ROOT / "docs/howto/server.md").read_text()
+    (query,) = re.findall(r"`(SELECT .*?;)`", page)
+    with serving(Settings(tmp_path)) as url:
+        Person(url, "admin").ask("POST", "/v1/users", {"username": "ann", "password": "ann's password"})
+        file = f"file:{tmp_path}/server/server.sqlite?mode=ro"
+        with contextlib.closing(sqlite3.connect(file, uri=True)) as database:
+            when, *newest = database.execute(query).fetchone()
+    assert newest == ["admin", "create_user", "ann"] and abs(when - time.time()) < 3600
 
 
 def test_the_operators_page_tells_of_every_option() -> None:
