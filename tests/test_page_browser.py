@@ -141,6 +141,13 @@ class TestEverybody:
                     wide = page.evaluate("document.documentElement.scrollWidth")
                     assert wide <= 320, place
 
+    def test_a_phone_shows_returns(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, _):
+            page.set_viewport_size({"width": 360, "height": 740})
+            page.goto("/episodes?sort=-return")
+            shown = page.locator("tbody tr").first.locator("td.num").nth(1).bounding_box()
+            assert shown is not None and shown["x"] + shown["width"] <= 360
+
     def test_without_scripts(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, java_script_enabled=False) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1&sort=-return")
