@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import psutil
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Locator, Page, sync_playwright
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -42,7 +42,7 @@ class Seen(NamedTuple):
     @property
     def ink(self) -> float:
         """The share of coloured pixels below the viewer's bar."""
-        return _ink(self.picture)
+        return ink(self.picture)
 
 
 @contextlib.contextmanager
@@ -94,20 +94,21 @@ def browse(url: str, seconds: float = 150.0, size: tuple[int, int] = (1000, 700)
 
 
 def _settled(page: Page, end: float) -> np.ndarray:
-    picture = _picture(page)
+    picture = picture_of(page)
     while time.monotonic() < end:
         page.wait_for_timeout(300)
-        before, picture = picture, _picture(page)
-        if min(_ink(picture), _ink(before)) > FILLED and np.abs(picture - before).mean() < 2:
+        before, picture = picture, picture_of(page)
+        if min(ink(picture), ink(before)) > FILLED and np.abs(picture - before).mean() < 2:
             break
     return picture
 
 
-def _picture(page: Page) -> np.ndarray:
+def picture_of(page: Page | Locator) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
 
 
-def _ink(picture: np.ndarray) -> float:
+def ink(picture: np.ndarray) -> float:
+    """The share of coloured pixels below the viewer's bar."""
     below = picture[_TOP:]
     return float((below.max(axis=2) - below.min(axis=2) > 60).mean())
 

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browsing import CHROMIUM, FLAGS
+from browsing import CHROMIUM, FILLED, FLAGS, ink, picture_of
 from pages import EVIL, browsing, carts, robot
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 from serving import PASSWORD, serving
+from waiting import wait_for
 
+from tupli_mcap import TupliAPIClient
 from tupli_mcap.server.settings import Settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: tools/setup-viewer web")
@@ -187,6 +189,17 @@ class TestNothingActs:
             assert any("frame-ancestors" in told for told in seen.complaints)
 
 
+def assert_replayed(page: Page, address: str, link: str) -> None:
+    """Waits until the viewer within the page has drawn curves."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    page.goto(address)
+    page.get_by_role("link", name=link).click()
+    viewer = page.frame_locator("iframe")
+    expect(viewer.locator("canvas")).to_be_visible(timeout=PATIENCE)
+    expect(viewer.locator(".coming")).to_have_count(0, timeout=180_000)
+    wait_for(lambda: ink(picture_of(viewer.locator("canvas"))) > FILLED)
+
+
 class TestPlayer:
     def test_it_moves_pictures_lines_and_values(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
@@ -215,15 +228,22 @@ class TestPlayer:
             assert seen.complaints == []
 
     def test_rerun_is_shown_within_the_page(self, playwright: Playwright, lab: str) -> None:
-        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
         uri = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1").json()["episodes"][0]["id"]
         with launched(playwright, *FLAGS) as browser, opened(browser, lab) as (page, seen):
-            page.goto(f"/episode/{uri}")
-            page.get_by_role("link", name="Replay in Rerun").click()
-            viewer = page.frame_locator("iframe")
-            expect(viewer.locator("canvas")).to_be_visible(timeout=PATIENCE)
-            expect(viewer.locator(".coming")).to_have_count(0, timeout=180_000)
+            assert_replayed(page, f"/episode/{uri}", "Replay in Rerun")
             assert {host.split(":")[0] for host in seen.hosts} == {"127.0.0.1"}
+
+    def test_rerun_shows_what_only_a_signed_in_user_may_see(
+        self, playwright: Playwright, server: str, tmp_path: Path
+    ) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        with TupliAPIClient(server) as client:
+            client.login("admin", PASSWORD)
+            client.push(tmp_path / "ppo0.mcap")
+            header = client.list_episodes()[0]
+        with launched(playwright, *FLAGS) as browser, opened(browser, server) as (page, _):
+            sign_in(page)
+            assert_replayed(page, f"/episode/{header.id}", "Replay in Rerun")
 
 
 class TestTable:

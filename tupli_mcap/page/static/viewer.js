@@ -1,5 +1,9 @@
 // Starts the Rerun viewer (its script defines `wasm_bindgen`) with the data that the page names.
 
+// The viewer asks without the cookie, and a server then answers with its sign-in page.
+const fetched = window.fetch;
+window.fetch = (asked, options) => fetched(asked, { ...options, credentials: "same-origin" });
+
 (async () => {
   const canvas = document.getElementById("viewer");
   const status = document.querySelector(".coming");
