@@ -165,6 +165,53 @@ def test_what_a_killed_process_has_recorded_is_finished_and_sent_by_the_next(
     assert len({header.recording for header in headers}) == 1
 
 
+LOOKS = """
+import os, sys
+from tupli_mcap.storage import TupliAPIClient
+
+client = TupliAPIClient(sys.argv[1])
+if "flush" in sys.argv:
+    client.flush()
+    os._exit(0)
+if "logout" in sys.argv:
+    client.logout()
+"""
+
+
+def looks(url: str, *words: str) -> str:
+    """Runs a process that records nothing; returns what it writes to stderr."""
+    command = [sys.executable, "-c", LOOKS, url, *words]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=240, check=True)
+    return done.stderr
+
+
+@pytest.mark.parametrize("words", [(), ("flush",)], ids=str)
+def test_a_short_program_that_records_nothing_sends_what_was_left(
+    proxy: Between, admin: TupliAPIClient, words: tuple[str, ...]
+) -> None:
+    kill(records(proxy.url))
+    assert waiting(admin) == 1
+    assert looks(proxy.url, *words) == ""
+    assert waiting(admin) == 0
+    assert admin.count_episodes() == 4
+
+
+def test_what_the_server_refuses_of_another_program_is_no_error(
+    proxy: Between, admin: TupliAPIClient
+) -> None:
+    kill(records(proxy.url))
+    admin._session.ask("PUT", "/v1/users/admin/quota", {"bytes": 1})
+    looks(proxy.url, "flush")
+    assert waiting(admin) == 1
+
+
+def test_signing_out_keeps_what_cannot_be_sent(proxy: Between, admin: TupliAPIClient) -> None:
+    kill(records(proxy.url))
+    admin._session.tokens.end(admin.url)
+    assert "who is not signed in any more" in looks(proxy.url, "logout")
+    assert admin.username == ""
+
+
 def test_a_program_that_ends_has_sent_what_it_recorded(proxy: Between, admin: TupliAPIClient) -> None:
     process = records(proxy.url)
     _, errors = process.communicate("\n", timeout=120)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.api.answers import as_told
+from tupli_mcap.storage.api.answers import SignInError, UnreachableError, as_told
 from tupli_mcap.storage.api.outbox import Outbox, Waiting, outbox_of
 from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
@@ -47,8 +48,8 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     Without a URL, it is the server in TUPLI_MCAP_URL, of the last `login` or `set_url`, or on this machine. Recordings
     are written to this machine's disk first and sent in the background, so recording never waits for the server, nor
     fails if it is down. Before a query, the client sends everything that this process has recorded: finished
-    recordings, and the ended episodes of growing ones; so it does at exit. The next program sends what this one could
-    not. Thread-safe; a copy in another process opens its own connections.
+    recordings, and the ended episodes of growing ones; and what earlier processes left. So it does at exit. The next
+    program sends what this one could not. Thread-safe; a copy in another process opens its own connections.
 
     Raises:
         StorageError: the URL is no web server's; later, the server does not answer, or refuses.
@@ -91,10 +92,11 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         return self._outbox.waiting_elsewhere()
 
     def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
-        """Wait until the server has everything that this process has recorded; of growing recordings, the ended
-        episodes.
+        """Wait until the server has everything that this process has recorded, and what earlier ones left; of growing
+        recordings, the ended episodes.
 
-        everything: send the recordings of ended processes, too. tell: called with the number of bytes just sent.
+        everything: also try again what the server has refused of earlier ones, and raise why. tell: called with the
+            number of bytes just sent.
 
         Raises:
             StorageError: the server does not answer, or refuses a recording, which then stays on this machine.
@@ -279,8 +281,10 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         outbox_of(self._session)
 
     def logout(self) -> None:
-        """Send everything that was recorded, then sign out, here and on the server."""
-        self.flush()
+        """Send everything that was recorded, then sign out, here and on the server. What cannot be sent now waits for
+        the next sign-in."""
+        with contextlib.suppress(UnreachableError, SignInError):
+            self.flush()
         self._session.sign_out()
 
     # --- helpers ---

@@ -95,6 +95,7 @@ class Outbox:
         self._given: set[str] = set()  # stems of the names that this process records to
         self._refused: dict[Path, TupliError] = {}  # of these, what the server does not take
         self._alone: defaultdict[Path, threading.Lock] = defaultdict(threading.Lock)
+        atexit.register(self._send_at_exit, os.getpid())
 
     def new_path(self, benchmark_id: str, name: str) -> Path:
         """A new path for a recording."""
@@ -105,8 +106,6 @@ class Outbox:
             files.write_bytes(self.directory / _WHOSE, json.dumps(whose).encode())
         path = directory / new_name(name)
         with self._turn:
-            if not self._given:
-                atexit.register(self._send_at_exit, os.getpid())
             self._given.add(path.stem)
         return path
 
@@ -157,10 +156,10 @@ class Outbox:
                 self.send(path)
 
     def flush(self, *, everything: bool = False, tell: Tell = lambda _: None) -> None:
-        """Waits until the server has everything that this process has recorded; of growing recordings, the ended
-        episodes.
+        """Waits until the server has everything that this process has recorded, or has to send for ended ones; of
+        growing recordings, the ended episodes.
 
-        everything: send the recordings of ended processes, too.
+        everything: send all recordings of ended processes, and raise what the server refuses of them, too.
 
         Raises:
             UnreachableError: the server does not answer; the recordings stay here, and are sent later.
@@ -168,16 +167,18 @@ class Outbox:
             StorageError: the server refuses a recording, which stays here.
         """
         with self._turn:
-            refused = dict(self._refused)
+            refused, behind = dict(self._refused), set(self._behind)
         for path in self._paths():
-            if path in refused or not (everything or self._is_ours(path)):
+            ours = everything or self._is_ours(path)
+            if path in refused or not (ours or path in behind):
                 continue
             try:
                 self._send_now(path, tell)
             except (UnreachableError, SignInError):
                 raise
             except TupliError as err:
-                refused[path] = err
+                if ours:  # else the thread warns of it
+                    refused[path] = err
         with self._turn:
             self._refused = {}
         for path, why in refused.items():
@@ -263,7 +264,7 @@ class Outbox:
         files.write_bytes(_note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
 
     def _send_at_exit(self, process: int) -> None:
-        """At exit, sends what the program has recorded; the next program sends the rest."""
+        """At exit, sends what `flush` sends; the next program sends the rest."""
         if os.getpid() != process:
             return
         try:
