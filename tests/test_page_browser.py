@@ -17,6 +17,7 @@ from serving import PASSWORD, serving
 from waiting import wait_for
 
 from tupli_mcap import TupliAPIClient
+from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.server.settings import Settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: tools/setup-viewer web")
@@ -311,3 +312,15 @@ class TestUpload:
             rows.nth(0).get_by_role("link").click()
             expect(page.locator(".count")).to_contain_text("2 episodes")
             assert [told for told in seen.complaints if "status of 400" not in told] == []
+
+    def test_why_a_file_is_refused(self, chromium: Browser, server: str, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        with Recording(tmp_path / "ppo0.mcap") as recording:
+            rewrite_recording(recording, tmp_path / "cut.mcap", episodes=[0])
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            field = page.get_by_label("Drop recordings here", exact=False)
+            field.set_input_files([tmp_path / "ppo0.mcap", tmp_path / "cut.mcap"])
+            refused = page.locator(".uploads .failed")
+            expect(refused).to_contain_text("which this file lacks", timeout=PATIENCE)

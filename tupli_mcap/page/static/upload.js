@@ -2,6 +2,7 @@
 
 const PIECE = 16 << 20;
 const TRIES = 5;
+const LATER = [423, 429, 500, 502, 503, 504]; // the server cannot answer now
 
 export function upload(form) {
   const list = document.querySelector(".uploads");
@@ -78,8 +79,7 @@ async function send(form, file, row) {
       recording = answer.headers.get("Recording");
       tries = 0;
     } catch (error) {
-      if (error.status < 500 && error.status !== 409 && error.status !== 423) throw error;
-      if (++tries > TRIES) throw error;
+      if (!error.again || ++tries > TRIES) throw error;
       await new Promise((later) => setTimeout(later, 1000 * tries));
       offset = Number((await ask(form, "HEAD", place, { "Tus-Resumable": "1.0.0" })).headers.get("Upload-Offset"));
     }
@@ -111,7 +111,7 @@ async function ask(form, method, address, headers, body) {
   for (let again = false; ; again = true) {
     token ??= await access(form);
     const answer = await fetch(address, { method, body, headers: { ...headers, Authorization: `Bearer ${token}` } }).catch(() => {
-      throw Object.assign(new Error("the server cannot be reached"), { status: 599 });
+      throw Object.assign(new Error("the server cannot be reached"), { again: true });
     });
     if (answer.ok) return answer;
     if (answer.status === 401 && !again) {
@@ -119,7 +119,8 @@ async function ask(form, method, address, headers, body) {
       continue;
     }
     const told = await answer.json().catch(() => ({}));
-    throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { status: answer.status });
+    const again = LATER.includes(answer.status) || answer.headers.has("Upload-Offset");
+    throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { again });
   }
 }
 
