@@ -132,6 +132,6 @@ def demand_room(connection: Connection, settings: Settings, caller: Caller, size
     used = used_by(connection, caller.name)
     if used + size > allowed:
         raise FullError(
-            f"{caller.name} may store {allowed} bytes, uses {used}, and cannot store {size} more; delete something, "
-            "or ask the server's admin for a larger quota"
+            f"{caller.name} may store {allowed} bytes, and would use {used + size} with this; delete something, or "
+            "ask the server's admin for a larger quota"
         )
