@@ -119,8 +119,8 @@ async function ask(form, method, address, headers, body) {
       continue;
     }
     const told = await answer.json().catch(() => ({}));
-    const again = LATER.includes(answer.status) || answer.headers.has("Upload-Offset");
-    throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { again });
+    const later = LATER.includes(answer.status) || answer.headers.has("Upload-Offset");
+    throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { again: later });
   }
 }
 
