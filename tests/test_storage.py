@@ -563,6 +563,39 @@ class TestFileStorage(StorageContract):
         path.unlink()
         assert [h.recording for h in storage.list_episodes()] == ["a copy.mcap"]
 
+    @pytest.mark.parametrize("name", ["a.mcap", "z.mcap"])
+    def test_an_episode_that_several_files_hold_is_listed_once(self, storage: FileStorage, name: str) -> None:
+        header = storage.store_benchmark(query())
+        made = [one.id for one in storage.record_episodes([episode(header.id) for _ in range(6)])]
+        path = next(storage.root.rglob("*.mcap"))
+        tupli_mcap.open(path).filter("episode in [2, 3]").save(storage.root / name)
+        with pytest.warns(UserWarning, match="holds episodes of .* again"):
+            assert sorted(h.id for h in storage.list_episodes()) == made
+        with pytest.warns(UserWarning, match="holds episodes of .* again"):
+            storage.reindex()
+            assert sorted(h.id for h in storage.list_episodes()) == made
+            assert storage.count_episodes() == 6
+        path.unlink()
+        assert [h.id for h in storage.list_episodes()] == made[2:4]
+
+    @pytest.mark.filterwarnings("ignore:.*again")
+    def test_a_copy_may_go_on(self, storage: FileStorage) -> None:
+        first, copy = storage.root / "a.mcap", storage.root / "b.mcap"
+        for path in (first, copy):
+            with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+                for _ in range(2):
+                    env.reset(seed=1)
+                    env.step(0)
+            if path == first:
+                shutil.copy(first, copy)
+                assert storage.count_episodes() == 2
+        assert storage.count_episodes() == 4
+        first.unlink()
+        assert storage.count_episodes() == 4
+        copy.write_bytes(b"nothing")
+        with pytest.warns(UserWarning, match="skipped a recording"):
+            assert storage.count_episodes() == 0
+
     def test_deleting_the_last_episode_removes_the_file(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id), episode(header.id)])

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import itertools
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, func, select
 
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.database import Database, MemoryDatabase
 from tupli_mcap.storage.catalog.rows import EpisodeRow
-from tupli_mcap.storage.catalog.tables import RECORDING
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -82,13 +82,25 @@ class Catalog:
             rows = connection.execute(select(*columns).order_by(RECORDING.c.path))
             return {unescape_text(path): RecordingStamp(*stamp) for path, *stamp in rows}
 
-    def copies(self, relpath: str, uuid: str) -> bool:
-        """Whether another recording of the same UUID is catalogued."""
-        same = select(RECORDING.c.id).where(
-            RECORDING.c.uuid == uuid, RECORDING.c.path != escape_text(relpath)
-        )
+    def listed_elsewhere(self, relpath: str, uuid: str) -> dict[int, str]:
+        """The numbers of the episodes that other recordings of the same UUID list, and the paths of those."""
+        listed = select(EPISODE.c.episode, RECORDING.c.path).join(RECORDING, of_one_recording())
+        others = RECORDING.c.uuid == uuid, RECORDING.c.path != escape_text(relpath)
         with self._read() as connection:
-            return connection.execute(same.limit(1)).first() is not None
+            return {number: unescape_text(path) for number, path in connection.execute(listed.where(*others))}
+
+    def forget_copies(self, relpaths: Collection[str]) -> bool:
+        """Removes the recordings that have the UUID of another one, if one of them is among the given ones; each may
+        hold episodes that the catalog lists of another. Returns whether there were some."""
+        uuids = select(RECORDING.c.uuid).group_by(RECORDING.c.uuid).having(func.count() > 1)
+        copies = select(RECORDING.c.uuid, RECORDING.c.path).where(RECORDING.c.uuid.in_(uuids))
+        with self._read() as connection:
+            found = [(uuid, unescape_text(path)) for uuid, path in connection.execute(copies)]
+        changed = {uuid for uuid, path in found if path in relpaths}
+        for uuid, path in found:
+            if uuid in changed:
+                self.remove_recording(path)
+        return bool(changed)
 
     def put_recording(
         self,

@@ -15,9 +15,8 @@ from tupli_mcap.cache import cache_dir
 from tupli_mcap.errors import FormatError, RecordingError, StorageError, warn
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.progress import progress
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ
+from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.atomic import os_errors
-from tupli_mcap.storage.base import episode_id
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.database import CatalogDamagedError, CatalogMovedError, CatalogUnusableError
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry
@@ -34,7 +33,8 @@ class SyncedCatalog:
     """The catalog of the recordings below a storage's root. Several processes may query and record at once.
 
     The files alone count. Before each query the catalog is updated with files that have appeared, changed (by size,
-    time stamps and inode) or gone; recordings that are being written are read anew each time. The catalog is in this
+    time stamps and inode) or gone; recordings that are being written are read anew each time. An episode that several
+    files hold is listed once: if one of them changes, all are read anew. The catalog is in this
     user's cache directory, or in memory: a query writes nothing below the root.
     """
 
@@ -97,6 +97,7 @@ class SyncedCatalog:
         def put() -> int:
             alone = self._catalog.alone()
             with alone, contextlib.suppress(CatalogMovedError), entry_of(self._root, relative) as entry:
+                self._catalog.forget_copies([relative])
                 return self._put(relative, entry)
             return -1  # the next query fills the new catalog
 
@@ -173,7 +174,10 @@ class SyncedCatalog:
             self._declare_keys()
             return True
         with self._catalog.alone():
-            self._follow(self._changes())
+            changes = self._changes()
+            if self._catalog.forget_copies(changes):
+                changes = self._changes()
+            self._follow(changes)
             self._declare_keys()
             return self._catalog.identity == self._synced
 
@@ -232,24 +236,24 @@ class SyncedCatalog:
             warn(f"skipped a recording: {why}")
 
     def _put(self, relative: str, entry: Entry) -> int:
-        """Catalogue a recording unless it is a copy; returns its number of episodes."""
-        if not self._is_copy(relative, entry):
+        """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
+        A recording that has no such episode is left out."""
+        listed = self._catalog.listed_elsewhere(relative, entry.uuid)
+        again = listed.keys() & set(entry.numbers)
+        if not again:
             put_entry(self._catalog, relative, entry)
+            return len(entry.numbers)
+        others = set(entry.numbers) - again
+        rows = [row for row in entry.rows if row.episode in others] if others else []
+        told = f"{self._root / relative} holds episodes of {listed[min(again)]} again"
+        if rows:
+            put_entry(self._catalog, relative, entry._replace(rows=rows))
+            warn(f"{told}; they are listed once, and the {len(rows)} others too")
+        else:
+            self._catalog.remove_recording(relative)
+            advice = "only that recording is listed; move or delete one of them"
+            self._skip(relative, entry.stamp, f"{told}; {advice}")
         return len(entry.numbers)
-
-    def _is_copy(self, relative: str, entry: Entry) -> bool:
-        """Whether another recording holds the first or the last episode of this one; such a copy is left out."""
-        if not self._catalog.copies(relative, entry.uuid):
-            return False
-        for number in {*entry.numbers[:1], *entry.numbers[-1:]}:
-            for header in self._catalog.episodes(FilterEQ(key="id", value=episode_id(entry.uuid, number))):
-                if header.recording != relative:
-                    self._catalog.remove_recording(relative)
-                    path, original = self._root / relative, f"holds episodes of {header.recording} again"
-                    advice = "only that recording is listed; move or delete one of them"
-                    self._skip(relative, entry.stamp, f"{path} {original}; {advice}")
-                    return True
-        return False
 
 
 def _is_exhausted(err: BaseException | None) -> bool:
