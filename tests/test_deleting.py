@@ -66,6 +66,18 @@ def test_of_a_file_and_back(runs: Path) -> None:
     assert sorted(path.name for path in runs.rglob("[!.]*")) == ["a.mcap", "b.mcap", "deep"]
 
 
+@pytest.mark.parametrize("which", ["best", "worst", "first", "last", "1", "3-4", "all", "1,first"])
+def test_of_a_directory_as_info_shows_it(runs: Path, which: str) -> None:
+    """A word is one of all its episodes, a number is that of each recording that has it."""
+    run("delete", str(runs / "a.mcap"), "--episodes", "3")
+    place = [str(runs), "--episodes", which]
+    shown = json.loads(run("info", *place, "--json"))["result"]["episodes"]
+    tagged = json.loads(run("tag", *place, "good=true", "--dry-run", "--json"))["result"]
+    deleted = json.loads(run("delete", *place, "--force", "--dry-run", "--json"))["result"]["episodes"]
+    assert shown == sum(len(one["episodes"]) for one in tagged) == len(deleted)
+    assert "runs has no episode 9; choose from 0 to 3" in run("delete", str(runs), "-e", "9", code=1)
+
+
 def test_of_a_copy_only(runs: Path) -> None:
     file, copy = runs / "a.mcap", runs / "copy.mcap"
     shutil.copyfile(file, copy)

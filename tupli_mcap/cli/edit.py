@@ -159,7 +159,7 @@ def tag(
             last = undo_annotation(file, dry_run=dry_run)
             done.append({"path": file, "episodes": last.episodes, "values": last.values})
     else:
-        chosen = numbers_in(files, episodes, filter_of(filter_text))
+        chosen = numbers_in(paths, episodes, filter_of(filter_text))
         if not chosen:
             why = "" if filter_text is None else f" that matches {filter_text}"
             raise RecordingError(f"there is no episode{why} in {', '.join(map(str, paths))}")

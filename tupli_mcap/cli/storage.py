@@ -183,8 +183,9 @@ def _delete_in_files(
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
 
+    paths = list(paths)
     files = [str(file) for given in paths for file in find_recordings(given)]
-    doomed = numbers_in(files, episodes, wanted)
+    doomed = numbers_in(paths, episodes, wanted)
     if wanted is not None and files and not doomed:
         len(dataset_of(files).filter(wanted))  # raises FilterError if no episode has such a key
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]

@@ -1,4 +1,4 @@
-"""Finds the episodes of one recording that a user means: by number, by return, by a filter.
+"""Finds the episodes of recordings that a user means: by number, by return, by a filter.
 
 Storages take long to import, and most files need none, so they are imported where they are needed.
 """
@@ -75,39 +75,60 @@ def named_positions(
         FilterError: the text is something else.
         RecordingError: there is no such episode, or none at all.
     """
-    why = "" if filter is None else f" that matches {filter}"
-    if not len(among):
-        raise RecordingError(f"{recording.name} has no episode{why}")
     rows = recording.index[among]
+    places = _named(recording.name, rows["episode"], rows["return"], text, filter)
+    return list(among[places].tolist())
+
+
+def _named(name: str, numbers: Any, returns: Any, text: str, filter: BaseFilter | None) -> list[int]:
+    """The places that a text names among episodes with these numbers and returns, in its order, each once."""
+    why = "" if filter is None else f" that matches {filter}"
+    if not len(numbers):
+        raise RecordingError(f"{name} has no episode{why}")
     chosen: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
-        places = places_of(item, text, rows["episode"], rows["return"])
+        places = places_of(item, text, numbers, returns)
         if not places:
             raise RecordingError(
-                f"{recording.name} has no episode {item}{why}; choose from {_range(rows['episode'])}"
+                f"{name} has no episode {item}{why}; choose from {_range(np.unique(numbers))}"
             )
-        chosen.update(dict.fromkeys(among[places].tolist()))
+        chosen.update(dict.fromkeys(places))
     return list(chosen)
 
 
 def numbers_in(
-    files: Iterable[str], text: str | None, filter: BaseFilter | None
+    places: Iterable[Path], text: str | None, filter: BaseFilter | None
 ) -> dict[tuple[str, str], list[int]]:
-    """The numbers of the episodes that a text names in each of some recordings, by its path and UUID; without a text,
-    of those that match the filter. Recordings without one are left out.
+    """The numbers of the episodes that a text names in some recordings and directories, by the recording's path and
+    UUID; without a text, of those that match the filter. Recordings without one are left out.
+
+    Of a directory, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number is that
+    of each recording which has it, as in `dataset.chosen.chosen_from`.
 
     Raises:
         FilterError: the text is something else, or the filter has an unknown key.
-        RecordingError: a recording has no such episode.
+        RecordingError: a recording or directory has no such episode.
     """
-    found = {}
-    for file in files:
-        with Recording(file) as recording:
-            among = candidates(recording, filter)
-            positions = among if text is None else named_positions(recording, among, text, filter)
-            if len(positions):
-                found[file, recording.uuid] = recording.index["episode"][positions].tolist()
-    return found
+    from tupli_mcap.storage.listing import find_recordings
+
+    found: dict[tuple[str, str], dict[int, None]] = {}
+    for place in places:
+        files: list[tuple[str, str]] = []  # of each episode
+        numbers: list[int] = []
+        returns: list[float] = []
+        for file in map(str, find_recordings(place)):
+            with Recording(file) as recording:
+                rows = recording.index[candidates(recording, filter)]
+            files += [(file, recording.uuid)] * len(rows)
+            numbers += rows["episode"].tolist()
+            returns += rows["return"].tolist()
+        if text is None:
+            chosen = list(range(len(files)))
+        else:
+            chosen = _named(str(place), np.array(numbers), np.array(returns), text, filter)
+        for at in chosen:
+            found.setdefault(files[at], {})[numbers[at]] = None
+    return {file: list(named) for file, named in found.items()}
 
 
 def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
