@@ -92,6 +92,8 @@ class Catalog:
     def forget_copies(self, relpaths: Collection[str]) -> bool:
         """Removes the recordings that have the UUID of another one, if one of them is among the given ones; each may
         hold episodes that the catalog lists of another. Returns whether there were some."""
+        if not relpaths:
+            return False
         uuids = select(RECORDING.c.uuid).group_by(RECORDING.c.uuid).having(func.count() > 1)
         copies = select(RECORDING.c.uuid, RECORDING.c.path).where(RECORDING.c.uuid.in_(uuids))
         with self._read() as connection:
