@@ -49,6 +49,7 @@ from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import NameRegistry, flatten_space
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.verify import verify_paths
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
 TOOL = Path(sys.executable).with_name("tupli-mcap")
@@ -887,6 +888,60 @@ def test_files_that_are_no_recording(here: Path, kind: str, command: tuple[str, 
 
 
 @pytest.mark.filterwarnings("ignore:.*has no journal")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "ls X",
+        "info X",
+        "episodes X",
+        "verify X",
+        "doctor X",
+        "plot X -o new.html",
+        "render X -o new.gif",
+        "view X --save new.rrd",
+        "tag X -e 0 good=true",
+        "edit X --name new",
+        "filter X 'return > 0' -o new.mcap",
+        "delete X -e 0",
+        "restore X",
+        "trim X --steps 1: -o new.mcap",
+        "merge X -o new.mcap",
+        "split X -o new.mcap --episodes 1",
+        "recover X",
+        "compact X",
+        "compact --storage X",
+        "push X",
+        "list-episodes --storage X",
+        "export --storage X -o new.mcap",
+        "import run.mcap --storage X",
+    ],
+)
+def test_an_empty_path_is_not_this_directory(command: str, cartpole: Path, here: Path) -> None:
+    shutil.copy(cartpole, here / "run.mcap")
+    before = (here / "run.mcap").read_bytes()
+    result = run(*("" if word == "X" else word for word in shlex.split(command)))
+    assert result.code == 1
+    assert "found an empty text" in result.out + result.err
+    assert [path.name for path in here.iterdir()] == ["run.mcap"]
+    assert (here / "run.mcap").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        FileStorage,
+        tupli_mcap.open,
+        lambda place: tupli_mcap.open([place]),
+        tupli_mcap.restore_episodes,
+        lambda place: list(verify_paths([place])),
+    ],
+)
+def test_in_python_neither(ask: Callable[[str], Any], cartpole: Path, here: Path) -> None:
+    shutil.copy(cartpole, here / "run.mcap")
+    with pytest.raises(tupli_mcap.TupliError, match="found an empty text"):
+        ask("")
+
+
 @pytest.mark.parametrize("kind", ["empty", "text", "truncated", "foreign"])
 def test_episodes_of_files_that_are_no_recording(here: Path, kind: str) -> None:
     make, line = BAD_FILES[kind]

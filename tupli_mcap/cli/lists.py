@@ -36,7 +36,7 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import fail, is_roomy
 from tupli_mcap.errors import bytes_of, did_you_mean, warn
-from tupli_mcap.remote import is_server, is_url
+from tupli_mcap.remote import is_server, is_url, path_of
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -166,7 +166,7 @@ def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]
 
         check_keys(wanted, EpisodeHeader)
         choose = partial(candidates, filter=wanted)
-    yield from list_recordings([source if is_url(source) else Path(source)], choose)
+    yield from list_recordings([source if is_url(source) else path_of(source)], choose)
 
 
 def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:

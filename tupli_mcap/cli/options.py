@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.errors import NotFoundError, StorageError, missing_extra
-from tupli_mcap.remote import is_server, is_url, shown
+from tupli_mcap.remote import is_server, is_url, path_of, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 
 
 def local_path(text: str | Path) -> Path:
-    """A path, for commands that take no URL; BadParameter for a URL. Typer passes defaults through it, too."""
+    """A path, for commands that take no URL. BadParameter for a URL, RecordingError for an empty text. Typer passes
+    defaults through it, too."""
     if isinstance(text, str) and is_url(text):
         raise typer.BadParameter(
             f"expected a path, found {shown(text)}; download the file, or save a part of it: "
             "tupli_mcap.open(url).save(path)"
         )
-    return Path(text)
+    return path_of(text)
 
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording.", parser=local_path)]
@@ -179,7 +180,7 @@ def any_storage(place: str | None) -> AbstractContextManager[TupliStorage]:
     if place is None:
         place = "" if DEFAULT_STORAGE.is_dir() else last_server()
         place = place or str(DEFAULT_STORAGE)
-    return server_at(place) if is_url(place) else open_storage(Path(place))
+    return server_at(place) if is_url(place) else open_storage(path_of(place))
 
 
 def server_at(url: str | None) -> TupliAPIClient:

@@ -20,7 +20,7 @@ import numpy as np
 from tupli_mcap.dataset.which import Positions, candidates, extreme, named_positions, places_of, positions_of
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, shown_name
+from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def _many_at(place: str) -> EpisodeSource | None:
     """The episodes of a server, a directory or a pattern; None for the place of one recording."""
     if is_server(place):
         return _stored(place)
-    path = Path(place)
+    path = path_of(place)
     if is_url(place) or not (path.is_dir() or (glob.has_magic(place) and not path.exists())):
         return None
     from tupli_mcap.dataset.sources import FilesSource

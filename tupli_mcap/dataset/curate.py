@@ -23,6 +23,7 @@ from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeabl
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
+from tupli_mcap.remote import path_of
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 
@@ -285,7 +286,7 @@ def restore_episodes(
 
     by_root: dict[Path, set[str]] = {}
     given = [places] if isinstance(places, str | os.PathLike) else places
-    for file in (file.absolute() for place in given for file in find_recordings(Path(place))):
+    for file in (file.absolute() for place in given for file in find_recordings(path_of(place))):
         root = storage_of(file)
         by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
     restored = []

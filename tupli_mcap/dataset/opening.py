@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import TypeAlias
 
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, place_of
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url
+from tupli_mcap.remote import is_server, is_url, path_of
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import find_recordings, is_storage
 
@@ -42,11 +41,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         return Dataset(FilesSource([place_of(source)]))
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
-        if not name:
-            raise DatasetError(
-                "expected a path, a pattern or a URL, found an empty text; name a directory as '.'"
-            )
-        folder = Path(name).expanduser()
+        folder = path_of(name).expanduser()
         if is_server(name):
             from tupli_mcap.storage import TupliAPIClient
 
@@ -72,8 +67,9 @@ def _files_in(source: Openable) -> Sequence[str]:
         return [place_of(source)]
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
-        if not is_url(name) and Path(name).expanduser().is_dir():
-            return [str(path) for path in find_recordings(Path(name).expanduser())]
+        folder = path_of(name).expanduser()
+        if not is_url(name) and folder.is_dir():
+            return [str(path) for path in find_recordings(folder)]
         return FilesSource(source).names
     raise DatasetError(
         f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"

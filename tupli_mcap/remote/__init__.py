@@ -6,11 +6,11 @@ plan:     which ranges are fetched in one request, and when a server should cut 
 source:   the file as a reader sees it: ranges are fetched ahead and cached; a changed object is an error.
 kept:     blocks that stay on disk for other processes, where the user wants it.
 patterns: the URLs that match a pattern such as "s3://bucket/runs/*.mcap".
-names:    recognises URLs, and removes secrets from them.
+names:    tells paths and URLs apart, and removes secrets from them.
 """
 
 from tupli_mcap.remote.failures import AUTHORITY, why
-from tupli_mcap.remote.names import is_server, is_url, is_web, shown, shown_name
+from tupli_mcap.remote.names import is_server, is_url, is_web, path_of, shown, shown_name
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
 from tupli_mcap.remote.plan import is_cut_cheaper
@@ -28,6 +28,7 @@ __all__ = [
     "matching",
     "open_store",
     "open_url",
+    "path_of",
     "shown",
     "shown_name",
     "watching",

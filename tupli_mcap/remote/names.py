@@ -1,9 +1,13 @@
-"""Recognises URLs, and removes secrets from them before they are shown."""
+"""Tells paths and URLs apart, and removes secrets from them before they are shown."""
 
 from __future__ import annotations
 
+import os
 import re
+from pathlib import Path
 from urllib.parse import urlsplit
+
+from tupli_mcap.errors import RecordingError
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
@@ -22,6 +26,13 @@ def is_web(url: str) -> bool:
 def is_server(name: str) -> bool:
     """True for the address of a server (`tupli-mcap serve`): of a web server, and not of a file on it."""
     return is_web(name) and not urlsplit(name).path.strip("/")
+
+
+def path_of(place: str | os.PathLike[str]) -> Path:
+    """A path as a user gives it. Raises RecordingError for an empty text, which `Path` takes for this directory."""
+    if not os.fspath(place):
+        raise RecordingError("expected a path, found an empty text; name a directory as '.'")
+    return Path(place)
 
 
 def shown(text: str) -> str:

@@ -20,7 +20,7 @@ from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.describe.description import spread_of, state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
-from tupli_mcap.remote import is_url, matching, shown_name
+from tupli_mcap.remote import is_url, matching, path_of, shown_name
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
@@ -195,7 +195,7 @@ def recordings_at(source: Path | str) -> Sequence[Path | str]:
     RecordingError if there are none."""
     if isinstance(source, str) and is_url(source):
         return matching(source)
-    path = Path(source)
+    path = path_of(source)
     if path.exists() or not glob.has_magic(str(path)):
         return find_recordings(path)
     if not (files := files_matching(path)):

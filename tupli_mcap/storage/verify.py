@@ -14,7 +14,7 @@ from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
-from tupli_mcap.remote import copied, is_server, is_url, matching, shown
+from tupli_mcap.remote import copied, is_server, is_url, matching, path_of, shown
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.bundles import carried_benchmark
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
@@ -36,7 +36,7 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
         if isinstance(given, str) and is_url(given):
             yield from map(_at_url, _found_at(given))
             continue
-        path = Path(given)
+        path = path_of(given)
         if path.is_dir():
             try:
                 found = find_recordings(path)

@@ -27,7 +27,7 @@ from tupli_mcap.cli.options import (
 from tupli_mcap.cli.output import counted, print_json, print_result
 from tupli_mcap.cli.terminal import say
 from tupli_mcap.errors import RecordingError, TupliError, bytes_of
-from tupli_mcap.remote import copied, is_url, shown
+from tupli_mcap.remote import copied, is_url, path_of, shown
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
@@ -63,7 +63,7 @@ def push(
     sends the recordings that could not be sent while they were recorded.
     """
     sources = sources or []
-    files = {source for source in sources if is_url(source) or Path(source).is_file()}
+    files = {source for source in sources if is_url(source) or path_of(source).is_file()}
     if (files or not sources) and (filter_text is not None or benchmark is not None):
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
     for source in sources:

@@ -63,8 +63,13 @@ class FileStorage(TupliStorage):
         *,
         storage_base_dir: str | os.PathLike[str] | None = None,
     ) -> None:
+        place = root if storage_base_dir is None else storage_base_dir
+        if not os.fspath(place):
+            raise StorageError(
+                "expected the directory of a storage, found an empty text; name this directory as '.'"
+            )
         # Absolute: the working directory may change while something is recorded.
-        self.root = Path(root if storage_base_dir is None else storage_base_dir).absolute()
+        self.root = Path(place).absolute()
         try:
             with os_errors("cannot use the storage", self.root), contextlib.suppress(FileNotFoundError):
                 os.scandir(self.root).close()
