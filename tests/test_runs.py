@@ -952,3 +952,18 @@ def test_a_damaged_run_does_not_keep_anybody_from_appending(tmp_path: Path) -> N
     add_attachments(path, {"run.json": ("application/json", b"no JSON")})
     record(path, 1, mode="a", name="two")
     assert [episode.seed for episode in Recording(path).episodes] == [0, 0]
+
+
+@pytest.mark.parametrize("name", ["one", None])
+def test_the_parts_of_a_run_are_one_run_again(name: str | None, tmp_path: Path) -> None:
+    record(tmp_path / "r.mcap", 6, name=name)
+    parts = [
+        part.path for part in tupli_mcap.split_recording(tmp_path / "r.mcap", tmp_path / "p.mcap", episodes=2)
+    ]
+    merged = tmp_path / "m.mcap"
+    merge_recordings(parts, merged)
+    assert len(Recording(merged).runs) == 1
+    assert edit_run(merged, name="x").name == "x"
+    edit_run(parts[0], name="edited")
+    merge_recordings(parts, merged, overwrite=True)
+    assert [run.name for run in Recording(merged).runs] == ["edited", name or "p_0001"]

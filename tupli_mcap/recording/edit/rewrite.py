@@ -183,6 +183,7 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
             recording.
     """
     runs: list[Run] = []
+    known: list[Run] = []  # as the files have them: names and times of files differ within a run
     places: list[int] = []
     annotations = Annotations()
     several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
@@ -190,10 +191,12 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
         said_runs = recording.runs if several else recording.recorded_runs.runs
         at = np.searchsorted(recording.index["episode"], rows["episode"]).tolist()
         for place in (recording.run_places[i] for i in at):
-            run = said_runs[place]
-            if run not in runs:
-                runs.append(run)
-            places.append(runs.index(run))
+            recorded = recording.recorded_runs.runs[place]
+            same = recorded if recorded.id else said_runs[place]
+            if same not in known:
+                known.append(same)
+                runs.append(said_runs[place])
+            places.append(known.index(same))
         kept = set(rows["episode"].tolist())
         for said in recording.annotations.said:
             numbers = [number + shift for number in said.episodes if number in kept]
