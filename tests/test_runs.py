@@ -967,3 +967,14 @@ def test_the_parts_of_a_run_are_one_run_again(name: str | None, tmp_path: Path) 
     edit_run(parts[0], name="edited")
     merge_recordings(parts, merged, overwrite=True)
     assert [run.name for run in Recording(merged).runs] == ["edited", name or "p_0001"]
+
+
+def test_compacted_it_keeps_its_edits(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 3, name="one")
+    edit_run(path, name="better")
+    tupli_mcap.open(path)[:1].delete()
+    with tupli_mcap.FileStorage(tmp_path) as storage:
+        assert storage.compact() > 0
+    record(path, 1, mode="a", name="one")  # as it was given
+    assert [run.name for run in Recording(path).runs] == ["better"]
+    assert undo_edit(path).name == "one"

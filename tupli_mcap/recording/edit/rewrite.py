@@ -205,7 +205,9 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
     spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
     found = {}
     if runs and runs != [Run()]:
-        carried = RecordedRuns(runs, spans if len(runs) > 1 else ())
+        first = parts[0][0].recorded_runs
+        edits = first.before if not several and runs == first.runs else ()
+        carried = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
         found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
     if annotations.said:
         found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, annotations.to_json())
