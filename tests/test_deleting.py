@@ -8,12 +8,14 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from test_signing import write_key
 from typer.testing import CliRunner
 from web_server import serving
 
 import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
+from tupli_mcap.recording.sign.sign import sign_recording
 
 
 def record(path: Path, episodes: int = 4) -> Path:
@@ -99,6 +101,15 @@ def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
     assert "restored 0 episodes" in run("restore", str(one))
     assert "rewrote 1 recording" in run("compact", str(other.parent))
     assert other.stat().st_size < sizes[1]
+
+
+def test_a_signature_goes_with_a_warning(runs: Path, tmp_path: Path) -> None:
+    file = runs / "a.mcap"
+    sign_recording(file, write_key(tmp_path / "id"))
+    run("delete", str(file), "--episodes", "0")
+    with pytest.warns(UserWarning, match=r"a\.mcap: its signature covers .* left out"):
+        FileStorage(runs).compact()
+    assert "signature.ed25519" not in Recording(file).attachments
 
 
 def test_merged_and_split_they_stay_deleted(runs: Path, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, warn
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -71,8 +71,10 @@ def rewrite_recording(
 def rewrite_in_place(
     source: Recording, path: Path, episodes: Sequence[int], *, compression: str = "zstd"
 ) -> None:
-    """Writes the file of `source`, whose lock the caller holds, anew with fewer episodes. Raises as
-    `rewrite_recording` does."""
+    """Writes the file of `source`, whose lock the caller holds, anew with fewer episodes. Warns if it removes a
+    signature; raises as `rewrite_recording` does."""
+    if SIGNATURE_NAME in source.attachments:
+        warn(f"{path}: its signature covers the episodes that are removed, and is left out")
     with replacing(path, held=True) as (fd, _):
         container = Container(fd, str(path), compression)
         write(source, container, kept_metadata(source), episodes, {}, signed=False)
