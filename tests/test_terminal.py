@@ -454,3 +454,11 @@ def test_one_module_prints() -> None:
     assert writers(Path(terminal_module.__file__).read_text())
     assert writers("import sys; sys.stderr.write('x')") == [(1, "stderr")]
     assert writers("from typer import echo as e") == [(1, "echo")]
+
+
+def test_a_closed_output_is_no_crash() -> None:
+    script = "from tupli_mcap.cli import main; main()"
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -c '{script}' version >&-"], stderr=subprocess.PIPE, check=True
+    )
+    assert done.stderr == b""

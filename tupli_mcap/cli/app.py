@@ -391,6 +391,9 @@ app.command("replay", cls=_Command, hidden=True)(replay.view)  # the earlier nam
 
 def main() -> None:
     """The console entry point."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the shell (`>&-`)
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - open until the end
     try:
         app()
     except KeyboardInterrupt:  # before a command began
