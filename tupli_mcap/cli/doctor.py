@@ -71,16 +71,11 @@ def doctor(
     """
     from tupli_mcap.dataset.chosen import chosen_from
     from tupli_mcap.doctor import Severity, examine
-    from tupli_mcap.doctor.examine import check_settings
 
     if list_checks:
         _print_checks(as_json)
         return
-    thresholds = _thresholds(settings or ())
-    try:
-        check_settings([*(check or ()), *(skip or ())], thresholds)
-    except RecordingError as err:
-        raise typer.BadParameter(str(err)) from err
+    thresholds = _thresholds(settings or (), [*(check or ()), *(skip or ())])
     wanted, sources = filter_of(filter_text), paths or ["."]
     with (
         nullcontext(sources) if episodes is None else chosen_from(sources, episodes, wanted) as chosen,
@@ -107,13 +102,20 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _thresholds(settings: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Thresholds by check, from texts such as `frozen-frames.frames=50`."""
+def _thresholds(settings: Sequence[str], checks: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Thresholds by check, from texts such as `frozen-frames.frames=50`. BadParameter if one is wrong, or the name of a
+    check."""
+    from tupli_mcap.doctor.examine import check_settings
+
     thresholds: dict[str, dict[str, Any]] = {}
     for setting in settings:
         name, value = pair_of(setting)
         check, _, threshold = name.partition(".")
         thresholds.setdefault(check, {})[threshold] = value
+    try:
+        check_settings(checks, thresholds)
+    except RecordingError as err:
+        raise typer.BadParameter(str(err)) from err
     return thresholds
 
 
