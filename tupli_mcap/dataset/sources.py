@@ -185,6 +185,7 @@ class FilesSource:
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         place = self._places.get(recording, recording)
+        # while that is the same file, the path as it was given: error messages show it
         as_given = not is_url(place) and os.path.abspath(recording) == place  # noqa: PTH100 - links stay
         return Recording(recording if as_given else place, cache_bytes=_CACHE_BYTES)
 

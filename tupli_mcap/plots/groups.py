@@ -108,6 +108,7 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 
 def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
     """The name of a group, with the parts of its key, and the settings, that differ from other groups of that name."""
+    # The settings are a set, of which only the differing ones are told.
     differing = [
         parts for parts in zip(*(one[:4] for one in (key, *keys)), strict=False) if len(set(parts)) > 1
     ]
@@ -134,6 +135,7 @@ def _seedless(one: Measured) -> tuple[Any, ...] | None:
 
 
 def _settings(metadata: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """Settings by keys such as `optimizer.lr`."""
     for key, value in metadata.items():
         if isinstance(value, dict):
             yield from _settings(value, f"{within}{key}.")
