@@ -324,3 +324,13 @@ class TestUpload:
             field.set_input_files([tmp_path / "ppo0.mcap", tmp_path / "cut.mcap"])
             refused = page.locator(".uploads .failed")
             expect(refused).to_contain_text("which this file lacks", timeout=PATIENCE)
+
+    def test_an_expired_token_is_renewed(self, chromium: Browser, server: str, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=1)
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            expired = {"status": 401, "json": {"detail": "the token has expired"}}
+            page.route("**/v1/uploads", lambda route: route.fulfill(**expired), times=1)
+            page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
+            expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
