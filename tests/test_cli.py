@@ -49,6 +49,7 @@ from tupli_mcap.schema import ArtifactMetadata, EpisodeMetadataCallback, RLTuple
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import NameRegistry, flatten_space
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.listing import by_run, listed_of
 from tupli_mcap.storage.verify import verify_paths
 from tupli_mcap.wrappers.rollout import load_policy, record_rollouts
 
@@ -471,6 +472,63 @@ class TestLook:
         (told,) = run("ls", "deep", "--json").json
         assert told["recording"] == "deep/b.mcap"
         assert (told["steps"], told["state"], told["error"]) == (200, "complete", None)
+
+    def test_ls_has_a_row_for_each_run(self, here: Path) -> None:
+        for name in ("a", "b"):
+            record_rollouts("CartPole-v1", f"{name}.mcap", name=name, steps=20_000, max_bytes=20_000)
+        files = [[str(path) for path in sorted(here.glob(f"{name}*.mcap"))] for name in "ab"]
+        names = [[Path(path).name for path in one] for one in files]
+        assert min(map(len, names)) > 2
+        dataset = tupli_mcap.open([*names[0]])
+        rows = run("ls", "--json").json
+        assert [(row["run"], row["recording"], row["paths"], row["files"]) for row in rows] == [
+            (name, f"{name}.mcap", one, len(one)) for name, one in zip("ab", names, strict=True)
+        ]
+        row = rows[0]
+        with Recording("a.mcap") as first:
+            assert (row["started"], row["state"]) == (first.run.started, "complete")
+        assert (row["episodes"], row["steps"]) == (len(dataset), 20_000)
+        assert row["return"] == pytest.approx(dataset.returns.mean())
+        assert row["size"] == sum(Path(name).stat().st_size for name in names[0])
+        header, line, _ = ok("ls").splitlines()
+        assert header.split()[:3] == ["RECORDING", "FILES", "RUN"]
+        assert line.split()[:3] == ["a.mcap", str(len(names[0])), "a"]
+        # the files in any order, and as a server lists them
+        assert run("ls", *reversed(names[0]), "--json").json == [row]
+        (served,) = by_run(listed_of(dataset.headers))
+        assert (served.files, served.episodes, served.steps, served.size) == (
+            len(names[0]), len(dataset), 20_000, None,
+        )  # fmt: skip
+        last = tupli_mcap.open(names[0][-1])
+        last[0].annotate(success=True)
+        (tagged,) = run("ls", *names[0], "--filter", "metadata.success", "--json").json
+        assert (tagged["paths"], tagged["episodes"], tagged["success"]) == ([names[0][-1]], 1, 1)
+        (tagged,) = run("ls", *names[0], "--columns", "success,paths", "--json").json
+        assert tagged == {"success": 1, "paths": names[0]}
+        assert f"100% of 1 {len(names[0])} " in " ".join(
+            ok("ls", *names[0], "--columns", "success,files,run").split()
+        )
+        assert "did you mean 'recording'" in fails("ls", "--columns", "file", code=2)
+
+    def test_ls_counts_no_episode_of_a_run_twice(self, here: Path) -> None:
+        record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)
+        names = sorted(path.name for path in here.glob("*.mcap"))
+        ok("filter", "a.mcap", "steps > 20", "-o", "best.mcap")
+        ok("merge", *names, "-o", "all.mcap")
+        ok("split", "a.mcap", "-o", "split.mcap", "--episodes", 100)
+        shutil.copytree(".", "copy")
+        for path in Path("copy").glob("[!a]*.mcap"):
+            path.unlink()
+        Path("copy/all.mcap").unlink()
+        rows = {row["recording"]: row["paths"] for row in run("ls", "--json").json}
+        assert rows == {
+            "a.mcap": names,
+            "all.mcap": ["all.mcap"],
+            "best.mcap": ["best.mcap"],
+            "copy/a.mcap": [f"copy/{name}" for name in names],
+            "split.mcap": sorted(path.name for path in here.glob("split*.mcap")),
+        }
+        assert len(rows["split.mcap"]) > 1
 
     def test_names_with_the_marks_of_urls(self, here: Path, cartpole: Path) -> None:
         (here / "lab#2").mkdir()

@@ -1,4 +1,4 @@
-"""The commands ls (lists recordings) and episodes (lists episodes)."""
+"""The commands ls (lists runs) and episodes (lists episodes)."""
 
 from __future__ import annotations
 
@@ -76,6 +76,7 @@ def _success(item: ListedRecording) -> str:
 
 _COLUMNS = {
     "recording": _listed_by(attrgetter("path"), Column("RECORDING", shrink="start"), short_ids),
+    "files": _listed_by(attrgetter("files"), Column("FILES", "right"), number),
     "run": _listed_by(attrgetter("name"), Column("RUN", shrink="end")),
     "environment": _listed_by(attrgetter("environment"), Column("ENVIRONMENT", shrink="end")),
     "episodes": _listed_by(attrgetter("episodes"), Column("EPISODES", "right"), number),
@@ -94,6 +95,7 @@ _COLUMNS = {
     "settings": _listed_by(
         attrgetter("settings"), Column("SETTINGS", shrink="end"), lambda s: pairs_of(s or {})
     ),
+    "paths": _listed_by(attrgetter("paths"), Column("PATHS", shrink="end"), ", ".join),
 }
 _MEANT = {
     "date": "started",
@@ -101,6 +103,8 @@ _MEANT = {
     "created": "started",
     "length": "steps",
     "name": "run",
+    "file": "recording",
+    "path": "recording",
     "metadata": "settings",
 }
 """Other names for columns, for a hint."""
@@ -120,18 +124,23 @@ def ls(
     columns: ColumnNames = None,
     as_json: Json = False,
 ) -> None:
-    """List recordings of files, directories and servers.
+    """List runs in files, directories and servers.
 
-    Columns are recording, run, environment, episodes, steps, return, success, started, size,
-    state, split, tags, settings. The last three appear only with --columns; settings are the
-    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all
-    episodes, also interrupted ones. STATE is `complete`; `recording` while a process writes
-    the file; `recovered` if its writer was killed or failed: all finished steps are there;
-    `incomplete` if its journal is missing, too. A server does not tell SIZE and STATE.
-    Deleted episodes are not counted. With --filter, only the episodes that match are counted.
+    A run that was recorded into several files is one row, and so is a file that has several
+    runs, or was made of other files. Columns are recording, files, run, environment,
+    episodes, steps, return, success, started, size, state, split, tags, settings, paths.
+    RECORDING is the first file of the run, FILES how many there are, if a run has several.
+    The last four appear only with --columns; settings are the metadata of the run, and
+    `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
+    ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
+    writer was killed or failed: all finished steps are there; `incomplete` if its journal is
+    missing, too. A server does not tell SIZE and STATE. Deleted episodes are not counted.
+    With --filter, only the episodes that match are counted.
     """
+    from tupli_mcap.storage.listing import by_run
+
     wanted = filter_of(filter_text)
-    listed = [item for source in paths or ["."] for item in _listed(source, wanted)]
+    listed = by_run(item for source in paths or ["."] for item in _listed(source, wanted))
     if wanted is not None and not listed:
         _check_there(paths or ["."], wanted)
     if sort is not None:
@@ -195,7 +204,7 @@ def _matching(dataset: Dataset, wanted: BaseFilter) -> Dataset:
 def _sorted(
     items: Sequence[ListedRecording], value: Callable[[ListedRecording], Any], *, descending: bool
 ) -> list[ListedRecording]:
-    """Sorts recordings by a value, texts after numbers; those without one, and unreadable ones, come last."""
+    """Sorts runs by a value, texts after numbers; those without one, and unreadable ones, come last."""
 
     def key(item: ListedRecording) -> Any:
         found = value(item)
@@ -230,7 +239,7 @@ def _text(value: Any) -> str:
 
 
 def _setting(path: Sequence[str], item: ListedRecording) -> Any:
-    """A value in the settings of a recording's run."""
+    """A value in the settings of a run."""
     found: Any = item.settings
     for part in path:
         found = found.get(part) if isinstance(found, dict) else None
@@ -241,13 +250,14 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
     roomy = is_roomy()
-    names = ["recording", *(["run", "environment"] * roomy), "episodes", "steps", "return"]
+    names = ["recording", *["files"] * any(item.files > 1 for item in items)]
+    names += [*(["run", "environment"] * roomy), "episodes", "steps", "return"]
     names += ["success"] * any(item.success is not None for item in items)
     return [_COLUMNS[name] for name in [*names, *(["started"] * roomy), "size", "state"]]
 
 
 def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
-    """The chosen columns of recordings, or all fields."""
+    """The chosen columns of runs, or all fields."""
     from tupli_mcap.schema.times import iso_utc
 
     if columns is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +19,13 @@ from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, Run
+from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.success import success_of
-from tupli_mcap.recording.describe.description import spread_of, state_of, successes
+from tupli_mcap.recording.describe.description import state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import is_url, matching, path_of, shown_name
 from tupli_mcap.schema import EpisodeHeader
+from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
@@ -56,24 +60,29 @@ class FoundRecording(NamedTuple):
     journal: bool
 
 
+_STATES = ("incomplete", "recording", "recovered", "complete", "")
+"""The states of recordings: of a run, the first of these that one of its recordings is in."""
+
+
 class ListedRecording(NamedTuple):
-    """Facts about a recording without its deleted episodes; `error` says why they are missing.
+    """Facts about a recording, or all those of a run, without its deleted episodes; `error` says why they are missing.
 
     Attributes:
-        return_mean: over its episodes, None if there are none; it leaves out the `return_nan` episodes whose return is
-            NaN, and is NaN if there is no other.
-        size: of the file (bytes); None if unknown.
+        paths: of the recording; of a run, those of its recordings in their order in time.
+        return_sum: over its episodes, without the `return_nan` whose return is NaN.
+        size: of the files (bytes); None if unknown.
         state: see `tupli_mcap.recording.describe.description.state_of`.
         name, environment, started (ISO 8601 in UTC), split, tags: of its run.
         settings: the metadata of its run; of several, what they have in common.
-        success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
-            none do.
+        succeeded: how many episodes did, of the `success_known` whose metadata say it.
+        run_id: the run that it is a part of; empty if it has several, or was made of other recordings.
+        span: when the first of its episodes ended, and the last (ISO 8601 in UTC); empty texts without an episode.
     """
 
-    path: str
+    paths: tuple[str, ...]
     episodes: int = 0
     steps: int = 0
-    return_mean: float | None = None
+    return_sum: float = 0.0
     return_nan: int = 0
     size: int | None = 0
     created_ns: int = 0
@@ -83,11 +92,36 @@ class ListedRecording(NamedTuple):
     name: str = ""
     environment: str = ""
     started: str = ""
-    success: float | None = None
+    succeeded: int = 0
     success_known: int = 0
     split: str = ""
     tags: tuple[str, ...] = ()
     settings: dict[str, Any] | None = None
+    run_id: str = ""
+    span: tuple[str, str] = ("", "")
+
+    @property
+    def path(self) -> str:
+        """The first of the paths."""
+        return self.paths[0]
+
+    @property
+    def files(self) -> int:
+        """The number of recordings."""
+        return len(self.paths)
+
+    @property
+    def return_mean(self) -> float | None:
+        """The mean return; None without an episode, NaN if all returns are."""
+        if not self.episodes:
+            return None
+        known = self.episodes - self.return_nan
+        return self.return_sum / known if known else math.nan
+
+    @property
+    def success(self) -> float | None:
+        """The share of successes; None if no episode says it."""
+        return self.succeeded / self.success_known if self.success_known else None
 
 
 class Compactable(NamedTuple):
@@ -182,7 +216,7 @@ def list_recordings(
         try:
             found = recordings_at(source)
         except TupliError as err:
-            yield ListedRecording(shown_name(str(source)), error=str(err))
+            yield ListedRecording((shown_name(str(source)),), error=str(err))
             continue
         for file in found:
             listed = _listed(file, source if isinstance(source, Path) and source.is_dir() else None, choose)
@@ -212,26 +246,70 @@ def files_matching(pattern: Path) -> list[Path]:
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
     """The recordings that episodes of a storage are in, as far as their headers tell; size and state are unknown."""
     for name, same in by_recording(headers).items():
-        returns = spread_of(np.array([header.episode_return for header in same], np.float64))
+        returns = np.array([header.episode_return for header in same], np.float64)  # None becomes NaN
         said = [found for header in same if (found := success_of(header.metadata)) is not None]
-        run = same[0].run
+        run, runs = same[0].run, {str(header.run.get("id") or "") for header in same}
         yield ListedRecording(
-            path=name,
+            paths=(name,),
             episodes=len(same),
             steps=sum(header.n_tuples for header in same),
-            return_mean=None if returns is None else returns.mean,
-            return_nan=0 if returns is None else returns.nan,
+            **_return_facts(returns),
             size=None,
             benchmark_id=same[0].benchmark_id,
             name=", ".join(dict.fromkeys(str(header.run.get("name", "")) for header in same)),
             environment=str(run.get("environment") or ""),
             started=str(run.get("started") or ""),
-            success=sum(said) / len(said) if said else None,
+            succeeded=sum(said),
             success_known=len(said),
             split=str(run.get("split") or ""),
             tags=tuple(map(str, run.get("tags") or ())),
             settings=_shared(header.run.get("metadata") or {} for header in same),
+            run_id=runs.pop() if len(runs) == 1 else "",
+            span=(min(ends := [header.created_at for header in same]), max(ends)),
         )
+
+
+def by_run(items: Iterable[ListedRecording]) -> list[ListedRecording]:
+    """One item for each run, in the order of their first recordings; what has no `run_id` stays as it is.
+
+    A run records into one file after the other, so recordings of it that overlap in time are copies: they are joined
+    with other rows, for no row may count an episode twice.
+    """
+    rows: list[list[ListedRecording]] = []
+    runs: dict[str, list[list[ListedRecording]]] = {}
+    for item in items:
+        same = runs.setdefault(item.run_id, []) if item.run_id else []
+        row = next((row for row in same if not any(_overlap(item.span, part.span) for part in row)), [])
+        if not row:
+            rows.append(row)
+            same.append(row)
+        row.append(item)
+    return [_joined(row) for row in rows]
+
+
+def _overlap(a: tuple[str, str], b: tuple[str, str]) -> bool:
+    return "" < a[0] <= b[1] and b[0] <= a[1]
+
+
+def _joined(parts: Sequence[ListedRecording]) -> ListedRecording:
+    parts = sorted(parts, key=attrgetter("span"))
+    sizes = [part.size for part in parts if part.size is not None]
+    counts = ("episodes", "steps", "return_sum", "return_nan", "succeeded", "success_known")
+    sums: dict[str, Any] = {name: sum(map(attrgetter(name), parts)) for name in counts}
+    return parts[0]._replace(
+        paths=tuple(part.path for part in parts),
+        size=sum(sizes) if len(sizes) == len(parts) else None,
+        state=min((part.state for part in parts), key=_STATES.index),
+        started=min((part.started for part in parts if part.started), default=""),
+        **sums,
+    )
+
+
+def _return_facts(returns: Array) -> dict[str, Any]:
+    """`return_sum` and `return_nan` of the returns of episodes (float64)."""
+    known = returns[~np.isnan(returns)]
+    with np.errstate(invalid="ignore", over="ignore"):  # of infinite returns
+        return {"return_sum": float(known.sum()), "return_nan": len(returns) - len(known)}
 
 
 def compactable(root: Path) -> list[Compactable]:
@@ -280,15 +358,14 @@ def _listed(
             else:
                 kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
             rows = recording.index[kept]
-            returns = spread_of(rows["return"])
+            ends = rows["end_time"]
             said, runs = successes(recording, kept), _runs_of(recording, kept)
             run = runs[0]
             return ListedRecording(
-                path=name,
+                paths=(name,),
                 episodes=len(rows),
                 steps=int(rows["length"].sum()),
-                return_mean=None if returns is None else returns.mean,
-                return_nan=0 if returns is None else returns.nan,
+                **_return_facts(rows["return"]),
                 size=recording.size,
                 created_ns=recording.created_ns,
                 benchmark_id=recording.benchmark_id,
@@ -296,11 +373,13 @@ def _listed(
                 name=", ".join(dict.fromkeys(run.name for run in runs)),
                 environment=run.environment,
                 started=run.started,
-                success=sum(said) / len(said) if said else None,
+                succeeded=sum(said),
                 success_known=len(said),
                 split=run.split,
                 tags=run.tags,
                 settings=_shared(each.metadata for each in runs),
+                run_id=run.id if len(runs) == 1 and MADE_OF_NAME not in recording.attachments else "",
+                span=(iso_utc(int(ends.min())), iso_utc(int(ends.max()))) if len(ends) else ("", ""),
             )
     except (TupliError, OSError) as err:
-        return ListedRecording(name, error=str(err))
+        return ListedRecording((name,), error=str(err))
