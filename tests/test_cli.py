@@ -611,6 +611,29 @@ class TestLook:
         assert "info.name" not in out
         facts = json.loads(ok("info", "i.mcap", "--json", "--episodes", "1,2"))["result"]
         assert (facts["info_keys"], facts["seeds"]) == (["logp", "name", "step"], 1)
+        with RecordEpisodes(env, here / "j.mcap", step_callback=lambda step: {"force": 1}) as recorded:
+            recorded.reset(seed=1)
+            recorded.step(0)
+        assert re.search(r"^infos +force, logp, name, step$", ok("info", "."), re.M)
+        assert run("info", ".", "--filter", "steps = 1", "--json").json["info_keys"] == ["force"]
+
+    def test_info_of_several_is_of_one_dataset(self, here: Path, cartpole: Path) -> None:
+        shutil.copy(cartpole, here / "a.mcap")
+        record_rollouts("CartPole-v1", "deep/b.mcap", steps=50, seed=9)
+        below, several, pattern = (
+            run("info", *sources, "--json").json
+            for sources in ((".",), ("a.mcap", "deep"), ("**/*.mcap", "a.mcap"))
+        )
+        assert (several["episodes"], several["steps"]) == (len(tupli_mcap.open(".")), 250)
+        assert (below.pop("path"), below.pop("paths")) == (".", ["."])
+        assert (several.pop("path"), several.pop("paths")) == (None, ["a.mcap", "deep"])
+        assert several == below
+        assert pattern["episodes"] == below["episodes"]  # each counts once
+        out = ok("info", "a.mcap", "deep/b.mcap", "--episodes", "0")
+        assert re.search(r"^sources +a\.mcap, deep/b\.mcap\nrecordings +2$", out, re.M)
+        assert re.search(r"^episodes +2 ", out, re.M)
+        assert ok("info", "**/*.mcap").startswith("pattern ")
+        assert fails("info", "a.mcap", "gone.mcap").startswith("gone.mcap does not exist")
 
     def test_info_of_infos_whose_keys_are_no_texts(self, here: Path) -> None:
         keys: dict[Any, float] = {1: 2.0, "x": 1.0, 0: 3.0, None: 4.0}

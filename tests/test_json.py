@@ -140,6 +140,7 @@ info FILE: info some.mcap --filter steps>20
 info FILE: info signed.mcap
 info DIRECTORY: info lab
 info DIRECTORY: info runs --episodes best
+info DIRECTORY: info a.mcap lab
 episodes: episodes lab
 doctor: doctor nan.mcap bad.mcap a.mcap | 1
 doctor --list: doctor --list

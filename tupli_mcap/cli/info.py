@@ -1,14 +1,11 @@
-"""The command info: shows what is in a recording, or in all recordings of a directory."""
+"""The command info: shows what is in a recording, or in several, such as those of a directory."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
-
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, Sources, dataset_of, filter_of
 from tupli_mcap.cli.output import (
     Column,
     counted,
@@ -25,12 +22,13 @@ from tupli_mcap.cli.output import (
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
 from tupli_mcap.errors import RecordingError, bytes_of
-from tupli_mcap.remote import is_pattern, is_server, is_url, shown_name
+from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
+    from tupli_mcap.dataset import Dataset
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.describe.description import RecordingDescription, Spread
     from tupli_mcap.recording.describe.series import Series
@@ -43,22 +41,43 @@ _OTHERS = 44  # columns of a line that are not blocks
 _LONGEST_NAME = 24
 
 
-def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *, as_json: bool) -> None:
-    """Prints facts about the recordings of a directory or a server, or about the chosen episodes of them."""
-    from tupli_mcap import open as open_dataset
+def _dataset(sources: Sequence[str], episodes: str | None, wanted: BaseFilter | None) -> Dataset:
+    """The chosen episodes of several recordings. RecordingError for a directory without any."""
     from tupli_mcap.dataset.chosen import chosen_ids
+    from tupli_mcap.storage.listing import recordings_at
+
+    for source in sources:
+        if not is_url(source) and not recordings_at(source):
+            raise RecordingError(f"{source} is a directory; expected a recording (.mcap) in it, found none")
+    dataset = dataset_of(sources)
+    if episodes is not None:
+        ids = chosen_ids(sources, episodes, wanted)
+        return dataset[[header.id in ids for header in dataset.headers]]
+    return dataset if wanted is None else dataset.filter(wanted)
+
+
+def _info_keys(dataset: Dataset) -> list[str]:
+    """The keys of infos in its recordings, each of which gets a share of the sample."""
+    from tupli_mcap.dataset.chosen import subjects_of
+    from tupli_mcap.recording.describe.description import info_keys
+    from tupli_mcap.recording.describe.series import MOST_INFOS
+
+    subjects, found = list(subjects_of(dataset, None)), set[str]()
+    for subject in subjects:
+        with subject.open() as recording:
+            found.update(info_keys(recording, subject.choose(recording), MOST_INFOS // len(subjects)))
+    return sorted(found)
+
+
+def _print_many(
+    sources: Sequence[str], episodes: str | None, wanted: BaseFilter | None, *, as_json: bool
+) -> None:
+    """Prints facts about the recordings of a directory, a server, or several of those, or about the chosen episodes."""
     from tupli_mcap.recording.about.success import success_of, success_text
     from tupli_mcap.recording.describe.description import spread_of
-    from tupli_mcap.storage.listing import find_recordings
 
-    if not is_url(source) and not find_recordings(Path(source)):
-        raise RecordingError(f"{source} is a directory; expected a recording (.mcap) in it, found none")
-    dataset = open_dataset(source)
-    if episodes is not None:
-        ids = chosen_ids(source, episodes, wanted)
-        dataset = dataset[[header.id in ids for header in dataset.headers]]
-    elif wanted is not None:
-        dataset = dataset.filter(wanted)
+    dataset, names = _dataset(sources, episodes, wanted), [*map(shown_name, sources)]
+    are_here = not any(map(is_url, sources))  # elsewhere, nothing is opened
     headers = dataset.headers
     said = [found for header in headers if (found := success_of(header.metadata)) is not None]
     ends: dict[str, int] = {}
@@ -72,21 +91,23 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
     )
     keys = sorted({key for header in headers for key in header.metadata})
     settings = sorted({key for header in headers for key in header.run.get("metadata", {})})
+    infos = _info_keys(dataset) if are_here else []
     lengths, returns = spread_of(dataset.lengths), spread_of(dataset.returns)
     rate = sum(said) / len(said) if said else None
     if as_json:
         print_json(
             {
-                "path": shown_name(source), "recordings": recordings, "runs": runs, "environments": environments,
-                "episodes": len(headers), "ends": ends, "steps": dataset.n_steps, "lengths": lengths,
-                "returns": returns, "success": rate, "success_known": len(said), "seeds": len(seeds),
-                "metadata_keys": keys, "setting_keys": settings, "made_of": None if is_url(source) else dataset.made_of,
+                "path": names[0] if len(names) == 1 else None, "paths": names, "recordings": recordings,
+                "runs": runs, "environments": environments, "episodes": len(headers), "ends": ends,
+                "steps": dataset.n_steps, "lengths": lengths, "returns": returns, "success": rate,
+                "success_known": len(said), "seeds": len(seeds), "metadata_keys": keys, "info_keys": infos,
+                "setting_keys": settings, "made_of": dataset.made_of if are_here else None,
             }
         )  # fmt: skip
         return
     ended = ", ".join(f"{count:,} {name}" for name, count in ends.items())
     lines = {
-        "server" if is_server(source) else "pattern" if is_url(source) else "directory": shown_name(source),
+        _kind(sources): _some(names),
         "recordings": number(recordings),
         "runs": _some(runs),
         "settings": _some(settings),
@@ -97,8 +118,17 @@ def _print_many(source: str, episodes: str | None, wanted: BaseFilter | None, *,
         "success": "" if rate is None else success_text(rate, len(said), len(headers)),
         "seeds": f"{number(len(seeds))} different" if seeds else "",
         "metadata": _some(keys),
+        "infos": _some(infos),
     }
     print_facts([(name, text) for name, text in lines.items() if text])
+
+
+def _kind(sources: Sequence[str]) -> str:
+    if len(sources) > 1:
+        return "sources"
+    if is_server(sources[0]):
+        return "server"
+    return "directory" if not is_url(sources[0]) and path_of(sources[0]).is_dir() else "pattern"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -106,34 +136,32 @@ def _some(names: Sequence[str]) -> str:
 
 
 def info(
-    source: Annotated[
-        str,
-        typer.Argument(metavar="PATH|URL", help="A recording, a directory, a server, or a pattern of URLs."),
-    ],
+    paths: Sources,
     episodes: Episodes = None,
     filter_text: FilterText = None,
     as_json: Json = False,
 ) -> None:
-    """Show what is in a recording, a directory or a server.
+    """Show what is in a recording, or in several together.
 
     For a recording: its run, spaces, benchmark, returns and lengths of episodes,
     distributions of rewards, actions, states and infos, channels and attachments.
     Distributions and keys of infos of a long recording come from a sample of its steps; for
-    a URL, they are left out. For a directory: its runs, environments, episodes, and the
-    keys of settings and metadata. --episodes and --filter choose episodes; channels, attachments and size are those
-    of the whole file.
+    a URL, they are left out. For several recordings: their runs, environments, episodes, and
+    the keys of settings, metadata and infos. --episodes and --filter choose episodes; channels,
+    attachments and size are those of the whole file.
     """
     import numpy as np
 
     from tupli_mcap.dataset.which import candidates, named_positions
     from tupli_mcap.recording import Recording
     from tupli_mcap.recording.describe.description import describe
+    from tupli_mcap.storage.listing import is_of_several
 
     wanted = filter_of(filter_text)
-    if is_server(source) or (is_pattern(source) if is_url(source) else Path(source).is_dir()):
-        _print_many(source, episodes, wanted, as_json=as_json)
+    if len(paths) > 1 or is_of_several(paths[0]):
+        _print_many(paths, episodes, wanted, as_json=as_json)
         return
-    with Recording(source) as recording:
+    with Recording(paths[0]) as recording:
         positions = candidates(recording, wanted)  # without deleted episodes
         if episodes is not None or wanted is not None:
             which = "all" if episodes is None else episodes

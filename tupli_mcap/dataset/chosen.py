@@ -6,7 +6,6 @@ Storages take long to import, and most files need none, so they are imported whe
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -20,7 +19,7 @@ import numpy as np
 from tupli_mcap.dataset.which import Positions, candidates, extreme, named_positions, places_of, positions_of
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, path_of, shown_name
+from tupli_mcap.remote import is_server, is_url, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 
 if TYPE_CHECKING:
@@ -212,11 +211,11 @@ def _many_at(place: str) -> EpisodeSource | None:
     """The episodes of a server, a directory or a pattern; None for the place of one recording."""
     if is_server(place):
         return _stored(place)
-    path = path_of(place)
-    if is_url(place) or not (path.is_dir() or (glob.has_magic(place) and not path.exists())):
-        return None
     from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.storage.listing import recordings_at
+    from tupli_mcap.storage.listing import is_of_several, recordings_at
+
+    if is_url(place) or not is_of_several(place):
+        return None
 
     files = [Path(file) for file in recordings_at(place)]
     if not files:

@@ -23,7 +23,7 @@ from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.describe.description import state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
-from tupli_mcap.remote import is_url, matching, path_of, shown_name
+from tupli_mcap.remote import is_pattern, is_server, is_url, matching, path_of, shown_name
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.base import by_recording
@@ -230,11 +230,19 @@ def recordings_at(source: Path | str) -> Sequence[Path | str]:
     if isinstance(source, str) and is_url(source):
         return matching(source)
     path = path_of(source)
-    if path.exists() or not glob.has_magic(str(path)):
+    if path.is_dir() or not is_of_several(str(source)):
         return find_recordings(path)
     if not (files := files_matching(path)):
         raise RecordingError(f"no file matches {str(path)!r}; give the path of a recording (.mcap)")
     return files
+
+
+def is_of_several(source: str) -> bool:
+    """Whether it is a server, a directory or a pattern, and not the place of one recording."""
+    if is_url(source):
+        return is_server(source) or is_pattern(source)
+    path = path_of(source)
+    return path.is_dir() or (glob.has_magic(str(path)) and not path.exists())
 
 
 def files_matching(pattern: Path) -> list[Path]:

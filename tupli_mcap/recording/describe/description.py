@@ -19,7 +19,7 @@ from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents
-from tupli_mcap.recording.describe.series import sampled_infos
+from tupli_mcap.recording.describe.series import MOST_INFOS, sampled_infos
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
 from tupli_mcap.spaces.labels import Labels, element_names, short_path
@@ -148,7 +148,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         made_of=recording.made_of,
         annotations=_annotations(recording, rows),
         metadata_keys=_metadata_keys(recording, positions),
-        info_keys=_info_keys(recording, positions),
+        info_keys=info_keys(recording, positions),
         seeds=len({seeds[i] for i in positions.tolist()} - {None}),
         success=sum(said) / len(said) if said else None,
         success_known=len(said),
@@ -203,9 +203,10 @@ def _metadata_keys(recording: Recording, positions: Array) -> list[str]:
     return sorted({key for text in texts for key in jsonvalue.loads(text)})
 
 
-def _info_keys(recording: Recording, positions: Array) -> list[str]:
+def info_keys(recording: Recording, positions: Array, most: int = MOST_INFOS) -> list[str]:
+    """The keys of infos of some episodes, of a sample of about `most` of them; none if they are damaged."""
     with contextlib.suppress(FormatError):  # `verify` names damage; the other facts are known all the same
-        return sorted({key for info in sampled_infos(recording, positions) for key in info})
+        return sorted({key for info in sampled_infos(recording, positions, most) for key in info})
     return []
 
 

@@ -22,6 +22,8 @@ from tupli_mcap.spaces.leaves import Leaf
 READ_BYTES = 4 << 20
 """Bytes of steps that are read at most; of longer recordings, steps at a few places are read."""
 _PLACES, _AT_EACH = 16, 256
+MOST_INFOS = _PLACES * _AT_EACH
+"""Infos that are read at most."""
 _VARIABLE_PLACES, _VARIABLE_AT_EACH = 8, 32  # steps of variable size are decoded one by one
 _FIELDS = ("states", "actions", "rewards")
 _MOST_REWARDS, _MOST_STATES, _MOST_ACTIONS, _MOST_INFOS = 2, 12, 6, 6
@@ -97,9 +99,9 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
     return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden)
 
 
-def sampled_infos(recording: Recording, positions: Array) -> list[dict[str, Any]]:
-    """Infos of steps of these episodes, by the texts of their keys: all, or of a long recording some at even
-    distances; none of a URL."""
+def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS) -> list[dict[str, Any]]:
+    """Infos of steps of these episodes, by the texts of their keys: all, or of a recording with more than `most` or
+    with large ones some at even distances; none of a URL."""
     file = recording.file
     channel = file.topics.get(INFO)
     total = 0 if channel is None or recording.path is None else file.store.count(channel)
@@ -107,7 +109,7 @@ def sampled_infos(recording: Recording, positions: Array) -> list[dict[str, Any]
         return []
     table = file.contents.table
     size = int(table["uncompressed"][table["channel"] == channel].sum())
-    each = max(1, min(_AT_EACH, READ_BYTES * total // max(1, size) // _PLACES))
+    each = max(1, min(most, READ_BYTES * total // max(1, size)) // _PLACES)
     places, each = (1, total) if total <= _PLACES * each else (_PLACES, each)
     codec = InfoCodec.from_metadata(file.contents.channels[channel].metadata)
     wanted = set(recording.index["episode"][positions].tolist())
