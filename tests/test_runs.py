@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 import tupli_mcap
 from tupli_mcap import (
+    EpisodeWriter,
     FileStorage,
     FormatError,
     RecordEpisodes,
@@ -533,6 +534,84 @@ def test_success_is_understood(key: str, record_info: bool, tmp_path: Path) -> N
     assert listed["success"] == 0.75
     assert "75%" in command("ls", str(path))
     assert "75%" in command("info", str(path))
+
+
+FLAGS = [
+    (np.array([True]), True), (np.array(1.0), True), (np.array([[0]]), False), (np.float32(1), True), (1, True),
+    (0.7, None), (np.array([1, 1]), None), (np.array([0.5]), None), ("yes", None),
+]  # fmt: skip
+
+
+class Telling(Winning):
+    """Its episodes end with these flags, one after the other; each has a step before that says nothing."""
+
+    def __init__(self, flags: list[Any]) -> None:
+        super().__init__()
+        self.left, self.steps = flags * 2, 0
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        ends = self.steps % 2 == 0
+        return 1, 1.0, ends, False, {self.key: self.left.pop(0)} if ends else {}
+
+
+@pytest.mark.filterwarnings("always")
+@pytest.mark.parametrize("kind", ["plain", "infos", "sb3", "vector", "writer", "writer of many"])
+def test_what_counts_as_success(kind: str, tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    path, flags = tmp_path / "r.mcap", [flag for flag, _ in FLAGS]
+    if kind.startswith("writer"):
+        with EpisodeWriter(path, Winning.observation_space, Winning.action_space) as writer:
+            for flag in flags:
+                writer.begin()
+                writer.step(0, 1, 1.0)
+                if kind == "writer":
+                    writer.step(0, 1, 1.0, True, info={"success": flag})
+                else:
+                    zero = np.zeros(1, np.int64)
+                    writer.steps(zero, zero, np.ones(1), np.ones(1, bool), infos=[{"success": flag}])
+                writer.end(1)
+    elif kind == "vector":
+        # a vector environment makes one array of what its sub-environments say
+        for flag in flags:
+            made = gym.vector.SyncVectorEnv([lambda flag=flag: Telling([flag])] * 2)  # type: ignore[misc]
+            with RecordVectorEpisodes(made, path, mode="a") as recorded:
+                recorded.reset()
+                recorded.step(np.zeros(2, np.int64))
+                recorded.step(np.zeros(2, np.int64))
+    else:
+        env: Any
+        if kind == "sb3":
+            dummy = pytest.importorskip("stable_baselines3.common.vec_env").DummyVecEnv
+            from tupli_mcap.sb3 import VecRecordEpisodes
+
+            env = VecRecordEpisodes(dummy([lambda: Telling(flags)]), path)
+        else:
+            env = RecordEpisodes(Telling(flags), path, record_info=kind == "infos")
+        env.reset()
+        for i in range(2 * len(flags)):
+            env.step(np.array([0]) if kind == "sb3" else 0)
+            if i % 2 and kind != "sb3":
+                env.reset()
+        env.close()
+    found = [episode.metadata for episode in Recording(path).episodes if not episode.env]
+    assert found == [{} if said is None else {"success": said} for _, said in FLAGS]
+    told = [str(one.message) for one in recwarn if "success" in str(one.message)]
+    assert len(told) == (4 if kind == "vector" else 1)  # one a recorder
+    assert told[0].startswith(f"{path}: expected True, False, 0, 1, or an array of one of these in the info")
+    assert "0.7" in told[0] and "; the episode gets no success" in told[0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_warning_that_is_an_error_loses_nothing(tmp_path: Path) -> None:
+    with RecordEpisodes(Telling([0.7, True]), tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+        with pytest.raises(UserWarning, match="is_success=0.7"):
+            env.step(0)
+        env.reset()
+        env.step(0)
+        env.step(0)
+    assert [episode.metadata for episode in Recording(env.path).episodes] == [{}, {"success": True}]
 
 
 @pytest.mark.parametrize("kind", ["single", "sb3", *gym.vector.AutoresetMode])

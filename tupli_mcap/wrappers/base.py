@@ -15,6 +15,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
@@ -102,6 +103,7 @@ class EpisodeWrapper(Recorder):
         env = self.env
         options.check_rendering(getattr(env, "render_mode", None))
         self._infos = InfoRecorder(options.record_info) if options.has_infos else None
+        self._check_flag = FlagCheck()
         self._step_callback = options.step_callback
         captured = Captured(env, options.capture_env, options.attachments)
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)

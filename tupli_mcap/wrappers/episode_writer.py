@@ -19,6 +19,7 @@ from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recording import Recording
@@ -103,6 +104,7 @@ class EpisodeWriter(Recorder):
         self._spaces, self._num_envs = spaces, None if num_envs is None else int(num_envs)
         self.rotation = Rotation(path, options, format_version(spaces, image_format), name or "")
         self._work = Work()
+        self._check_flag = FlagCheck()
         self._discarded: dict[Path, list[int]] = {}
         self._compression, self._is_plain = compression, options.is_plain
         writer = self.rotation.open_first()
@@ -207,6 +209,8 @@ class EpisodeWriter(Recorder):
             self._writer.stop(err)
             raise
         work.finish()
+        if entries and (terminal or timeout):
+            self._check_flag(self.path, entries)
 
     def steps(
         self,
@@ -244,6 +248,8 @@ class EpisodeWriter(Recorder):
                 stream.put_many(states, actions, rewards, *flags, entries)
                 self._writer.flush_if_due()
                 self._writer.sync_step()
+            if entries and stream.over is not None:
+                self._check_flag(self.path, entries[-1])
 
     def episodes(
         self,

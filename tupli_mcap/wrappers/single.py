@@ -17,7 +17,7 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.about.success import success_of, with_success
+from tupli_mcap.recording.about.success import names_success, with_success
 from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import (
@@ -52,7 +52,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         mode: if the file exists, "x" refuses, "w" replaces it, and "a" continues it. "a" also makes a missing file.
         metadata_callback: called with every step (an RLTuple); the dict it returns at the last one is the episode's
             metadata. If it has a `reset()`, that is called before each episode. If the info of the step that ends an
-            episode has `is_success` or `success`, the metadata gets that as `success`, unless the callback sets it.
+            episode has `is_success` or `success` (a bool, 0, 1, or an array of one of these), the metadata gets that as
+            `success`, unless the callback sets it.
         record_info: False, True (everything), a list of names, or a function from an info to what is recorded.
         step_callback: called with every Step; returns entries to record with its info (log-probabilities, say).
         compression: "zstd", "lz4" or "none".
@@ -188,15 +189,13 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             put = self._recorder.put
             put(action, state, reward, terminal, timeout)
             if self._plain:
-                if terminal or timeout:
-                    end = TERMINAL if terminal else TIMEOUT
-                    if success_of(result[4]) is None:
-                        self._recorder.leave_end(end)
-                    else:
-                        self._recorder.metadata = with_success("{}", result[4])
-                        self._recorder.end(end)
-                work.state = DONE
-                return result
+                if not (terminal or timeout):
+                    work.state = DONE
+                    return result
+                if not names_success(result[4]):
+                    self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
+                    work.state = DONE
+                    return result
         except StepError:
             self._recorder.refuse()
             work.state = DONE
@@ -290,6 +289,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
             self._recorder.metadata = with_success(self._recorder.metadata, info)
             self._recorder.end(TERMINAL if terminal else TIMEOUT)
             self._work.ask(self._reset_callback)
+            self._work.ask(self._check_flag, self.path, info)
 
     def _reset_callback(self) -> None:
         self._stepped = False

@@ -163,15 +163,18 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         """The ends of the episodes that the batch has ended."""
         _, _, terminals, _, infos = result
         recorder, texts, ended = self._recorder, self._texts, self._recorder.ended
+        finals: list[dict[str, Any]] = []
         if ended and infos and tells_success(infos):
-            texts = list(texts)
-            for i, info in zip(ended, final_infos_of(infos, ended, self.num_envs), strict=True):
+            texts, finals = list(texts), final_infos_of(infos, ended, self.num_envs)
+            for i, info in zip(ended, finals, strict=True):
                 texts[i] = with_success(texts[i], info)
         if self._watches or texts is not self._texts:
             recorder.note_metadata(texts)
         recorder.finish(terminals, infos)
         if self._callbacks is not None:
             self._work.ask(self._forget, ended)
+        for info in finals:
+            self._work.ask(self._check_flag, self.path, info)
 
     def _go_on(self, taken: Any, result: Any) -> None:
         """Flushes and syncs if that is due, and begins a new file if this one is full."""

@@ -3,27 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import plural
+from tupli_mcap.errors import plural, warn
 
 KEYS = ("is_success", "success")
 """The keys that infos and metadata use."""
 
 
 def success_of(said: Any) -> bool | None:
-    """Whether the episode succeeded, from an info or from metadata; None if they have no such key."""
+    """Whether the episode succeeded, from an info or from metadata; None if they have no success flag.
+
+    That is a bool, a number that is 0 or 1, or an array of one of these, as `success` or `is_success`.
+    """
     if isinstance(said, dict) and said:
         for key in KEYS:
             value = said.get(key)
+            if isinstance(value, np.ndarray) and value.size == 1:
+                value = value.item()
             if isinstance(value, bool | np.bool_) or (
                 isinstance(value, int | float | np.number) and value in (0, 1)
             ):
                 return bool(value)
     return None
+
+
+def names_success(info: Any) -> bool:
+    """Whether an info has a key of `KEYS`."""
+    return isinstance(info, dict) and any(key in info for key in KEYS)
+
+
+class FlagCheck:
+    """Warns once if the info of a step that ended an episode has a key of `KEYS`, and no success flag; None is none."""
+
+    def __init__(self) -> None:
+        self._has_warned = False
+
+    def __call__(self, path: Path, info: Any) -> None:
+        if self._has_warned or not names_success(info) or success_of(info) is not None:
+            return
+        odd = [f"{key}={info[key]!r:.80}" for key in KEYS if info.get(key) is not None]
+        if odd:
+            self._has_warned = True
+            warn(
+                f"{path}: expected True, False, 0, 1, or an array of one of these in the info of an episode's last "
+                f"step, found {', '.join(odd)}; the episode gets no success (a metadata_callback can say what it is)"
+            )
 
 
 def with_success(metadata: str, info: Any) -> str:
