@@ -17,6 +17,7 @@ import jsonschema
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from test_verify import unprivileged
 from typer.testing import CliRunner
 
 import tupli_mcap
@@ -862,6 +863,42 @@ class TestCommands:
         assert Recording(sweep).episodes[0].metadata == {"good": True}
         command("tag", f"{runs}/deep/b.mcap", "--undo")
         assert not any(e.metadata for e in tupli_mcap.open(runs))
+
+    @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+    @pytest.mark.parametrize("words", ["tag --episodes all good=true", "edit --name x"])
+    def test_all_recordings_are_changed_or_none(
+        self, words: str, dry: tuple[str, ...], tmp_path: Path
+    ) -> None:
+        paths = [record(tmp_path / f"{name}.mcap") for name in "abcd"]
+        paths[1].write_bytes(paths[1].read_bytes()[:-300])  # not finished
+        damaged = bytearray(paths[2].read_bytes())
+        damaged[-400:-300] = bytes(100)
+        paths[2].write_bytes(damaged)
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        verb, *rest = words.split()
+        with RecordEpisodes(gym.make("CartPole-v1"), paths[3], mode="a"):  # finished, but somebody appends
+            result = CliRunner().invoke(app, [verb, *map(str, paths), *rest, *dry])
+        assert result.exit_code == 1
+        told = result.stderr.splitlines()[-1]
+        assert told.startswith("error: nothing was changed: ")
+        for said in ("b.mcap is not finished", "c.mcap: ", "d.mcap is being recorded by another writer"):
+            assert told.count(said) == 1
+        assert "a.mcap" not in told
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+        command(verb, str(paths[0]), str(paths[3]), *rest, *dry)
+        assert (paths[0].read_bytes() == before["a.mcap"]) == bool(dry)
+
+    @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+    def test_what_may_not_be_written_is_said_first(self, dry: tuple[str, ...], tmp_path: Path) -> None:
+        path, locked, closed = (record(tmp_path / name / "r.mcap") for name in ("a", "b", "c"))
+        before = path.read_bytes()
+        locked.chmod(0o444)
+        closed.parent.chmod(0o555)
+        done = unprivileged("edit", path, locked, closed, "--name", "x", *dry)
+        assert done.returncode == 1
+        assert [done.stderr.count(str(one)) for one in (path, locked, closed)] == [0, 1, 1]
+        assert done.stderr.count("Permission denied") == 2
+        assert path.read_bytes() == before
 
     def test_record_says_what_run_it_is(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)

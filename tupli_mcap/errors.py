@@ -128,6 +128,28 @@ class MissingExtraError(TupliError, ImportError):
     """An optional dependency is not installed; the message names the extra to install."""
 
 
+class Gathered:
+    """Errors of several recordings, kept until all have been looked at, and then raised as one."""
+
+    def __init__(self) -> None:
+        self._errors: list[TupliError] = []
+
+    @contextlib.contextmanager
+    def keep(self) -> Iterator[None]:
+        """Keeps the error of a recording that the block raises."""
+        try:
+            yield
+        except (FormatError, RecordingError, StorageError) as err:
+            self._errors.append(err)
+
+    def raise_all(self) -> None:
+        """Raises the error if one was kept, and a RecordingError with the messages of all if several were."""
+        if len(self._errors) == 1:
+            raise self._errors[0]
+        if self._errors:
+            raise RecordingError(f"nothing was changed: {'; also, '.join(map(str, self._errors))}")
+
+
 def brief(err: BaseException | None) -> str:
     """An exception in one line: `ValueError: its message`."""
     text = " ".join(str(err).split())[:300]

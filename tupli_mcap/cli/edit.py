@@ -37,11 +37,11 @@ from tupli_mcap.cli.output import (
     print_wrapped,
 )
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError, bytes_of
+from tupli_mcap.errors import Gathered, RecordingError, bytes_of
 from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording import RecoveryReport
+    from tupli_mcap.recording import RecoveryReport, Run
 
 _NO_JOURNAL = {
     "missing": "their journal is not beside the file; if the file was cut off, also all after the cut",
@@ -129,11 +129,13 @@ def tag(
 
     Filters and tables use a note in place of recorded metadata of the same key. A value that
     is JSON is read as JSON, any other as text; KEY= removes a key. The file keeps who noted
-    it and when. Its steps are not touched. A signature is dropped.
+    it and when. Its steps are not touched. A signature is dropped. If one recording cannot be
+    changed, none is.
     """
     from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.recording import annotate_episodes, undo_annotation
     from tupli_mcap.recording.about.success import KEYS, success_of
+    from tupli_mcap.recording.edit.annotate import change_all
     from tupli_mcap.storage.listing import find_recordings
 
     given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
@@ -155,17 +157,23 @@ def tag(
     files = [str(file) for path in paths for file in find_recordings(path)]
     done: list[dict[str, Any]] = []
     if undo:
-        for file in files:
-            last = undo_annotation(file, dry_run=dry_run)
+        lasts = change_all(files, lambda file, dry: undo_annotation(file, dry_run=dry), dry_run=dry_run)
+        for file, last in zip(files, lasts, strict=True):
             done.append({"path": file, "episodes": last.episodes, "values": last.values})
     else:
-        chosen = numbers_in(paths, episodes, filter_of(filter_text))
+        gathered = Gathered()
+        named = numbers_in(paths, episodes, filter_of(filter_text), gathered)
+        chosen = {file: numbers for (file, _), numbers in named.items()}
+        change_all(
+            chosen,
+            lambda file, dry: annotate_episodes(file, values, chosen[file], dry_run=dry),
+            dry_run=dry_run,
+            gathered=gathered,
+        )
         if not chosen:
             why = "" if filter_text is None else f" that matches {filter_text}"
             raise RecordingError(f"there is no episode{why} in {', '.join(map(str, paths))}")
-        for (file, _), numbers in chosen.items():
-            annotate_episodes(file, values, numbers, dry_run=dry_run)
-            done.append({"path": file, "episodes": numbers, "values": values})
+        done = [{"path": file, "episodes": numbers, "values": values} for file, numbers in chosen.items()]
     if as_json:
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
@@ -207,9 +215,11 @@ def edit(
 ) -> None:
     """Change the name, metadata, tags or split of a run.
 
-    The recording keeps its id, and its steps are not touched. A signature is dropped.
+    The recording keeps its id, and its steps are not touched. A signature is dropped. If one
+    recording cannot be changed, none is.
     """
     from tupli_mcap.recording import edit_run, undo_edit
+    from tupli_mcap.recording.edit.annotate import change_all
 
     meant = [str(file) for file in files if "=" in str(file) and not file.exists()]
     if meant:
@@ -221,12 +231,13 @@ def edit(
             "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
         )
     metadata = dict(pair_of(text) for text in settings or ())
-    runs = [
-        undo_edit(file, dry_run=dry_run)
-        if undo
-        else edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry_run)
-        for file in files
-    ]
+
+    def change(file: Path, dry: bool) -> Run:
+        if undo:
+            return undo_edit(file, dry_run=dry)
+        return edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry)
+
+    runs = change_all(files, change, dry_run=dry_run)
     if as_json:
         edited = zip(files, runs, strict=True)
         print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])

@@ -42,7 +42,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import is_roomy, say
-from tupli_mcap.errors import RecordingError, bytes_of
+from tupli_mcap.errors import Gathered, RecordingError, bytes_of
 from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
@@ -185,7 +185,9 @@ def _delete_in_files(
 
     paths = list(paths)
     files = [str(file) for given in paths for file in find_recordings(given)]
-    doomed = numbers_in(paths, episodes, wanted)
+    gathered = Gathered()
+    doomed = numbers_in(paths, episodes, wanted, gathered)
+    gathered.raise_all()
     if wanted is not None and files and not doomed:
         len(dataset_of(files).filter(wanted))  # raises FilterError if no episode has such a key
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]

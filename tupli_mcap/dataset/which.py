@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tupli_mcap.errors import FilterError, RecordingError
+from tupli_mcap.errors import FilterError, Gathered, RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
 
@@ -97,7 +97,7 @@ def _named(name: str, numbers: Any, returns: Any, text: str, filter: BaseFilter 
 
 
 def numbers_in(
-    places: Iterable[Path], text: str | None, filter: BaseFilter | None
+    places: Iterable[Path], text: str | None, filter: BaseFilter | None, gathered: Gathered
 ) -> dict[tuple[str, str], list[int]]:
     """The numbers of the episodes that a text names in some recordings and directories, by the recording's path and
     UUID; without a text, of those that match the filter. Recordings without one are left out.
@@ -105,9 +105,12 @@ def numbers_in(
     Of a directory, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a number is that
     of each recording which has it, as in `dataset.chosen.chosen_from`.
 
+    `gathered` keeps the errors of recordings that cannot be read, and of recordings and directories that have no such
+    episode.
+
     Raises:
         FilterError: the text is something else, or the filter has an unknown key.
-        RecordingError: a recording or directory has no such episode.
+        RecordingError: there is no such recording or directory.
     """
     from tupli_mcap.storage.listing import find_recordings
 
@@ -117,17 +120,17 @@ def numbers_in(
         numbers: list[int] = []
         returns: list[float] = []
         for file in map(str, find_recordings(place)):
-            with Recording(file) as recording:
+            with gathered.keep(), Recording(file) as recording:
                 rows = recording.index[candidates(recording, filter)]
-            files += [(file, recording.uuid)] * len(rows)
-            numbers += rows["episode"].tolist()
-            returns += rows["return"].tolist()
-        if text is None:
+                files += [(file, recording.uuid)] * len(rows)
+                numbers += rows["episode"].tolist()
+                returns += rows["return"].tolist()
+        with gathered.keep():
             chosen = list(range(len(files)))
-        else:
-            chosen = _named(str(place), np.array(numbers), np.array(returns), text, filter)
-        for at in chosen:
-            found.setdefault(files[at], {})[numbers[at]] = None
+            if text is not None:
+                chosen = _named(str(place), np.array(numbers), np.array(returns), text, filter)
+            for at in chosen:
+                found.setdefault(files[at], {})[numbers[at]] = None
     return {file: list(named) for file, named in found.items()}
 
 

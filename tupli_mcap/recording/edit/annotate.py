@@ -6,13 +6,13 @@ import getpass
 import operator
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from tupli_mcap.errors import RecordingError, warn
+from tupli_mcap.errors import Gathered, RecordingError, warn
 from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
     ANNOTATIONS_NAME,
@@ -20,12 +20,14 @@ from tupli_mcap.recording.about.annotations import (
     Annotations,
 )
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
-from tupli_mcap.recording.edit.attach import attach, held
+from tupli_mcap.recording.edit.attach import attach, check_attachable, held
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
 _MOST_EDITS = 20  # edits that can be undone
+_Place = TypeVar("_Place", bound=str | os.PathLike[str])
+_Change = TypeVar("_Change")
 
 
 def annotate_episodes(
@@ -134,6 +136,35 @@ def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
     return run
 
 
+def change_all(
+    paths: Iterable[_Place],
+    change: Callable[[_Place, bool], _Change],
+    *,
+    dry_run: bool,
+    gathered: Gathered | None = None,
+) -> list[_Change]:
+    """Changes several recordings, or none of them if one cannot be changed; returns what `change` returned of each.
+
+    Args:
+        change: takes a path, and whether it is a dry run, in which it raises the errors of the change itself.
+        gathered: errors of other recordings that were to be changed, too.
+
+    Raises:
+        RecordingError: some cannot be changed; the message has the reason of each.
+        FormatError: the only one that cannot be changed is damaged.
+    """
+    paths, gathered = list(paths), gathered or Gathered()
+    found = []
+    with warnings.catch_warnings():
+        if not dry_run:
+            warnings.simplefilter("ignore")  # the change itself gives the same ones
+        for path in paths:
+            with gathered.keep():
+                found.append(change(path, True))
+    gathered.raise_all()
+    return found if dry_run else [change(path, False) for path in paths]
+
+
 def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, Sequence[Run]]:
     """The run of a recording, and its versions before edits."""
     if len(recording.runs) > 1:
@@ -150,10 +181,14 @@ def _changing(
 ) -> Iterator[tuple[Recording, Callable[[str, str, bytes], None]]]:
     """Locks a recording; yields it, and a function that replaces one of its attachments (name, media type, bytes).
 
-    The function warns if it removes a signature. In a dry run it does nothing else, and the recording is not locked.
-    """
+    The function warns if it removes a signature. In a dry run it does nothing else.
 
-    with nullcontext(path) if dry_run else held(path) as place, Recording(place) as recording:
+    Raises:
+        RecordingError: the recording is not finished, is being written, or cannot be written; also in a dry run.
+        FormatError: it is damaged.
+    """
+    with held(path) as place, Recording(place) as recording:
+        check_attachable(place, finished=recording.complete)
 
         def say(name: str, media_type: str, data: bytes) -> None:
             if SIGNATURE_NAME in recording.attachments:
@@ -161,7 +196,7 @@ def _changing(
                 message = f"{path}: its signature covers what was said before, and {left_out}"
                 warn(message)
             if not dry_run:
-                attach(Path(recording.name), {name: (media_type, data)}, without=[SIGNATURE_NAME])
+                attach(place, {name: (media_type, data)}, without=[SIGNATURE_NAME])
 
         yield recording, say
 

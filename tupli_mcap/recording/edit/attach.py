@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
@@ -57,15 +58,24 @@ def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without:
     """`add_attachments` to a file that is `held`; attachments that `without` names are removed."""
     with contextlib.closing(PathSource(path)) as source:
         contents = read_contents(source)
-        if not contents.complete:
-            raise RecordingError(
-                f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
-            )
+        check_attachable(path, finished=contents.complete)
         with replacing(path, 0o600, held=True) as (fd, _):
             container = Container(fd, str(path), "zstd")
             restore_container(container, contents, source)
             _write(container, source, contents, attachments, {*attachments, *without})
             os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
+
+
+def check_attachable(path: Path, *, finished: bool) -> None:
+    """Raises RecordingError if nothing can be attached to a recording: it is not finished, or its directory is not
+    writable."""
+    if not finished:
+        raise RecordingError(
+            f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
+        )
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        refused = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        raise RecordingError(f"{path} cannot be written: its directory: {os_reason(refused)}")
 
 
 def _write(
