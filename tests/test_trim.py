@@ -13,13 +13,14 @@ import pytest
 import web_server
 from environments import same
 from test_golden import NAMES, place
+from test_runs import Winning
 from typer.testing import CliRunner
 
 import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, doctor
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import Episode, verify_recording
+from tupli_mcap.recording import Episode, annotate_episodes, verify_recording
 from tupli_mcap.replay.starts import plan_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -90,6 +91,37 @@ def test_says_where_it_comes_from_and_what_no_reset_leads_to(tmp_path: Path) -> 
     lengths = [len(episode) for episode in ds]
     assert said["steps"] == {"1": [2, lengths[1]], "2": [0, lengths[2] - 2]}
     assert not [finding.check for finding in doctor.examine(new).findings if finding.check == "missing-reset"]
+
+
+class Three(Winning):
+    """Wins at its third step."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.left = 3
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        self.left -= 1
+        return 1, 1.0, not self.left, False, {} if self.left else {self.key: True}
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_who_loses_the_end_has_no_recorded_success(several: bool, tmp_path: Path) -> None:
+    paths = []
+    for name in ("a", "b")[: 1 + several]:
+        paths.append(tmp_path / f"{name}.mcap")
+        with RecordEpisodes(Three(), paths[-1]) as recorded:
+            for _ in range(3):
+                recorded.reset()
+                while not recorded.step(1)[2]:
+                    pass
+    annotate_episodes(paths[0], {"success": False, "note": "seen"}, [2])
+    cut = {0: slice(1, None), 1: slice(0, 1), 2: slice(0, 1)}
+    new = tupli_mcap.open(paths).trim(lambda e: cut[e.number], tmp_path / "n.mcap")
+    known = [{"success": True}, {}, {"success": False, "note": "seen"}]
+    assert [e.metadata for e in tupli_mcap.open(paths[0])] == [{"success": True}] * 2 + known[2:]
+    assert [e.metadata for e in Recording(new)] == known + [{"success": True}, {}, {}] * several
+    assert verify_recording(new).ok
 
 
 def test_of_a_part_of_several_recordings(tmp_path: Path) -> None:

@@ -291,8 +291,9 @@ def trim(
 
     10:-5 leaves out the first ten and the last five steps, :200 all steps from 200 on.
     Episodes that are not chosen stay whole. An episode that loses its end is marked as
-    interrupted, and the state after its last step becomes its final state. An episode that
-    loses its beginning loses its seed. The new recording has a new id, and no signature.
+    interrupted, the state after its last step becomes its final state, and its recorded
+    success is dropped. An episode that loses its beginning loses its seed. The new recording
+    has a new id, and no signature.
     """
     from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.dataset.curate import trim_dataset

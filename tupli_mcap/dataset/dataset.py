@@ -478,8 +478,8 @@ class Dataset(RandomAccess):
         Args:
             steps: the steps that stay, or a function from an `Episode` to them.
 
-        An episode that loses its end ends as interrupted, and the state that followed is its final state; one that
-        loses its beginning has no seed, because no reset leads to its first state.
+        An episode that loses its end ends as interrupted, the state that followed is its final state, and it keeps no
+        recorded `success`; one that loses its beginning has no seed, because no reset leads to its first state.
 
         Raises:
             DatasetError: there is no episode, one occurs twice, the target exists (without `overwrite`), or it is one

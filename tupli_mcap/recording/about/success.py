@@ -66,6 +66,14 @@ def with_success(metadata: str, info: Any) -> str:
     )
 
 
+def without_success(metadata: str) -> str:
+    """Metadata (a JSON text) without the keys of `KEYS`, for an episode that has lost its end."""
+    known = jsonvalue.loads(metadata)
+    if not isinstance(known, dict) or known.keys().isdisjoint(KEYS):
+        return metadata
+    return jsonvalue.dumps_plain({key: value for key, value in known.items() if key not in KEYS})
+
+
 def success_text(share: float, known: int, episodes: int) -> str:
     """The share of successes; with the number of episodes that say it, unless all do."""
     return (

@@ -16,6 +16,7 @@ from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
+from tupli_mcap.recording.about.success import without_success
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
@@ -267,7 +268,7 @@ class EpisodeCopier:
                 total, end_time = trim.episode_return, int(row["end_time"])
                 end = end._replace(length=trim.stop - trim.start, end=int(row["end"]))
                 if trim.final is not None:
-                    end = end._replace(has_final_state=True)
+                    end = end._replace(has_final_state=True, metadata=without_success(end.metadata))
             found.append(
                 CopiedEpisode(
                     [(time_ns, start._replace(**new)) for time_ns, start in starts],

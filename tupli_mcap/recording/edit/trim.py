@@ -40,10 +40,10 @@ def trim_recording(
 ) -> TrimReport:
     """Writes `target` with only some consecutive steps of some episodes.
 
-    An episode that loses its end ends as interrupted, and the state that followed is its final state. An episode that
-    loses its beginning has no seed, no options and no reset info, because no reset leads to its first state. Steps
-    are numbered from 0, returns are those of the steps that stay; metadata and annotations stay. The recording has a
-    new UUID and no signature.
+    An episode that loses its end ends as interrupted, and the state that followed is its final state; whether it
+    succeeded is not known, so its recorded metadata have no `success`. An episode that loses its beginning has no seed,
+    no options and no reset info, because no reset leads to its first state. Steps are numbered from 0, returns are
+    those of the steps that stay; other metadata, and annotations, stay. The recording has a new UUID and no signature.
 
     Args:
         source: the recording to read.
