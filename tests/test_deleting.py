@@ -194,6 +194,29 @@ def test_in_python_and_back(runs: Path) -> None:
         tupli_mcap.restore_episodes(runs / "none.mcap")
 
 
+def test_what_is_not_deleted_is_not_restored(runs: Path) -> None:
+    file, other = runs / "a.mcap", runs / "deep" / "b.mcap"
+    for words in (["delete"], ["restore"], ["restore", str(other)]):
+        told = run(*words, str(file), "-e", "99", code=1)
+        assert told.count("99") == 1
+    assert f"{file} has no episode 99; choose from 0 to 3" in run("delete", str(file), "-e", "99", code=1)
+    assert f"{file} has no deleted episode 0; none can be" in run("restore", str(file), "-e", "0", code=1)
+    run("delete", str(file), "-e", "1,2")
+    for dry in ([], ["--dry-run"]):
+        told = run("restore", str(file), "-e", "1,3", *dry, code=1)
+        assert f"{file} has no deleted episode 3; choose from 1 to 2" in told
+        assert "b.mcap has no deleted episode 1; none" in run(
+            "restore", *map(str, (file, other)), "-e", "1", code=1
+        )
+    assert seeds(file) == [0, 3]
+    with pytest.raises(RecordingError, match=r"a\.mcap has no deleted episode 0; choose from 1 to 2"):
+        tupli_mcap.restore_episodes(file, [1, 0])
+    assert tupli_mcap.restore_episodes(file, []) == []
+    run("restore", str(file), "-e", "", code=2)
+    assert len(tupli_mcap.restore_episodes(runs, "2-9, 1")) == 2
+    assert seeds(file) == [0, 1, 2, 3]
+
+
 def test_one_episode_in_python(runs: Path) -> None:
     assert tupli_mcap.open(runs)[1].delete() == 1
     assert Recording(runs / "a.mcap").episodes[0].delete() == 1

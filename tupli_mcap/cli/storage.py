@@ -209,14 +209,8 @@ def restore(
     episodes were deleted.
     """
     from tupli_mcap.dataset import restore_episodes
-    from tupli_mcap.dataset.which import bounds_of
 
-    if episodes in (None, "all"):
-        restored = restore_episodes(paths, dry_run=dry_run)
-    else:
-        bounds = [bounds_of(item.strip(), episodes, ["all"]) for item in episodes.split(",")]
-        found = [restore_episodes(paths, range(low, high + 1), dry_run=dry_run) for low, high in bounds]
-        restored = list(dict.fromkeys(one for ids in found for one in ids))
+    restored = restore_episodes(paths, episodes, dry_run=dry_run)
     print_result(
         {"dry_run": dry_run, "episodes": restored},
         f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}",

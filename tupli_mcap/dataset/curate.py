@@ -13,7 +13,7 @@ import numpy as np
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Source
-from tupli_mcap.dataset.which import candidates, may_be_noted
+from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import Episode, rewrite_recording, say_made_of, trim_recording
@@ -29,7 +29,7 @@ from tupli_mcap.storage.base import by_recording
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Dataset
-    from tupli_mcap.storage import TupliStorage
+    from tupli_mcap.storage import FileStorage, TupliStorage
 
 
 class FilterReport(NamedTuple):
@@ -265,36 +265,70 @@ def delete(
 
 def restore_episodes(
     places: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
-    episodes: Collection[int] | None = None,
+    episodes: str | Collection[int] | None = None,
     *,
     dry_run: bool = False,
 ) -> list[str]:
-    """Brings deleted episodes back (their numbers, such as `[3, 7]`; all by default), and returns their ids.
+    """Brings deleted episodes back, and returns their ids.
 
     Those whose space `compact` has freed, those of a file that was removed, and those on a server cannot be restored.
 
     Args:
         places: the paths of recordings, directories and storages.
+        episodes: their numbers, such as `[3, 7]` or "3,7-9"; by default, or if "all", all that are deleted.
 
     Raises:
-        RecordingError: there is no such path.
+        RecordingError: there is no such path, or a path has no such deleted episode; then none is restored.
+        FilterError: the text is something else.
         StorageError: the notes beside a recording cannot be written.
+    """
+    if not isinstance(episodes, str | None):
+        if not len(episodes):
+            return []
+        episodes = ",".join(map(str, episodes))
+    items = [] if episodes is None or episodes == "all" else episodes.split(",")
+    bounds = {item.strip(): bounds_of(item.strip(), str(episodes), ["all"]) for item in items}
+    found = [
+        part
+        for place in ([places] if isinstance(places, str | os.PathLike) else places)
+        for part in _deleted_at(place, bounds)
+    ]
+    if not dry_run:
+        for storage, recordings, ids in found:
+            storage.restore_episodes(ids, recordings)
+    return list(dict.fromkeys(one for _, _, ids in found for one in ids))
+
+
+def _deleted_at(
+    place: str | os.PathLike[str], bounds: Mapping[str, tuple[int, int]]
+) -> list[tuple[FileStorage, set[str], list[str]]]:
+    """The storages of the recordings at a path, the names of these, and the ids of their deleted episodes.
+
+    `bounds`: if there are any, only episodes whose number is within one of them. RecordingError if a path has none that
+    is within one of them; the key names it.
     """
     from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.listing import find_recordings
     from tupli_mcap.storage.sidecar import storage_of
 
     by_root: dict[Path, set[str]] = {}
-    given = [places] if isinstance(places, str | os.PathLike) else places
-    for file in (file.absolute() for place in given for file in find_recordings(path_of(place))):
+    for file in (file.absolute() for file in find_recordings(path_of(place))):
         root = storage_of(file)
         by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
-    restored = []
+    found = []
+    numbers: set[int] = set()
     for root, recordings in by_root.items():
         storage = FileStorage(root)
-        deleted = storage.deleted_episodes(recordings)
-        chosen = [one for one in deleted if episodes is None or int(one.rpartition("-")[2]) in episodes]
-        if not dry_run:
-            storage.restore_episodes(chosen, recordings)
-        restored += chosen
-    return restored
+        deleted = {one: int(one.rpartition("-")[2]) for one in storage.deleted_episodes(recordings)}
+        numbers.update(deleted.values())
+        chosen = [
+            one
+            for one, number in deleted.items()
+            if not bounds or any(low <= number <= high for low, high in bounds.values())
+        ]
+        found.append((storage, recordings, chosen))
+    for item, (low, high) in bounds.items():
+        if not any(low <= number <= high for number in numbers):
+            known = f"choose from {range_text(sorted(numbers))}" if numbers else "none can be restored"
+            raise RecordingError(f"{place} has no deleted episode {item}; {known}")
+    return found

@@ -90,7 +90,7 @@ def _named(name: str, numbers: Any, returns: Any, text: str, filter: BaseFilter 
         places = places_of(item, text, numbers, returns)
         if not places:
             raise RecordingError(
-                f"{name} has no episode {item}{why}; choose from {_range(np.unique(numbers))}"
+                f"{name} has no episode {item}{why}; choose from {range_text(np.unique(numbers))}"
             )
         chosen.update(dict.fromkeys(places))
     return list(chosen)
@@ -166,8 +166,8 @@ def extreme(word: str, returns: Any) -> int:
     return int(np.nan_to_num(returns, nan=np.inf).argmin())
 
 
-def _range(numbers: Any) -> str:
-    """The numbers of episodes, for people; they may have gaps, from deleted episodes or a filter."""
+def range_text(numbers: Any) -> str:
+    """The numbers of episodes (ascending), for people; they may have gaps, from deleted episodes or a filter."""
     low, high = int(numbers[0]), int(numbers[-1])
     if high - low + 1 == len(numbers):
         return f"{low} to {high}" if low < high else f"episode {low} only"
