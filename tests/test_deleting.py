@@ -8,6 +8,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from test_golden import place
 from test_signing import write_key
 from typer.testing import CliRunner
 from web_server import serving
@@ -15,6 +16,8 @@ from web_server import serving
 import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
+from tupli_mcap.errors import bytes_of
+from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.sign.sign import sign_recording
 
 
@@ -103,6 +106,25 @@ def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
     assert other.stat().st_size < sizes[1]
 
 
+def test_the_space_of_one_that_was_not_finished(tmp_path: Path) -> None:
+    """Its journal goes, too; without one, it only gets the index that it lacked."""
+    file = place("unfinished_holes", tmp_path)
+    journal = journal_path(file)
+    sizes = file.stat().st_size, journal.stat().st_size
+    run("delete", str(file), "-e", "1")
+    told = run("compact", str(file), "--json")
+    assert json.loads(told)["result"]["bytes_freed"] == sum(sizes) - file.stat().st_size
+    assert not journal.exists()
+    file = place("unfinished_holes", tmp_path)
+    journal.unlink()
+    run("delete", str(file), "-e", "1")
+    told = run("compact", str(file))
+    assert (
+        f"rewrote 1 recording, which freed nothing: {bytes_of(file.stat().st_size - sizes[0])} more are used"
+        in told
+    )
+
+
 def test_a_signature_goes_with_a_warning(runs: Path, tmp_path: Path) -> None:
     file = runs / "a.mcap"
     sign_recording(file, write_key(tmp_path / "id"))
@@ -145,9 +167,9 @@ def test_importing_does_not_bring_them_back(runs: Path, tmp_path: Path) -> None:
 
 
 def test_of_a_directory_by_filter(runs: Path) -> None:
-    for place in (runs, runs / "a.mcap"):
+    for where in (runs, runs / "a.mcap"):
         assert "no episode has metadata.lost" in run(
-            "delete", str(place), "--filter", "metadata.lost", code=2
+            "delete", str(where), "--filter", "metadata.lost", code=2
         )
     assert "deleted 4 episodes" in run("delete", str(runs), "--filter", "seed >= 2")
     assert seeds(runs) == [0, 1, 0, 1]

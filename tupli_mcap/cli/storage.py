@@ -260,11 +260,13 @@ def compact(
         if left:
             say(f"would remove {counted(len(left), 'temporary file')} of killed processes")
         return
-    say(
-        f"rewrote {counted(len(recordings), 'recording')}, freed {bytes_of(freed)}"
-        if recordings or left
-        else "nothing to compact"
+    if not (recordings or left):
+        say("nothing to compact")
+        return
+    told = (
+        f"freed {bytes_of(freed)}" if freed >= 0 else f"which freed nothing: {bytes_of(-freed)} more are used"
     )
+    say(f"rewrote {counted(len(recordings), 'recording')}, {told}")
 
 
 def rename(

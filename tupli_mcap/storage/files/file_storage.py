@@ -303,7 +303,7 @@ class FileStorage(TupliStorage):
 
     def compact(self, recordings: Collection[str] | None = None) -> int:
         """Rewrite recordings that hold deleted episodes, and remove the temporary files of killed processes; returns
-        the number of bytes freed.
+        the number of bytes freed, which is below 0 if new files are larger (an unfinished one gets its index).
 
         Recordings that are being written are left alone. Episodes that stay keep their ids. `recordings`: only those
         at these paths below `root`.

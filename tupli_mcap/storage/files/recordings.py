@@ -297,6 +297,8 @@ class RecordingFiles:
         return freed
 
     def _compact(self, path: Path) -> int:
+        """Rewrites a recording whose lock the caller holds; returns the bytes freed. Of one that is not finished, the
+        journal goes, since the new file has all its steps."""
         notes = Notes.read(path, self._root)
         before = path.stat().st_size
         with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
@@ -304,7 +306,9 @@ class RecordingFiles:
             if sidecar.deleted:
                 kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
                 rewrite_in_place(recording, path, kept)
-                journal_path(path).unlink(missing_ok=True)
+                with contextlib.suppress(FileNotFoundError):
+                    before += journal_path(path).stat().st_size
+                    journal_path(path).unlink()
                 groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
                 sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
         sidecar.write(path)
