@@ -23,6 +23,7 @@ from test_golden import NAMES, as_read, assert_same, expected, place
 from tool_modules import tool
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import (
     FormatError,
     RecordEpisodes,
@@ -172,6 +173,37 @@ def test_an_episode_with_a_hole_is_cut(tmp_path: Path) -> None:
             (0, 0, first, 0),
             (0, stop, 200 - stop, 2),
         ]
+
+
+@pytest.mark.parametrize("command", [False, True])
+@pytest.mark.parametrize("lost", ["nothing", "steps", "metadata"])
+def test_deleted_episodes_stay_deleted(lost: str, command: bool, tmp_path: Path) -> None:
+    """All parts of one that is cut, too, and if the recording gets another UUID; and they can be restored."""
+    path = record(tmp_path / "a.mcap", length=200)
+    count = len(tupli_mcap.open(path))
+    assert tupli_mcap.open(path)[:1].delete() == 1
+    if lost == "steps":
+        hit(path, chunks(path, "/step")[2])
+    uuid = Recording(path).uuid
+    if lost == "metadata":
+        flip(path, *(m.start() for m in re.finditer(uuid.encode(), path.read_bytes())))
+    target = tmp_path / "new" / "b.mcap"
+    if command:
+        assert CliRunner().invoke(app, ["recover", str(path), "-o", str(target)]).exit_code == 0
+    else:
+        recover_recording(path, target)
+    with Recording(target) as recording:
+        assert (recording.uuid == uuid) == (lost != "metadata")
+        origins = [e.metadata.get("recovered", {}).get("episode", e.number) for e in recording.episodes]
+    parts = 2 if lost == "steps" else 1
+    assert (origins.count(0), len(origins)) == (parts, count + parts - 1)
+    assert 0 not in [e.number for e in tupli_mcap.open(target)]
+    assert len(tupli_mcap.open(target)) == count - 1
+    assert len(tupli_mcap.restore_episodes(target)) == parts
+    if lost == "nothing":
+        tupli_mcap.restore_episodes(path)
+    recover_recording(path, target, overwrite=True)
+    assert len(tupli_mcap.open(target)) == count - (lost != "nothing")
 
 
 def test_recovering_again_changes_nothing(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         TupliDataset as TupliDataset,
         merge_recordings as merge_recordings,
         open as open,
+        recover_recording as recover_recording,
         restore_episodes as restore_episodes,
         split_recording as split_recording,
     )
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
         Step as Step,
         VerifyReport as VerifyReport,
         journal_path as journal_path,
-        recover_recording as recover_recording,
         rewrite_recording as rewrite_recording,
         verify_recording as verify_recording,
         write_recording as write_recording,
@@ -87,14 +87,14 @@ if TYPE_CHECKING:
 # The module of each public name, imported on first use, so that `import tupli_mcap` is quick.
 _HOMES = {
     "benchmark": "TupliEnvWrapper",
-    "dataset": "Dataset TupliDataset merge_recordings open restore_episodes split_recording",
+    "dataset": "Dataset TupliDataset merge_recordings open recover_recording restore_episodes split_recording",
     "errors": (
         "FilterError FormatError MissingExtraError NotFoundError RecordingError SignatureError "
         "SpaceError StepError StorageError TupliError UntrustedError"
     ),
     "recording": (
-        "Episode EpisodeData Recording RecoveryReport Step VerifyReport journal_path recover_recording "
-        "rewrite_recording verify_recording write_recording"
+        "Episode EpisodeData Recording RecoveryReport Step VerifyReport journal_path rewrite_recording "
+        "verify_recording write_recording"
     ),
     "schema": (
         "EpisodeMetadataCallback F FilterAND FilterCONTAINS FilterEQ FilterGEQ FilterGT FilterIN FilterLEQ FilterLT "

@@ -343,10 +343,12 @@ def recover(
 
     Works on damaged recordings, and on those that their writers did not finish. FILE is only
     read; with --in-place, it is finished instead. The command prints the lost steps of each
-    episode. An episode that lost steps in the middle becomes several. The command exits with
-    1 if nothing could be saved, or if the recording had steps and none could be saved.
+    episode. An episode that lost steps in the middle becomes several. Deleted episodes stay
+    deleted in the new one, and restore brings them back. The command exits with 1 if nothing
+    could be saved, or if the recording had steps and none could be saved.
     """
-    from tupli_mcap.recording import finish_recording, recover_recording
+    from tupli_mcap.dataset import recover_recording
+    from tupli_mcap.recording import finish_recording
 
     if in_place and (output is not None or force):
         raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")

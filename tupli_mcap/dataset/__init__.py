@@ -25,7 +25,12 @@ if TYPE_CHECKING:
         TorchTupleParser,
     )
     from tupli_mcap.dataset.columns.saved import SavedColumns, open_columns
-    from tupli_mcap.dataset.curate import merge_recordings, restore_episodes, split_recording
+    from tupli_mcap.dataset.curate import (
+        merge_recordings,
+        recover_recording,
+        restore_episodes,
+        split_recording,
+    )
     from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.dataset.opening import open
     from tupli_mcap.dataset.sources import DatasetError
@@ -37,7 +42,7 @@ __getattr__ = imported_on_use(
     {
         "columns.convert": "BaseTupleParser NumpyTupleParser TensorflowTupleParser TorchTupleParser",
         "columns.saved": "SavedColumns open_columns",
-        "curate": "merge_recordings restore_episodes split_recording",
+        "curate": "merge_recordings recover_recording restore_episodes split_recording",
         "dataset": "Dataset",
         "opening": "open",
         "sources": "DatasetError",
@@ -57,6 +62,7 @@ __all__ = [
     "merge_recordings",
     "open",
     "open_columns",
+    "recover_recording",
     "restore_episodes",
     "split_recording",
 ]

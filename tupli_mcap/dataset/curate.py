@@ -1,4 +1,4 @@
-"""Writes a recording of some episodes; deletes episodes, and brings them back."""
+"""Writes a recording of some episodes, or of what can be saved; deletes episodes, and brings them back."""
 
 from __future__ import annotations
 
@@ -14,15 +14,24 @@ from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Source
 from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.recording import Episode, rewrite_recording, say_made_of, trim_recording
+from tupli_mcap.recording import (
+    Episode,
+    Recording,
+    RecoveryReport,
+    rewrite_recording,
+    say_made_of,
+    trim_recording,
+)
 from tupli_mcap.recording.edit import merge, split
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
+from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import path_of
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
@@ -70,6 +79,38 @@ def split_recording(
         source, target, episodes=episodes, max_bytes=max_bytes, compression=compression, dry_run=dry_run,
         positions=candidates,
     )  # fmt: skip
+
+
+def recover_recording(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str] | None = None,
+    *,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    compression: str = "zstd",
+) -> RecoveryReport:
+    """`tupli_mcap.recording.recover_recording`; episodes that a storage has deleted are deleted in the new file, too.
+
+    `restore_episodes` brings them back there, as in the source. Raises StorageError, too, if the notes beside the new
+    file cannot be written.
+    """
+    from tupli_mcap.storage.sidecar import Notes, Sidecar
+
+    notes = Notes.read(Path(source))
+    report = recover.recover_recording(
+        source, target, overwrite=overwrite, dry_run=dry_run, compression=compression
+    )
+    if report.target is None:
+        return report
+    try:
+        deleted = notes.about(metadata_at(Path(source))).deleted
+    except FormatError:  # what the notes are about is lost
+        deleted = notes.deleted
+    with Recording(report.target) as made:
+        parts = {cut.becomes for cut in report.cut if cut.episode in deleted}
+        kept = (deleted | parts).intersection(made.index["episode"].tolist())
+        Sidecar(uuid=made.uuid, deleted=kept).write(Path(report.target))
+    return report
 
 
 def filter_dataset(
