@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
+from typer.testing import CliRunner
 
 import tupli_mcap
 from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
+from tupli_mcap.cli.app import app
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -883,6 +885,31 @@ def test_what_chose_the_episodes_is_noted_where_they_were_listed_before(runs: Pa
     made = Recording(saved).made_of
     assert made is not None
     assert (made["how"], made["query"]) == ("filter", str((F("seed") < 200) & (F("return") > 0)))
+
+
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize("one", [False, True])
+def test_all_that_chose_the_episodes_is_noted_in_order(
+    listed: bool, one: bool, runs: Path, tmp_path: Path
+) -> None:
+    dataset = tupli_mcap.open(sorted(runs.rglob("*.mcap"))[0] if one else runs)
+    if listed:
+        assert len(dataset)
+    first, second, third = F("steps") > 0, F("return") > 0, F("episode") >= 0
+
+    def noted(chosen: Dataset) -> tuple[str, str | None]:
+        made = Recording(chosen.save(tmp_path / "s.mcap", overwrite=True)).made_of
+        assert made is not None
+        return made["how"], made.get("query")
+
+    narrowed = dataset.filter(first).sort("return").filter(second)
+    assert noted(narrowed.filter(lambda e: len(e) > 0).head(9)[:-1]) == ("filter", str(first & second))
+    assert noted(narrowed.sample(3, seed=0).filter(third)) == ("filter", str(first & second & third))
+    told = CliRunner().invoke(app, ["info", str(tmp_path / "s.mcap")]).output
+    assert f"by filter {first & second & third}" in " ".join(told.split())
+    either = dataset.filter(first).head(1) + dataset.filter(second)
+    assert noted(either) == ("filter", str(first | second))
+    assert noted(dataset.filter(first) + dataset) == ("filter" if one else "merge", None)
 
 
 def test_two_continued_copies_are_told_apart(tmp_path: Path) -> None:

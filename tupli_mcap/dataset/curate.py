@@ -137,7 +137,7 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    query = filter if isinstance(filter, str) else str(filter)
+    query = filter if isinstance(filter, str) and dataset._filter is None else str(kept._filter)
     return report._replace(size=save(kept, target, overwrite=overwrite, query=query).stat().st_size)
 
 
@@ -246,7 +246,7 @@ def _check_new(dataset: Dataset, target: Path, *, overwrite: bool) -> None:
 
 
 def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:
-    """See `Dataset.save`. `query`: the filter that chose the episodes, where the dataset does not know it."""
+    """See `Dataset.save`. `query`: the text of the dataset's filter, if the user gave one."""
     target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
     known = query or ("" if dataset._filter is None else str(dataset._filter))

@@ -62,7 +62,7 @@ class Dataset(RandomAccess):
 
     def __init__(self, source: Source, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source
-        self._filter: BaseFilter | None = None
+        self._filter: BaseFilter | None = None  # is true of the episodes; `save` notes it
         self._listed = None if headers is None else list(headers)
         self._recordings = OpenRecordings(source.open)
         self._steps: RecordedSteps | None = None
@@ -175,6 +175,7 @@ class Dataset(RandomAccess):
     def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
+        made._filter = self._filter
         return made
 
     def __add__(self, other: Dataset | Recording) -> Dataset:
@@ -190,9 +191,13 @@ class Dataset(RandomAccess):
         ids = {header.id for header in self.headers}
         more = [header for header in other.headers if header.id not in ids]
         if self._source is other._source:
-            return self._of([*self.headers, *more])
-        joined = JoinedSource([(self._source, self.headers), (other._source, more)])
-        return Dataset(joined, [*self.headers, *more])
+            made = self._of([*self.headers, *more])
+        else:
+            joined = JoinedSource([(self._source, self.headers), (other._source, more)])
+            made = Dataset(joined, [*self.headers, *more])
+        one, two = self._filter, other._filter
+        made._filter = None if one is None or two is None else one | two
+        return made
 
     # ---- narrowing
 
@@ -211,17 +216,14 @@ class Dataset(RandomAccess):
             return self._of([header for header in self.headers if test(self._episode(header))])
         wanted = parse_filter(test) if isinstance(test, str) else test
         check_keys(wanted, EpisodeHeader)
-        if self._listed is None:
-            made = self._of([])
-            made._listed = None
-            made._filter = wanted if self._filter is None else self._filter & wanted
-            return made
-        matches = compile_predicate(wanted, EpisodeHeader)
-        found = [header for header in self._listed if matches(header)]
-        if not found:
-            check_metadata(wanted, self._listed)
-        made = self._of(found)
-        made._filter = wanted if self._filter is None else self._filter & wanted  # what `save` notes
+        made = self._of([])
+        made._filter = wanted if self._filter is None else self._filter & wanted
+        made._listed = None
+        if self._listed is not None:
+            matches = compile_predicate(wanted, EpisodeHeader)
+            made._listed = [header for header in self._listed if matches(header)]
+            if not made._listed:
+                check_metadata(wanted, self._listed)
         return made
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
