@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from test_recovery import abandon, cart_pole
 from test_sampling import naive
 
+import tupli_mcap
 from tupli_mcap import F, FileStorage, RecordEpisodes, Recording, TupliDataset
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.columns.saved import save_columns
@@ -157,6 +158,32 @@ def test_spaces_that_do_not_fit(tmp_path: Path) -> None:
             roll(env, 8)
     with pytest.raises(SpaceError, match=r"state: expected float32 of shape \(2,\) as in .*0.mcap, found"):
         TupliDataset.from_files(paths).windows(2)
+
+
+@pytest.mark.parametrize("other", [spaces.Box(0, 1, (3,)), spaces.Text(5), spaces.Dict(a=spaces.Discrete(3))])
+def test_only_the_fields_that_are_read_must_fit(tmp_path: Path, other: spaces.Space[Any]) -> None:
+    paths = [tmp_path / "0.mcap", tmp_path / "1.mcap"]
+    for path, space in zip(paths, (spaces.Box(0, 1, (2,)), other), strict=True):
+        with RecordEpisodes(Sampler(space, spaces.Discrete(3)), path) as env:
+            roll(env, 20)
+    for order in (paths, paths[::-1]):
+        dataset = tupli_mcap.open(order)
+        found = dataset.read(["rewards", "actions"])
+        rewards = np.concatenate([Recording(path).read(fields=["rewards"]).rewards for path in order])
+        assert same(found.rewards, rewards) and found.states is None
+        assert same(dataset.windows(1, fields=["rewards"])[:].rewards[:, 0], rewards)
+        assert same(dataset.transitions(fields=["rewards"])[:].rewards, rewards)
+        assert same(dataset.delta_windows({"reward": [0]})[:].values["reward"][:, 0], rewards)
+        assert dataset.stats(["rewards"])["rewards"].count == 40
+        for use in (
+            lambda dataset: dataset.read(["next_states"]),
+            lambda dataset: dataset.windows(2),
+            lambda dataset: dataset.transitions(fields=["next_states"]),
+            lambda dataset: dataset.delta_windows({"state": [0]}),
+            lambda dataset: dataset.stats(["states"]),
+        ):
+            with pytest.raises(SpaceError, match=r"state.*: expected .* as in .*.mcap, found"):
+                use(dataset)
 
 
 def test_many_files_keep_few_open(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from tupli_mcap.recording.frames import Frames
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
+
+T = TypeVar("T", Windows, Transitions, DeltaWindows)
 
 
 class RandomAccess(SaysWhatIsMeant):
@@ -63,10 +65,10 @@ class RandomAccess(SaysWhatIsMeant):
 
         Raises:
             SamplingError: no episode is long enough, or an argument is invalid.
+            SpaceError: one array cannot hold a field of two of the recordings.
         """
         steps, fields = self._with_more(fields)
-        made = Windows(steps, length, stride, pad, history, fields=fields)
-        return made.of_episodes(self._values_now())
+        return self._checked(Windows(steps, length, stride, pad, history, fields=fields))
 
     def transitions(
         self, n_step: int = 1, discount: float = 1.0, *, fields: Sequence[str] = TRANSITION_FIELDS
@@ -78,9 +80,10 @@ class RandomAccess(SaysWhatIsMeant):
 
         Raises:
             SamplingError: the dataset is empty, or an argument is invalid.
+            SpaceError: one array cannot hold a field of two of the recordings.
         """
         steps, fields = self._with_more(fields)
-        return Transitions(steps, n_step, discount, fields=fields).of_episodes(self._values_now())
+        return self._checked(Transitions(steps, n_step, discount, fields=fields))
 
     def _with_more(self, fields: Sequence[str]) -> tuple[Steps, Sequence[str]]:
         """The steps, with infos and frames if fields name them, and the names of the fields to read."""
@@ -134,11 +137,16 @@ class RandomAccess(SaysWhatIsMeant):
 
         Raises:
             SamplingError: the dataset is empty, a key is unknown, or the recordings do not agree on the time of a step.
+            SpaceError: one array cannot hold the values at a key of two of the recordings.
         """
         if unit == "seconds" and step_seconds is None:
             step_seconds = self._step_seconds()
-        made = DeltaWindows(self.steps, deltas, unit, step_seconds=step_seconds)
-        return made.of_episodes(self._values_now())
+        return self._checked(DeltaWindows(self.steps, deltas, unit, step_seconds=step_seconds))
+
+    def _checked(self, items: T) -> T:
+        """The items with their episodes' values; SpaceError now, not at the first batch, if they cannot be read."""
+        _ = items[:0]
+        return items.of_episodes(self._values_now())
 
 
 def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter) -> np.ndarray[Any, Any]:

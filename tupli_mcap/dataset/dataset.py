@@ -312,7 +312,7 @@ class Dataset(RandomAccess):
 
         Raises:
             DatasetError: a field is unknown.
-            SpaceError: one array cannot hold the steps of two recordings; the message names them.
+            SpaceError: one array cannot hold a field of two of the recordings; the message names them.
         """
         keys, others = info_keys(fields)
         if any(keys):
@@ -397,6 +397,7 @@ class Dataset(RandomAccess):
 
         Raises:
             DatasetError: a field has no numbers, or there is no step.
+            SpaceError: one array cannot hold a field of two of the recordings.
         """
         names = field_names(fields, STATISTICAL, DatasetError)
         if missing := [name for name in names if name not in self._stats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,14 +23,16 @@ def field_leaves(field: str, layout: StepLayout) -> Sequence[Leaf] | None:
     return groups.get(field)
 
 
-def check_layouts(first: StepLayout, first_name: str, other: StepLayout, other_name: str) -> None:
-    """Raises SpaceError unless one array can hold the columns of two recordings; it names the first leaf that differs,
-    and both recordings."""
-    for root, ours, theirs in (
-        ("state", first.state, other.state),
-        ("action", first.action, other.action),
-        ("reward", first.reward, other.reward),
-    ):
+def check_layouts(
+    first: StepLayout, first_name: str, other: StepLayout, other_name: str, fields: Iterable[str]
+) -> None:
+    """Raises SpaceError unless one array can hold each of these fields of two recordings; it names the first leaf that
+    differs, and both recordings."""
+    for field in fields:
+        ours, theirs = field_leaves(field, first), field_leaves(field, other)
+        if ours is None or theirs is None:
+            continue
+        root = field.removeprefix("next_").removesuffix("s")
         found = {leaf.keys: leaf for leaf in theirs}
         if {leaf.keys for leaf in ours} != found.keys():
             a, b = (", ".join(leaf.path for leaf in leaves) or "nothing" for leaves in (ours, theirs))

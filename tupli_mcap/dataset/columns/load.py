@@ -52,7 +52,7 @@ def read_columns(
     selector: TupleSelector | None = None,
     known: Selected | None = None,
 ) -> tuple[dict[str, Any], Selected, StepLayout | None]:
-    """Columns of the wanted steps by field, the selection of these steps, and their common layout.
+    """Columns of the wanted steps by field, the selection of these steps, and the layout of the first recording.
 
     Fields are those of `Recording.read`, "infos" (a list of dicts) and "steps" (int64, from 0 in each
     episode). Memory holds at most the result, one block of episodes (64 MiB, or one episode) and the cache
@@ -61,7 +61,7 @@ def read_columns(
     `selector` is the tuple filter, and `known` its result if it was evaluated before.
 
     Raises:
-        SpaceError: one array cannot hold two of the recordings.
+        SpaceError: one array cannot hold a field of two of the recordings.
         NotFoundError: an episode is missing in its recording: the file was changed.
     """
     total = sum(header.n_tuples for header in headers)
@@ -116,7 +116,7 @@ class _Reader:
             self._layout, self._first_name = layout, recording.name
             self._builders = {field: _FieldBuilder(field, self._capacity, layout) for field in self._fields}
         else:
-            check_layouts(self._layout, self._first_name, layout, recording.name)
+            check_layouts(self._layout, self._first_name, layout, recording.name, self._needed)
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
         most = 1 if "frames" in self._needed else _BLOCK_BYTES // step_bytes(layout)  # frames are large

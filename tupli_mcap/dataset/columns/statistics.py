@@ -57,6 +57,9 @@ def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, dict[str
     steps = dataset.steps
     if steps.layout is None or not len(steps):
         raise DatasetError("expected steps to take statistics of, found none")
+    steps.read(
+        fields, np.empty(0, np.int64)
+    )  # SpaceError, also where the first recording's leaves have no statistics
     layout, total = steps.layout, len(steps)
     leaves = [(field, leaf) for field in fields for leaf in field_leaves(field, layout) or ()]
     leaves = [(field, leaf) for field, leaf in leaves if leaf.kind != "variable" and not leaf.apart]

@@ -7,7 +7,7 @@ import itertools
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +87,7 @@ class StepIndex:
     """
 
     layouts: list[StepLayout]
+    names: list[str]  # of the first recording with each layout
     layout_of: list[int]  # of each file
     stores: list[ChunkStore]
     steps: Segments
@@ -109,7 +110,6 @@ class StepIndex:
         """Opens one recording after the other.
 
         Raises:
-            SpaceError: one array cannot hold two of the recordings.
             NotFoundError: an episode is missing in its recording: the file was changed.
         """
         builder = _Builder(files, cache)
@@ -121,6 +121,11 @@ class StepIndex:
     @property
     def files(self) -> Files:
         return Files(self.layouts, self.layout_of, self.stores)
+
+    def check(self, fields: Sequence[str]) -> None:
+        """Raises SpaceError unless one array can hold each of these fields of all recordings."""
+        for layout, name in zip(self.layouts[1:], self.names[1:], strict=True):
+            check_layouts(self.layouts[0], self.names[0], layout, name, fields)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "layouts": [layout.to_metadata() for layout in self.layouts]}
@@ -157,10 +162,10 @@ class _Builder:
     def __init__(self, files: OpenFiles, cache: ChunkCache) -> None:
         self._files, self._cache = files, cache
         self._layouts: list[StepLayout] = []
+        self._names: list[str] = []
         self._known: dict[tuple[str, ...], int] = {}
         self._layout_of: list[int] = []
         self._parts: list[_Part] = []
-        self._first_name = ""
         self._digest = hashlib.sha256()
 
     def add(self, recording: Recording, listed: ListedEpisodes) -> None:
@@ -177,12 +182,9 @@ class _Builder:
     def _layout(self, name: str, layout: StepLayout) -> int:
         key = tuple(layout.to_metadata().values())
         if key not in self._known:
-            if self._layouts:
-                check_layouts(self._layouts[0], self._first_name, layout, name)
-            else:
-                self._first_name = name
             self._known[key] = len(self._layouts)
             self._layouts.append(layout)
+            self._names.append(name)
         return self._known[key]
 
     def finish(self) -> StepIndex:
@@ -196,6 +198,7 @@ class _Builder:
         after[went_on] = lengths.sum() + np.arange(np.count_nonzero(went_on))
         return StepIndex(
             self._layouts,
+            self._names,
             self._layout_of,
             [part.store for part in parts],
             self._steps(None),

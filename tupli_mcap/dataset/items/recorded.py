@@ -38,7 +38,6 @@ class RecordedSteps:
         mask: the wanted ones of the listed steps (bool); None for all.
 
     Raises:
-        SpaceError: one array cannot hold two of the recordings.
         NotFoundError: an episode is missing in its recording: the file was changed.
     """
 
@@ -173,6 +172,7 @@ class RecordedSteps:
     def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
         """The plan to read some fields, whose columns then share the budget."""
         names = checked_fields(fields)
+        self._index.check(names)
         kinds = [rows.columns for rows in self._rows[:-1]]
         plan = Plan.of([field for field in names if field != "next_states"], layout, kinds)
         for i, leaves in plan.sources:

@@ -52,6 +52,7 @@ class Steps(Protocol):
 
         Raises:
             SamplingError: there is no such field.
+            SpaceError: one array cannot hold a field of two of the recordings.
         """
         ...
 

@@ -236,19 +236,20 @@ def _rows(
 
 
 def _column(files: Files, leaf: Leaf) -> Column:
-    """The column of a leaf of the first layout, in a dtype that holds the values of all layouts."""
+    """The column of a leaf of the first layout, in a dtype that holds the values of all layouts that share it."""
     if leaf.kind == "variable":
         return Column((), None)
     dtype = files.layouts[0].dtypes[leaf.name]
     for layout in files.layouts[1:]:
-        dtype = common_dtype(dtype, layout.dtypes[_own_names(files, layout)[leaf.name]]) or dtype
+        own = _own_names(files, layout)[leaf.name]
+        dtype = common_dtype(dtype, layout.dtypes.get(own, dtype)) or dtype
     return Column(leaf.shape, dtype)
 
 
 def _own_names(files: Files, layout: StepLayout) -> dict[str, str]:
-    """ROS names of leaves: in the first layout -> in this one."""
+    """ROS names of leaves: in the first layout -> in this one; the same for a leaf that this one lacks."""
     names = {leaf.path: leaf.name for leaf in layout.leaves}
-    return {leaf.name: names[leaf.path] for leaf in files.layouts[0].leaves}
+    return {leaf.name: names.get(leaf.path, leaf.name) for leaf in files.layouts[0].leaves}
 
 
 # ---- fields
