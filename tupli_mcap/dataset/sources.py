@@ -167,7 +167,10 @@ class FilesSource:
         for name, uuids in made_of.items():
             if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
                 more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
-                warn(f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice")
+                warn(
+                    f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice; move one "
+                    "of them to another directory, or open the recordings that you mean by their names"
+                )
         return found
 
     def _each(self) -> Iterator[tuple[str, Recording]]:
