@@ -603,7 +603,7 @@ def test_what_was_saved_beside_its_source_hides_nothing(tmp_path: Path) -> None:
     """Episodes keep their ids: those that are in both files count once."""
     record(tmp_path / "run.mcap", 1, 6)
     tupli_mcap.open(tmp_path / "run.mcap").head(2).save(tmp_path / "best.mcap")
-    with pytest.warns(UserWarning, match="holds 2 episodes of .*best.mcap again"):
+    with pytest.warns(UserWarning, match=r"best.mcap holds 2 episodes of .*run.mcap again; they"):
         assert len(tupli_mcap.open(tmp_path)) == 6
 
 
@@ -920,10 +920,40 @@ def test_two_continued_copies_are_told_apart(tmp_path: Path) -> None:
             env.reset(seed=seed)
             env.step(0)
     with pytest.warns(
-        UserWarning, match=r"are copies of one recording, and both went on: episode 2 .* by itself"
+        UserWarning,
+        match=r"b.mcap \(3 episodes, \d+ steps\) and .*a.mcap \(.*\) are copies of one recording, but .*both "
+        r"went on; .*: 3 episodes of .*b.mcap left out; open it by itself",
     ):
         assert tupli_mcap.open(tmp_path).headers[-1].seed == 10
     assert tupli_mcap.open(second).headers[-1].seed == 20
+
+
+@pytest.mark.parametrize("names", ["ab", "ba"])
+def test_a_whole_recording_counts_before_a_copy_that_was_cut_off(tmp_path: Path, names: str) -> None:
+    whole, cut = (tmp_path / f"{name}.mcap" for name in names)
+    with tupli_mcap.EpisodeWriter(whole, SPACE, SPACE, chunk_size=1000) as writer:
+        for seed in range(4):
+            writer.begin(seed=seed)
+            for i in range(50):
+                writer.step(np.zeros(1, np.float32), np.zeros(1, np.float32), 1.0, i == 49)
+            writer.end()
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    with pytest.warns(UserWarning, match="was not finished and has no journal"):
+        part = tupli_mcap.open(cut).headers
+    assert 1 < len(part) < 4 and part[-1].end == "interrupted"
+    with (
+        pytest.warns(UserWarning, match="no journal"),
+        pytest.warns(UserWarning, match="left out") as warned,
+    ):
+        headers = tupli_mcap.open(tmp_path).headers
+    assert {(header.recording, header.end, header.n_tuples) for header in headers} == {
+        (str(whole), "terminal", 50)
+    }
+    (said,) = (str(one.message) for one in warned if "left out" in str(one.message))
+    assert (
+        said.startswith(f"{cut} ({len(part)} episodes, ") and f" and {whole} (4 episodes, 200 steps)" in said
+    )
+    assert "one was cut off" in said and f"{len(part)} episodes of {cut} left out" in said
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,9 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
     """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
     a server: "http://lab:8080"), or a list of them.
 
-    An episode that is in two of the files counts once, with a warning. An episode that is still being recorded has the
-    steps so far, and ends as interrupted.
+    An episode that is in two of the files counts once, with a warning: that of the file with more episodes, if they are
+    copies of one recording that differ. A recording that was made of others has episodes of its own, which count beside
+    theirs, also with a warning. An episode that is still being recorded has the steps so far, and ends as interrupted.
 
         ds = tupli_mcap.open("runs/")
         best = ds.filter("return > 100").sort("return", descending=True).head(10)

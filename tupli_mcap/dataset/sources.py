@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, RecordingError, TupliError, warn
+from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_url, matching, shown_name
@@ -146,24 +146,17 @@ class FilesSource:
     ) -> list[EpisodeHeader]:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
-        known: dict[str, EpisodeHeader] = {}
+        listed: dict[str, list[EpisodeHeader]] = {}  # by name
         by_uuid: dict[str, str] = {}  # the names of recordings
         made_of: dict[str, set[str]] = {}  # by name, the UUIDs of others
-        found: list[EpisodeHeader] = []
         for name, recording in self._each():
             if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
             notes = None if recording.path is None else Notes.read(recording.path)
             deleted = set() if notes is None else notes.about(recording.metadata).deleted
-            headers = list(episode_headers(recording, name, deleted))
-            copies = [header for header in headers if header.id in known]
-            if copies:
-                warn(_again(name, copies, known))
-            new = [header for header in headers if header.id not in known]
-            known.update((header.id, header) for header in new)
+            listed[name] = list(episode_headers(recording, name, deleted))
             by_uuid[recording.uuid] = name
             made_of[name] = _made_of(recording)
-            found += [header for header in new if episode_filter is None or matches(header)]
         for name, uuids in made_of.items():
             if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
                 more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
@@ -171,7 +164,7 @@ class FilesSource:
                     f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice; move one "
                     "of them to another directory, or open the recordings that you mean by their names"
                 )
-        return found
+        return [header for header in _each_once(listed) if episode_filter is None or matches(header)]
 
     def _each(self) -> Iterator[tuple[str, Recording]]:
         """The recordings and the names that are shown, each open until the next one."""
@@ -250,15 +243,38 @@ def _made_of(recording: Recording) -> set[str]:
     return set()
 
 
-def _again(name: str, copies: Sequence[EpisodeHeader], known: Mapping[str, EpisodeHeader]) -> str:
-    """What to warn of where a file has episodes with the ids of other files' ones."""
-    first = known[copies[0].id].recording
-    others = [one.episode for one in copies if one.created_at != known[one.id].created_at]
-    if not others:
-        return f"{name} holds {len(copies)} episodes of {first} again; they are left out"
+def _each_once(listed: Mapping[str, Sequence[EpisodeHeader]]) -> list[EpisodeHeader]:
+    """Each episode of some files once. Of files that are copies of one recording, the largest one counts (one may have
+    been cut off, or gone on), of equal ones the first; warns of what is left out."""
+    sizes = {name: (len(headers), sum(one.n_tuples for one in headers)) for name, headers in listed.items()}
+    counted: dict[str, EpisodeHeader] = {}
+    for name in sorted(listed, key=sizes.__getitem__, reverse=True):  # stable also in reverse
+        copies = [header for header in listed[name] if header.id in counted]
+        if copies:
+            warn(_left_out(name, copies, counted, sizes))
+        for header in listed[name]:
+            counted.setdefault(header.id, header)
+    return [header for headers in listed.values() for header in headers if counted[header.id] is header]
+
+
+def _left_out(
+    name: str,
+    copies: Sequence[EpisodeHeader],
+    counted: Mapping[str, EpisodeHeader],
+    sizes: Mapping[str, tuple[int, int]],
+) -> str:
+    """What to warn of where a file has episodes that count as those of another file."""
+    first, many = counted[copies[0].id].recording, plural(len(copies), "episode")
+    same = [(one.created_at, one.n_tuples) for one in copies]
+    if same == [(counted[one.id].created_at, counted[one.id].n_tuples) for one in copies]:
+        return f"{name} holds {many} of {first} again; {'they are' if len(copies) > 1 else 'it is'} left out"
+    a, b = (
+        f"{one} ({plural(sizes[one][0], 'episode')}, {plural(sizes[one][1], 'step')})"
+        for one in (name, first)
+    )
     return (
-        f"{name} and {first} are copies of one recording, and both went on: episode {others[0]} of {name} is another "
-        f"one than in {first}; of {name}, {len(copies)} episodes are left out; open it by itself"
+        f"{a} and {b} are copies of one recording, but one was cut off, or both went on; the larger one counts, of "
+        f"equal ones the first: {many} of {name} left out; open it by itself to see them"
     )
 
 
