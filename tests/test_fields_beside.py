@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pandas
 import pytest
 from environments import Scripted
 
@@ -112,6 +113,26 @@ def test_of_columns(dataset: tupli_mcap.Dataset) -> None:
     assert dataset.read(["infos"]).infos[0]["name"] == "at 1"
     with pytest.raises(SamplingError, match="did you mean 'force'"):
         dataset.read("info.forse")
+
+
+@pytest.mark.parametrize("large", [2**53 + 1, -(2**53) - 1, np.int64(2**60 + 1), np.uint64(2**64 - 1), 2**63])
+@pytest.mark.parametrize("other", [0.5, -1, None])
+def test_large_integers_keep_their_digits(tmp_path: Path, large: Any, other: Any) -> None:
+    env = Scripted(
+        lambda n: n, gym.spaces.Discrete(9), info=lambda n: {"id": other if n % 2 else large}, length=4
+    )
+    with RecordEpisodes(env, tmp_path / "r.mcap", record_info=True) as recorded:
+        recorded.reset(seed=0)
+        for _ in range(4):
+            recorded.step(0)
+    dataset = tupli_mcap.open(tmp_path / "r.mcap")
+    told = [int(large) if n % 2 == 0 else other for n in range(1, 5)]
+    for column in (
+        dataset.read(["info.id"]).infos["id"],
+        dataset.windows(4, fields=["info.id"])[0].infos["id"],
+        [None if pandas.isna(value) else value for value in dataset.to_pandas()["info.id"]],
+    ):
+        assert list(column) == told
 
 
 def test_times_are_a_field(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,13 @@ def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
 def arrays_at(tree: Any, place: Any) -> Any:
     """Indexes each array of nested dicts and tuples with `place`: an index, a slice, or a tuple of these."""
     return map_arrays(tree, operator.itemgetter(place))
+
+
+def are_floats(numbers: Iterable[Array]) -> bool:
+    """Whether float64 holds arrays of one shape exactly: no integer in them is as far from 0 as 2**53, beyond which not
+    every integer is a float."""
+    whole = [each for each in numbers if each.dtype.kind in "iu"]
+    return not whole or bool((np.abs(np.stack(whole, dtype=np.float64)) < 2**53).all())
 
 
 def short_repr(value: Any) -> str:

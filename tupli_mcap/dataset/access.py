@@ -61,7 +61,8 @@ class RandomAccess(SaysWhatIsMeant):
 
         See `Windows`: an index gives one window, an array of numbers gives a batch. The field "infos" gives a dict of
         columns for all keys of the infos, "info.<key>" for one key; they are all read into memory. Numbers are
-        arrays, with NaN for steps without such an info. The field "frames" gives the recorded pictures of the states.
+        arrays, with NaN for steps without such an info; a list if they include both integers from 2**53 on and floats
+        or steps without one. The field "frames" gives the recorded pictures of the states.
 
         Raises:
             SamplingError: no episode is long enough, or an argument is invalid.

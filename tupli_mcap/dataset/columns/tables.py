@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError
@@ -149,10 +150,11 @@ def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]
 
 
 def _floats(values: Sequence[Any]) -> Any:
-    """Numbers, some of which may be None: as a masked array, which tells them from NaN, if a float can hold all."""
+    """Numbers, some of which may be None: as a masked array, which tells them from NaN, if floats hold them exactly."""
     numbers = np.array([np.nan if value is None else value for value in values])
-    if numbers.dtype.kind != "f":  # an integer is too large
-        return values
+    given = [np.asarray(value) for value in values if value is not None]
+    if numbers.dtype.kind != "f" or not are_floats(given):
+        return import_pandas().Series(values, dtype=object)
     return np.ma.masked_array(numbers, [value is None for value in values])
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, are_floats
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, following, pick, rows_of_runs
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.recording.frames import Frames, gathered
@@ -95,7 +95,8 @@ def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None 
     """A column for each of `keys`, by default for all keys.
 
     Numbers, and arrays of one shape, become an array of shape (steps, ...) with their dtype; if some steps lack the
-    key it is float64, with NaN for them. Other values become a list, with None for steps that lack the key.
+    key it is float64, with NaN for them. Other values, and integers that would lose digits as floats, become a list,
+    with None for steps that lack the key.
 
     Raises:
         SamplingError: no step has one of the keys.
@@ -113,7 +114,8 @@ def _column(values: list[Any]) -> Any:
     if not alike or any(isinstance(value, list | tuple) for value in values):
         return values
     if len(there) == len(values):
-        return np.stack(there)
-    column = np.full((len(values), *there[0].shape), np.nan)
-    column[[value is not None for value in values]] = there
-    return column
+        column = np.stack(there)
+    else:
+        column = np.full((len(values), *there[0].shape), np.nan)
+        column[[value is not None for value in values]] = there
+    return column if column.dtype.kind != "f" or are_floats(there) else values
