@@ -223,6 +223,41 @@ def test_lists_are_episodes(tmp_path: Path) -> None:
     assert [info["x"] for info in data[2].infos] == list(range(7))
 
 
+def test_seeds_and_a_dict_of_infos_for_each_step_are_kept(tmp_path: Path) -> None:
+    """In lists of episodes, in arrays of sub-environments, and in arrays of one."""
+    lists, vector, single = (tmp_path / f"{name}.mcap" for name in ("lists", "vector", "single"))
+    lengths = [3, 1]
+    infos: Any = [[{"x": i} if i else {"first": "yes"} for i in range(n)] for n in lengths]
+    states, scalars = [np.zeros((n, 1)) for n in lengths], [np.zeros(n) for n in lengths]
+    write_rollout(lists, states, scalars, scalars, infos=infos, seeds=[5, None])
+    data = tupli_mcap.open(lists)
+    assert [e.seed for e in data] == [5, None]
+    assert [list(e.infos) for e in data] == infos
+
+    ends = np.zeros((6, 2), np.bool_)
+    ends[[1, 3], 0] = ends[5, :] = True
+    told = [[{"step": t, "env": env} for env in range(2)] for t in range(6)]
+    for given in (None, told):
+        write_rollout(
+            vector, np.zeros((6, 2, 1)), ends * 1.0, ends * 1.0, ends, infos=given, seeds=np.array([7, 8]),
+            autoreset="disabled", mode="w",
+        )  # fmt: skip
+        data = tupli_mcap.open(vector)
+        assert sorted((e.env, e.seed or 0, len(e)) for e in data) == [
+            (0, 0, 2),
+            (0, 0, 2),
+            (0, 7, 2),
+            (1, 8, 6),
+        ]
+    (second,) = data.filter("env == 1")
+    assert list(second.infos) == [{"step": t, "env": 1} for t in range(6)]
+
+    write_rollout(
+        single, np.zeros((6, 1)), ends[:, 0], ends[:, 0] * 1.0, ends[:, 0], seeds=7, autoreset="disabled"
+    )
+    assert [e.seed for e in tupli_mcap.open(single)] == [7, None, None]
+
+
 def test_tensors_dicts_and_images_are_understood(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     images = np.random.default_rng(0).integers(0, 255, (5, 2, 16, 16, 3)).astype(np.uint8)
@@ -302,8 +337,16 @@ def test_a_run_has_known_parts(tmp_path: Path) -> None:
     arrays = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
     with pytest.raises(RecordingError, match=r"found 'nmae' \(did you mean 'name'\?\)"):
         write_rollout(tmp_path / "r.mcap", *arrays, run={"nmae": "x"})
-    with pytest.raises(StepError, match="infos: expected arrays by name, found"):
-        write_rollout(tmp_path / "r.mcap", *arrays, infos=[{"x": 1}, {"x": 2}])
+    with pytest.raises(StepError, match="infos: expected arrays by name, or a dict for each step, found"):
+        write_rollout(tmp_path / "r.mcap", *arrays, infos=[{"x": 1}, None])
+    with pytest.raises(
+        StepError, match=r"infos: expected arrays that begin with \(2,\), as rewards, found \(1,\)"
+    ):
+        write_rollout(tmp_path / "r.mcap", *arrays, infos=[{"x": 1}])
+    with pytest.raises(StepError, match="seeds: expected one for each of 2 sub-environments, found 3"):
+        write_rollout(tmp_path / "r.mcap", np.zeros((2, 2, 1)), *[np.zeros((2, 2))] * 2, seeds=3)
+    with pytest.raises(StepError, match="seeds: expected a list of one for each of 1 episodes, found 3"):
+        write_rollout(tmp_path / "r.mcap", *([array] for array in arrays), seeds=3)
     with pytest.raises(RecordingError, match=r"\['metadata'\]\['code'\] is a .*module, .*; convert it"):
         write_rollout(tmp_path / "r.mcap", *arrays, run={"metadata": {"code": np}})
     assert not (tmp_path / "r.mcap").exists()

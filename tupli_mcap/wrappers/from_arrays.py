@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
 from typing import Any, Final, Literal, NamedTuple
 
 import gymnasium as gym
@@ -39,8 +40,9 @@ class _Part(NamedTuple):
     terminals: Array
     timeouts: Array
     final_state: Any
-    infos: Mapping[str, Any]
+    infos: Any
     metadata: Mapping[str, Any]
+    seed: Any = None
     whole: bool = False
     name: str = ""  # for messages
 
@@ -57,6 +59,7 @@ def write_rollout(
     final_states: Any = None,
     infos: Any = None,
     metadata: Any = None,
+    seeds: Any = None,
     autoreset: Autoreset | str | None = None,
     observation_space: gym.Space[Any] | None = None,
     action_space: gym.Space[Any] | None = None,
@@ -92,8 +95,11 @@ def write_rollout(
             also that of the last step, and nothing else.
         final_states: instead of that, one for each episode that a flag ends, in the order of
             `numpy.argwhere(terminals | timeouts)`; in lists, one for each episode, None if it is not known.
-        infos: name -> array, along the same axes as the rewards; in lists, one such dict for each episode.
+        infos: name -> array, along the same axes as the rewards; or a dict for each step, in a list of T, or in T lists
+            of N; in lists of episodes, either of these for each episode.
         metadata: of every episode; in lists, one for each or one for all.
+        seeds: that of the reset before the first step, for sub-environments a list of N; in lists, one for each
+            episode. None: not known.
         autoreset: what the row after an end is, if arrays continue after one. "next-step": a reset; its action and
             reward are left out. "same-step": a step of the next episode, whose first state follows the end.
             "disabled": the same, and the caller has reset between the steps, also after the last one if it is an end.
@@ -117,7 +123,7 @@ def write_rollout(
         _one_of("timeouts", timeouts, "truncations", truncations),
         _one_of("next_states", next_states, "next_observations", next_observations),
         _one_of("final_states", final_states, "final_observations", final_observations),
-        infos, metadata,
+        infos, metadata, seeds,
     )  # fmt: skip
     parts, first, lead, count = _rollout_of(given, autoreset, reward_space)
     observations = observation_space or _space(first.states, lead, "states")
@@ -152,7 +158,7 @@ def _rollout_of(
             raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
     if isinstance(given.rewards, list | tuple) and given.rewards and _array(given.rewards[0]).ndim:
         return _episodes(given), _episode(given, 0), 1, None
-    given = _Given._make([*(map_arrays(one, _array) for one in given[:-1]), given.metadata])
+    given = _Given._make([*(map_arrays(one, _array) for one in given[:-2]), given.metadata, given.seeds])
     lead = _lead(given.rewards, reward_space)
     count = given.rewards.shape[1] if lead == 2 else None
     return _streams(given, lead, _mode(autoreset)), given, lead, count
@@ -170,6 +176,7 @@ class _Given(NamedTuple):
     final_states: Any
     infos: Any
     metadata: Any
+    seeds: Any
 
 
 def _write(writer: EpisodeWriter, part: _Part) -> None:
@@ -178,8 +185,9 @@ def _write(writer: EpisodeWriter, part: _Part) -> None:
         writer.episodes(*steps, part.final_state, env=part.env)
         return
     n = len(part.rewards)
-    infos = [arrays_at(part.infos, i) for i in range(n)] if part.infos else None
-    writer.begin(metadata=part.metadata, env=part.env)
+    is_told = part.infos is not None and len(part.infos) > 0
+    infos = [arrays_at(part.infos, i) for i in range(n)] if is_told else None
+    writer.begin(seed=part.seed, metadata=part.metadata, env=part.env)
     writer.steps(*steps, infos=infos, env=part.env)
     writer.end(part.final_state, env=part.env)
 
@@ -203,10 +211,9 @@ def _episodes(given: _Given) -> Iterator[_Part]:
             told = one.next_states is not None or _length(states) == n
             final = arrays_at(one.next_states, n - 1) if told else arrays_at(states, n)
         flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
-        metadata, infos = one.metadata or {}, one.infos or {}
         yield _Part(
-            0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, infos, metadata,
-            name=f"episode {i}: ",
+            0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, one.infos,
+            one.metadata or {}, one.seeds, name=f"episode {i}: ",
         )  # fmt: skip
 
 
@@ -217,10 +224,10 @@ def _episode(given: _Given, i: int) -> _Given:
         if value is None or (name == "metadata" and isinstance(value, Mapping)):
             entries.append(value)
             continue
-        if isinstance(value, Mapping) or len(value) != count:
-            found = "a dict" if isinstance(value, Mapping) else len(value)
+        if isinstance(value, Mapping) or not hasattr(value, "__len__") or len(value) != count:
+            found = len(value) if isinstance(value, Sequence) else shorten(value)
             raise StepError(f"{name}: expected a list of one for each of {count} episodes, found {found}")
-        entries.append(value[i] if name == "metadata" else map_arrays(value[i], _array))
+        entries.append(value[i] if name in ("metadata", "seeds") else map_arrays(value[i], _array))
     return _Given(*entries)
 
 
@@ -250,12 +257,22 @@ def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
     if not mode and done[:-1].any():
         step = np.argwhere(done[:-1])[0][0]
         raise StepError(f"autoreset: an episode ends at step {step}, and the arrays go on; {_CHOOSE}")
-    given = given._replace(terminals=terminals, timeouts=timeouts)
+    given = given._replace(terminals=terminals, timeouts=timeouts, seeds=_seeds(given.seeds, shape[1:]))
     finals = _Finals(given, done, mode)
     columns = [(env,) for env in range(shape[1])] if lead == 2 else [()]
     spans = [_spans(done[:, *column], mode) for column in columns]
     parts = (_parts(given, finals, *each) for each in zip(columns, spans, strict=True))
     return itertools.chain.from_iterable(parts)
+
+
+def _seeds(given: Any, streams: tuple[int, ...]) -> Sequence[Any]:
+    """The seed of each sub-environment; of the only one if there are none."""
+    seeds: Sequence[Any] = [given] * math.prod(streams) if given is None or not streams else given
+    if not isinstance(seeds, Sized) or len(seeds) != math.prod(streams):
+        raise StepError(
+            f"seeds: expected one for each of {streams[0]} sub-environments, found {shorten(given)}"
+        )
+    return seeds
 
 
 def _spans(done: Array, mode: str) -> tuple[Array, Array]:
@@ -280,8 +297,10 @@ def _parts(
     """The episodes of one sub-environment; consecutive whole ones are one part."""
     begins, ends = spans
     alone, known = ~finals.done[ends, *column], finals.known(ends, column)
-    if given.infos or given.metadata:
+    env = column[0] if column else 0
+    if given.infos is not None or given.metadata:
         alone[:] = True
+    alone[0] |= given.seeds[env] is not None
     turns = (np.diff(begins // _TOGETHER) != 0) | (known[1:] != known[:-1])
     cuts = np.flatnonzero(turns | alone[1:] | alone[:-1]) + 1
     for first, stop in itertools.pairwise([0, *cuts.tolist(), len(ends)]):
@@ -292,11 +311,11 @@ def _parts(
             rows = np.delete(np.arange(rows.start, rows.stop), after - rows.start)
         where, last = (rows, *column), ends[first:stop] if whole else int(ends[first])
         states, actions, rewards, terminals, timeouts, infos = (
-            arrays_at(tree, where) for tree in (*given[:5], given.infos or {})
+            arrays_at(tree, where) for tree in (*given[:5], given.infos)
         )
         yield _Part(
-            column[0] if column else 0, states, actions, rewards, terminals, timeouts, finals.at(last, column),
-            infos, given.metadata or {}, whole,
+            env, states, actions, rewards, terminals, timeouts, finals.at(last, column), infos,
+            given.metadata or {}, None if first else given.seeds[env], whole,
         )  # fmt: skip
 
 
@@ -355,8 +374,9 @@ def _lead(rewards: Array, space: gym.Space[Any] | None) -> int:
 
 
 def _check_infos(infos: Any) -> None:
-    if not (infos is None or isinstance(infos, Mapping)):
-        raise StepError(f"infos: expected arrays by name, found {shorten(infos)}")
+    is_dicts = isinstance(infos, np.ndarray) and all(isinstance(one, Mapping) for one in infos.flat)
+    if not (infos is None or isinstance(infos, Mapping) or is_dicts):
+        raise StepError(f"infos: expected arrays by name, or a dict for each step, found {shorten(infos)}")
 
 
 def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> None:
