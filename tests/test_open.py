@@ -1056,3 +1056,35 @@ def test_a_recorded_nan_is_not_missing_in_arrow(tmp_path: Path) -> None:
     frame = dataset.to_pandas()
     assert frame["info.force"].dtype == frame["metadata.score"].dtype == np.float64
     assert frame["info.force"].isna().sum() == 4
+
+
+@pytest.mark.parametrize(
+    ("test", "found"),
+    [
+        ("= 8", "8"),
+        ("!= 8", "9n"),
+        ("< 9", "8"),
+        (">= 0", "89"),
+        ("in [8]", "8"),
+        ("not in [8]", "9nm"),
+        ("= null", "n"),
+    ],
+)
+def test_null_is_a_value_and_a_missing_one_is_not(tmp_path: Path, test: str, found: str) -> None:
+    """A seed that an episode does not have is null; metadata that it does not have are missing."""
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", SPACE, SPACE) as writer:
+        for seed, metadata in ((8, {"x": 8}), (9, {"x": 9}), (None, {"x": None}), (None, {})):
+            writer.begin(seed=seed, metadata=metadata)
+            writer.step(np.zeros(1, np.float32), np.zeros(1, np.float32), 0.0, terminal=True)
+            writer.end()
+    dataset = tupli_mcap.open(tmp_path)
+    for lazily in (True, False):
+        if not lazily:
+            assert len(dataset) == 4
+        assert [e.episode for e in dataset.filter(f"metadata.x {test}").headers] == [
+            "89nm".index(c) for c in found
+        ]
+        of_seed = found.replace("m", "") + ("m" if "n" in found else "")
+        assert [e.episode for e in dataset.filter(f"seed {test}").headers] == [
+            "89nm".index(c) for c in of_seed
+        ]

@@ -10,7 +10,8 @@ A filter is true or false for an item (nested mappings of JSON values), never un
   anything, itself included; NE is true for it.
 - **GT, GEQ, LT, LEQ** compare numbers with numbers and texts with texts (by code point); they are false for every
   other pair.
-- **null** (None) is a value: EQ None is true if the key is there and null.
+- **null** (None) is a value: EQ None is true if the key is there and null. An episode without a seed or a return has
+  null there, so `seed != 8` is true for it.
 - A **list** is EQ to each of its elements: `run.tags = "x"` is true if "x" is one of the tags, and NE if it is
   none of them. GT, GEQ, LT and LEQ are false for lists.
 - A mapping, also one in a list, is EQ to nothing, and so NE to everything. A filter cannot compare with a mapping or a
