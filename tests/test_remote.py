@@ -30,7 +30,7 @@ from web_server import WebServer, serving
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, RecordingError, TupliDataset, write_recording
 from tupli_mcap.cli import app
-from tupli_mcap.remote import copied, matching, objects, shown, source
+from tupli_mcap.remote import copied, matching, objects, plan, shown, source
 from tupli_mcap.remote.patterns import _expression
 from tupli_mcap.remote.plan import pieces_of
 
@@ -83,6 +83,20 @@ def test_a_whole_field_takes_few_requests(server: WebServer, large: Path) -> Non
     server.asked.clear()
     recording.read(fields=["states"])
     assert not server.asked  # the same chunks
+
+
+def test_no_byte_is_fetched_twice(server: WebServer, large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plan, "_LARGEST_PIECE", 1 << 20)
+    expected = Recording(large)
+    table, edge = expected.file.store.table, large.stat().st_size - (128 << 10)
+    assert (
+        (table["offset"] < edge) & (edge < table["offset"] + table["length"])
+    ).any()  # a chunk straddles it
+    assert np.array_equal(Recording(server.url()).read().states, expected.read().states)
+    asked = [asked.range or "" for asked in server.asked]
+    ranges = sorted(tuple(map(int, text[len("bytes=") :].split("-"))) for text in asked[1:])
+    assert asked[0] == "bytes=-131072" and len(ranges) > 2
+    assert all(before[1] < after[0] for before, after in itertools.pairwise([*ranges, (edge, edge)]))
 
 
 def test_an_episode_takes_its_chunks_and_no_more(server: WebServer, large: Path) -> None:
@@ -471,11 +485,13 @@ def test_pieces_cover_what_is_wanted_and_little_more(starts: list[tuple[int, int
     pieces = pieces_of(wanted)
     assert pieces == sorted(pieces)
     assert all(first[1] <= second[0] for first, second in itertools.pairwise(pieces))
-    assert all(0 < stop - start <= 8 << 20 for start, stop in pieces)
     covered = sum(stop - start for start, stop in pieces)
     for start, stop in wanted:
-        inside = sum(max(0, min(stop, b) - max(start, a)) for a, b in pieces)
-        assert inside == stop - start
+        assert sum(a <= start and stop <= b for a, b in pieces) == 1
+    for start, stop in pieces:  # only ranges that overlap make a larger one
+        inside = sorted(each for each in wanted if start <= each[0] < stop)
+        ends = itertools.accumulate((end for _, end in inside), max)
+        assert stop - start <= 8 << 20 or all(a < end for (a, _), end in zip(inside[1:], ends, strict=False))
     union, end = 0, 0
     for start, stop in sorted(wanted):
         union += max(0, stop - max(start, end))

@@ -23,9 +23,10 @@ def pieces_of(wanted: Iterable[Range]) -> list[Range]:
     """Ranges that cover all the wanted ones, in ascending order; each is one request.
 
     Adjacent ranges become one, and so do ranges with small gaps: the smallest gaps first, as long as all gaps together
-    are a small part of the wanted bytes. A range has at most 8 MiB, so that several are fetched at the same time.
+    are a small part of the wanted bytes. A range holds each wanted one whole or not at all, so that nothing is fetched
+    twice. It has at most 8 MiB, unless a wanted one is larger, so that several are fetched at the same time.
     """
-    merged = _touching(wanted)
+    merged = _apart(wanted)
     gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(itertools.pairwise(merged)))
     left = _LITTLE + sum(stop - start for start, stop in merged) // _WASTE
     bridged = set()
@@ -34,30 +35,24 @@ def pieces_of(wanted: Iterable[Range]) -> list[Range]:
         if left < 0 or gap > _LARGEST_GAP:
             break
         bridged.add(i)
-    pieces: list[list[int]] = []
+    pieces: list[Range] = []
     for i, (start, stop) in enumerate(merged):
-        if pieces and i - 1 in bridged:
-            pieces[-1][1] = stop
+        if i - 1 in bridged and stop - pieces[-1][0] <= _LARGEST_PIECE:
+            pieces[-1] = (pieces[-1][0], stop)
         else:
-            pieces.append([start, stop])
-    return [piece for start, stop in pieces for piece in _cut(start, stop)]
+            pieces.append((start, stop))
+    return pieces
 
 
-def _touching(wanted: Iterable[Range]) -> list[Range]:
+def _apart(wanted: Iterable[Range]) -> list[Range]:
+    """The wanted ranges in ascending order; those that overlap become one."""
     found: list[Range] = []
     for start, stop in sorted(wanted):
-        if found and start <= found[-1][1]:
+        if found and start < found[-1][1]:
             found[-1] = (found[-1][0], max(stop, found[-1][1]))
         elif start < stop:
             found.append((start, stop))
     return found
-
-
-def _cut(start: int, stop: int) -> list[Range]:
-    """Cuts a range into pieces of about the same size."""
-    count = -(-(stop - start) // _LARGEST_PIECE)
-    size = -(-(stop - start) // count)
-    return [(at, min(stop, at + size)) for at in range(start, stop, size)]
 
 
 def is_cut_cheaper(wanted: Sequence[int] | None, episodes: int, size: int) -> bool:

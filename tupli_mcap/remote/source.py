@@ -137,6 +137,8 @@ class RemoteSource:
         first = self.size - len(self._tail.data)
         if offset >= first:
             return self._tail.data[offset - first : stop - first]
+        if stop > first:  # the tail has the rest
+            return memoryview(self.read(offset, first - offset) + self._tail.data[: stop - first])
         check_process(self._url)
         block = _blocks.find(self._file, offset, stop) or self._kept_block(offset, stop)
         block = block or self._ask_for(offset, stop)
@@ -152,11 +154,11 @@ class RemoteSource:
         """Starts to fetch ranges that will be read next; fetching continues while they are read."""
         first = self.size - len(self._tail.data)
         kept = self._kept.ranges() if self._kept else []
+        wanted = [(start, min(stop, first)) for start, stop in ranges if start < first]
         missing = [
-            (start, min(stop, self.size))
-            for start, stop in ranges
-            if start < first
-            and not _blocks.find(self._file, start, stop)
+            (start, stop)
+            for start, stop in wanted
+            if not _blocks.find(self._file, start, stop)
             and not any(begin <= start and stop <= end for begin, end in kept)
         ]
         with self._lock:
@@ -188,7 +190,7 @@ class RemoteSource:
                     del self._planned[i]
                     return self._begin(first, last)
             if stop <= _HEAD:
-                start, stop = 0, min(_HEAD, self.size)
+                start, stop = 0, min(_HEAD, self.size - len(self._tail.data))
             _tell(stop - start, 0)
             return self._begin(start, stop)
 
