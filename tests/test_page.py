@@ -403,6 +403,19 @@ class TestChosen:
         broken.unlink()
         assert found.content == b"no recording, but a file of this directory"
 
+    def test_foxglove_is_not_given_what_is_not_finished(self, lab: Path, tmp_path: Path) -> None:
+        whole = (lab / "ppo0.mcap").read_bytes()
+        (tmp_path / "broken.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+        with pytest.warns(UserWarning, match="was not finished"), browsing(tmp_path) as address:
+            with httpx.Client(base_url=address, timeout=60) as client:
+                first = told(client, "/episodes")["episodes"][0]["id"]
+                text = client.get(f"/episode/{first}").text
+                assert "as it is not finished. Download the episode" in text
+                assert "app.foxglove.dev" not in text
+                got = client.get("/download", params={"episode": first})
+        (tmp_path / "one.mcap").write_bytes(got.content)
+        assert tupli_mcap.Recording(tmp_path / "one.mcap").complete
+
 
 class TestDocumentation:
     def test_it_lists_the_fields_of_every_page(self, web: httpx.Client) -> None:

@@ -298,7 +298,8 @@ class TestWhoSeesWhat:
                 assert got.startswith(b"\x89MCAP")
                 replay = bob.get("/replay.rrd", params={"episode": carts[1]}).content
                 assert b"6 terminal" not in replay
-                assert "foxglove" not in bob.get(f"/episode/{carts[1]}").text
+                text = bob.get(f"/episode/{carts[1]}").text
+                assert "foxglove" not in text and "as you may read only a part of it" in text
                 link = re.search(
                     'href="(https://app.foxglove.dev/[^"]*)"', ann.get(f"/episode/{carts[1]}").text
                 )

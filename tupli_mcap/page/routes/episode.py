@@ -91,8 +91,9 @@ def one_step(shelf: Shown, uri: str, step: int) -> Response:
 
 
 def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Episode) -> str:
-    """A link that opens the recording in Foxglove, where the episode begins."""
-    place = shelf.address_of(header.recording)
+    """A link that opens the recording in Foxglove, where the episode begins; empty if Foxglove cannot read it here, as
+    it asks for the index, which an unfinished file lacks, and then for ranges."""
+    place = shelf.address_of(header.recording) if shown.recording.complete else None
     if place is None:
         return ""
     url = str(request.base_url).rstrip("/") + place
