@@ -272,7 +272,7 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
             Recording(url)
     monkeypatch.setenv("AWS_ENDPOINT_URL", server.url(""))
     server.failures = [403] * 20
-    with pytest.raises(RecordingError, match="lab cannot be read: .* 403 Forbidden; check the credentials"):
+    with pytest.raises(RecordingError, match="lab/ cannot be read: .* 403 Forbidden; check the credentials"):
         matching("s3://lab/*.mcap")
 
 
@@ -432,6 +432,11 @@ def test_other_addresses_go_through_fsspec(large: Path) -> None:
     assert np.array_equal(Recording("memory://runs/x.mcap").read().states, Recording(large).read().states)
     for folder in ("memory://runs", "memory:///runs"):
         assert matching(f"{folder}/*.mcap") == matching(f"{folder}/**") == [f"{folder}/x.mcap"]
+    fsspec.filesystem("memory").pipe("/at-root.mcap", large.read_bytes())
+    for root in ("memory://", "memory:///"):
+        assert matching(f"{root}*.mcap") == [f"{root}at-root.mcap"]
+    assert len(TupliDataset.from_files("memory://*.mcap").preview()) == EPISODES
+    assert matching("memory://ru*/x.mcap") == ["memory://runs/x.mcap"]
     with pytest.raises(RecordingError, match="does not exist"):
         Recording("memory://runs/y.mcap")
     with pytest.raises(RecordingError, match="cannot be opened"):

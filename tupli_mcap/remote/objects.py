@@ -79,11 +79,11 @@ def find(url: str) -> RemoteObject:
 
 
 def listed(folder: str) -> Iterator[str]:
-    """The URLs of all objects below a folder of a bucket, at any depth."""
+    """The URLs of all objects below a folder, at any depth. `folder` ends with a slash: `s3://bucket/`, `memory://`."""
     if not _is_bucket(folder):
         system, path = _fsspec(folder)
         for name in asked(folder, lambda: system.find(path)):
-            yield f"{folder}/{name.removeprefix(path).lstrip('/')}"
+            yield folder + name.removeprefix(path).lstrip("/")
         return
     store, path = open_store(folder)
     bucket = folder.removesuffix(path).rstrip("/")

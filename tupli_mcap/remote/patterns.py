@@ -28,7 +28,7 @@ def matching(url: str) -> list[str]:
         return [url]
     if is_web(url):
         raise RecordingError(f"{shown(url)}: a web server does not list its files; give the address of each")
-    folder = _MAGIC.split(url, maxsplit=1)[0].rpartition("/")[0]
+    folder = "".join(_MAGIC.split(url, maxsplit=1)[0].rpartition("/")[:2])
     wanted = re.compile(_expression(url))
     found = sorted(name for name in listed(folder) if wanted.fullmatch(name))
     if not found:
