@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from zoneinfo import ZoneInfo
 
 import httpx
 import pytest
@@ -18,6 +20,7 @@ from waiting import wait_for
 
 from tupli_mcap import TupliAPIClient
 from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.schema.times import local_text
 from tupli_mcap.server.settings import Settings
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: tools/setup-viewer web")
@@ -151,6 +154,16 @@ class TestEverybody:
             shown = page.locator("tbody tr").first.locator("td.num").nth(1).bounding_box()
             assert shown is not None and shown["x"] + shown["width"] <= 360
 
+    def test_times_are_in_the_zone_of_the_browser(self, chromium: Browser, lab: str) -> None:
+        last = httpx.get(f"{lab}/dataset/CartPole-v1?format=json").json()["last_ns"]
+        for zone in ("Asia/Kolkata", "America/St_Johns", "UTC"):
+            there = datetime.datetime.fromtimestamp(last // 10**9, ZoneInfo(zone))
+            with opened(chromium, lab, timezone_id=zone) as (page, seen):
+                page.goto("/dataset/CartPole-v1")
+                shown = page.locator("time").all_inner_texts()
+                assert shown.count(str(there)) >= 3  # the facts, the table, the end of a chart
+                assert {text[-6:] for text in shown} == {str(there)[-6:]} and not seen.complaints
+
     def test_without_scripts(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, java_script_enabled=False) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1&sort=-return")
@@ -160,6 +173,8 @@ class TestEverybody:
             page.get_by_role("button", name="Compare").click()
             expect(page.get_by_role("heading", name="2 episodes compared")).to_be_visible()
             page.goto("/dataset/CartPole-v1")
+            last = httpx.get(f"{lab}/dataset/CartPole-v1?format=json").json()["last_ns"]
+            expect(page.locator(".facts time")).to_have_text(local_text(last))  # as in tables of commands
             page.locator(".stage h2 a").click()
             page.locator("input[type=range]").fill("3")
             page.get_by_role("button", name="Show").click()

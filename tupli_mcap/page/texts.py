@@ -6,9 +6,14 @@ import datetime
 import math
 from typing import Any
 
-from tupli_mcap.schema.times import time_ns
+from markupsafe import Markup
 
-__all__ = ["day", "duration", "iso", "minute", "number", "percent", "spread"]
+from tupli_mcap.schema.times import local_text, time_ns
+
+__all__ = ["duration", "iso", "moment", "number", "percent", "spread"]
+
+_TIME = Markup('<time datetime="{}">{}</time>')
+_DASH = Markup("–")
 
 
 def number(value: float | None) -> str:
@@ -30,22 +35,20 @@ def percent(part: int, whole: int) -> str:
 
 def iso(ns: int) -> str:
     """ISO 8601 in UTC, to the second."""
+    moment = datetime.datetime.fromtimestamp(ns // 10**9, datetime.UTC)
+    return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def moment(time: Any) -> Markup:
+    """A time (ns, or ISO 8601) as tables of commands show it; a script turns it into the zone of the browser.
+
+    A dash if it is no time.
+    """
+    ns = time if isinstance(time, int) else time_ns(time)
     try:
-        moment = datetime.datetime.fromtimestamp(ns // 10**9, datetime.UTC)
-    except (OverflowError, ValueError, OSError):  # a file may hold a time that no clock has
-        return ""
-    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def minute(moment: Any) -> str:
-    """A time (ns, or ISO 8601) as `2026-11-25 09:30 UTC`."""
-    ns = moment if isinstance(moment, int) else time_ns(str(moment))
-    return "" if ns is None else iso(ns)[:16].replace("T", " ") + " UTC" if iso(ns) else ""
-
-
-def day(ns: int) -> str:
-    """`2026-11-25`."""
-    return iso(ns)[:10]
+        return _DASH if ns is None else _TIME.format(iso(ns), local_text(ns))
+    except (OverflowError, ValueError):  # a file may hold a time that no clock has
+        return _DASH
 
 
 def duration(seconds: float) -> str:

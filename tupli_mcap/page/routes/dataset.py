@@ -156,8 +156,7 @@ def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[
 def _as_one(episodes: SampledEpisodes, values: Array, what: str) -> Markup:
     at = np.arange(len(values), dtype=np.float64)
     middle, mean, _, low, high, _ = bands(values, len(values) if len(values) <= _FEW else _GROUPS)
-    ends = texts.day(int(episodes.ended[0])), texts.day(int(episodes.ended[-1]))
-    ends = ends if ends[0] != ends[1] else ("first", "last")
+    ends = texts.moment(int(episodes.ended[0])), texts.moment(int(episodes.ended[-1]))
     if set(values[np.isfinite(values)].tolist()) <= {0.0, 1.0}:  # points and band of flags would show nothing
         return charts.over_time([(middle, mean)], ends, what)
     return charts.over_time([(middle, mean)], ends, what, points=(at, values), band=(low, high))

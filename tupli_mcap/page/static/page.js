@@ -4,13 +4,7 @@ import { player } from "./player.js";
 import { table } from "./table.js";
 import { upload } from "./upload.js";
 
-for (const time of document.querySelectorAll("time[datetime]")) {
-  const moment = new Date(time.dateTime);
-  if (!Number.isNaN(moment.valueOf())) {
-    time.title = time.textContent;
-    time.textContent = moment.toLocaleString(undefined, { dateStyle: "medium", timeStyle: "short" });
-  }
-}
+for (const time of document.querySelectorAll("time[datetime]")) time.textContent = local(new Date(time.dateTime));
 
 for (const section of document.querySelectorAll(".player")) player(section);
 for (const form of document.querySelectorAll("form.chosen")) table(form);
@@ -30,6 +24,14 @@ document.addEventListener("click", (event) => {
     embed(document.getElementById(opener.dataset.embed), opener);
   }
 });
+
+// A time in the zone of the browser, as tables of commands show it: 2026-11-23 04:31:07+01:00.
+function local(moment) {
+  const ahead = -moment.getTimezoneOffset(); // minutes
+  const [day, clock] = new Date(moment.valueOf() + 60_000 * ahead).toISOString().split("T");
+  const zone = [Math.abs(ahead) / 60, Math.abs(ahead) % 60].map((part) => String(Math.trunc(part)).padStart(2, "0"));
+  return `${day} ${clock.slice(0, 8)}${ahead < 0 ? "-" : "+"}${zone.join(":")}`;
+}
 
 async function copy(button) {
   const label = (button.dataset.label ??= button.textContent);
