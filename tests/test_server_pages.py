@@ -310,6 +310,41 @@ class TestWhoSeesWhat:
             finally:
                 api.publish(*carts[1:3], published=False)
 
+    def test_whose_a_dataset_without_a_benchmark_is(self, tmp_path: Path) -> None:
+        names = ["ann", "bob", "cid", "dan", "eve"]
+        carts(tmp_path, seeds=1, episodes=3)
+        with serving(Settings(tmp_path / "kept")) as url, browser(url, "admin", PASSWORD) as admin:
+
+            def card() -> tuple[str, dict[str, Any]]:
+                dataset = admin.get("/?format=json").json()["datasets"][0]
+                pages = [admin.get(address).text for address in ("/", f"/dataset/{dataset['key']}")]
+                told = [" · ".join(re.findall(r"<bdi>([^<]*)</bdi> · <bdi>([^<]*)<", pages[0])[0])]
+                told += re.findall(r"<dt>(?:Owners?|Seen by)</dt><dd>([^<]*)<", pages[1])
+                assert told[0] == " · ".join(told[1:])
+                return told[0], dataset
+
+            for name in names:
+                Api(url, "admin").post("/v1/users", username=name, password=f"{name}'s password")
+                Api(url, name).send(tmp_path / "ppo0.mcap")
+                with browser(url, name) as client:
+                    wanted = {"code": code(client), "dataset": "CartPole-v1", "group": "global"}
+                    assert client.post("/share", data=wanted).status_code == 303
+                if name == "ann":
+                    told, dataset = card()
+                    assert (told, dataset["owner"], dataset["published_in"]) == (
+                        "ann · global",
+                        "ann",
+                        ["ann", "global"],
+                    )
+            told, dataset = card()
+            assert told == "ann, bob, cid and 2 more · global"
+            assert (dataset["owner"], dataset["owners"]) == (None, names)
+            assert admin.get("/?q=eve&format=json").json()["count"] == 1
+            with browser(url, "ann") as ann:
+                own = episodes_of(ann)[0]["id"]
+                Api(url, "ann").publish(own, published=False)
+                assert "<bdi>global, private</bdi>" in ann.get("/").text
+
 
 class TestPeople:
     def test_publishing_as_a_whole(self, server: str) -> None:

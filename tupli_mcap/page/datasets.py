@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import base64
 import binascii
+import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import ColumnElement, Connection, and_, select
+from sqlalchemy import ColumnElement, Connection, and_, func, select, true
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.shelf import Shelf
@@ -26,13 +28,26 @@ _NAMELESS: Final = "-"
 _UNNAMED: Final = "Recordings without an environment"
 
 
+class Audience(NamedTuple):
+    """A number of episodes of one owner, and the groups that see them, as far as the reader may know of these."""
+
+    owner: str
+    published_in: list[str]
+    episodes: int
+
+    @property
+    def groups(self) -> list[str]:
+        """The groups without the owner's own; `private` if no other sees them."""
+        return [group for group in self.published_in if group != self.owner] or ["private"]
+
+
 @dataclass(frozen=True)
 class Dataset:
     """The facts of a dataset that the catalog has without reading its episodes. They are sums over its files: an
     episode that two files have, which lists show once, counts twice.
 
     key: its name in addresses. benchmark: None for recordings without one, or if the reader may not see it.
-    recordings: empty only for a benchmark without recordings.
+    recordings, audiences: empty only for a benchmark without recordings.
     """
 
     key: str
@@ -40,6 +55,7 @@ class Dataset:
     environment: str
     benchmark: BenchmarkHeader | None
     recordings: Sequence[Tally]
+    audiences: Sequence[Audience]
 
     @property
     def name(self) -> str:
@@ -53,6 +69,21 @@ class Dataset:
     @property
     def description(self) -> str:
         return self.benchmark.metadata.description if self.benchmark else ""
+
+    @property
+    def owners(self) -> list[str]:
+        """The owner of the benchmark, else those of its episodes."""
+        return sorted({part.owner for part in self._shared})
+
+    @property
+    def seen_by(self) -> list[str]:
+        """The groups in which the benchmark is published, else those in which any of its episodes is."""
+        return sorted({group for part in self._shared for group in part.groups})
+
+    @property
+    def _shared(self) -> Sequence[Audience]:
+        header = self.benchmark
+        return [Audience(header.created_by, header.published_in, 0)] if header else self.audiences
 
     @property
     def episodes(self) -> int:
@@ -112,7 +143,7 @@ class Dataset:
     def holds(self, words: Sequence[str]) -> bool:
         """Whether each of the words (lower case) is in its names, description, owner or tags."""
         said = [self.name, self.description, self.environment, self.benchmark_id]
-        said += [self.benchmark.created_by] if self.benchmark else []
+        said += self.owners
         for run in self.runs:
             said += [str(run.get("name", "")), *map(str, run.get("tags", ()))]
         text = "\n".join(said).lower()
@@ -127,8 +158,9 @@ class Dataset:
             "description": self.description,
             "environment": self.environment,
             "benchmark_id": self.benchmark_id or None,
-            "owner": self.benchmark.created_by if self.benchmark else None,
-            "published_in": self.benchmark.published_in if self.benchmark else None,
+            "owner": self.owners[0] if len(self.owners) == 1 else None,
+            "owners": self.owners,
+            "published_in": sorted({group for part in self._shared for group in part.published_in}),
             "recordings": len(self.recordings),
             "episodes": self.episodes,
             "steps": self.steps,
@@ -144,7 +176,7 @@ class Dataset:
 def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
     """All datasets of a shelf, the most recently recorded first."""
     found = _grouped(
-        _tallies(shelf, connection), {header.id: header for header in shelf.benchmarks(connection)}
+        shelf, connection, {header.id: header for header in shelf.benchmarks(connection)}, true()
     )
     return sorted(found, key=lambda dataset: (-dataset.last, dataset.name))
 
@@ -152,7 +184,7 @@ def all_datasets(shelf: Shelf, connection: Connection) -> list[Dataset]:
 def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
     """A dataset by its key. NotFoundError if there is none that the reader may see."""
     benchmarks = {h.id: h for h in shelf.benchmarks(connection, FilterEQ(key="id", value=key))}
-    found = _grouped(_tallies(shelf, connection, of_dataset(key)), benchmarks)
+    found = _grouped(shelf, connection, benchmarks, of_dataset(key))
     if not found:
         raise NotFoundError(f"there is no dataset {key[:80]!r} here")
     return found[0]
@@ -186,20 +218,52 @@ def of_dataset(key: str) -> ColumnElement[bool]:
     return and_(RECORDING.c.benchmark_id == "", RECORDING.c.environment == escape_text(environment))
 
 
-def _tallies(shelf: Shelf, connection: Connection, of: ColumnElement[bool] | None = None) -> list[Tally]:
-    return list(tallies(connection, shelf.seen(TALLY.c.created_by, TALLY.c.published_in), of))
-
-
-def _grouped(found: Iterable[Tally], benchmarks: Mapping[str, BenchmarkHeader]) -> list[Dataset]:
+def _grouped(
+    shelf: Shelf, connection: Connection, benchmarks: Mapping[str, BenchmarkHeader], of: ColumnElement[bool]
+) -> list[Dataset]:
+    """The datasets of benchmarks, and of the recordings that meet the condition `of`."""
     groups: dict[str, list[Tally]] = {uri: [] for uri in benchmarks}
-    for item in found:
+    for item in tallies(connection, _seen(shelf), of):
         groups.setdefault(_key(item.benchmark_id, item.environment), []).append(item)
+    audiences = _audiences(shelf, connection, of)
     made = []
     for key, items in groups.items():
         header = benchmarks.get(key)
         benchmark_id = header.id if header else items[0].benchmark_id
         environment = (items[0].environment if items else "") or (header.environment if header else "")
-        made.append(Dataset(key, benchmark_id, environment, header, items))
+        made.append(Dataset(key, benchmark_id, environment, header, items, audiences.get(key, ())))
+    return made
+
+
+def _seen(shelf: Shelf) -> ColumnElement[bool]:
+    return shelf.seen(TALLY.c.created_by, TALLY.c.published_in)
+
+
+def _audiences(shelf: Shelf, connection: Connection, of: ColumnElement[bool]) -> dict[str, list[Audience]]:
+    """The audiences of each dataset, by its key."""
+    parts = (RECORDING.c.benchmark_id, RECORDING.c.environment, TALLY.c.created_by, TALLY.c.published_in)
+    query = (
+        select(*parts, func.sum(TALLY.c.episodes))
+        .join(RECORDING, RECORDING.c.id == TALLY.c.recording_id)
+        .where(_seen(shelf), of)
+        .group_by(*parts)
+    )
+    found = [
+        (
+            _key(unescape_text(benchmark), unescape_text(environment)),
+            unescape_text(owner),
+            json.loads(groups),
+            count,
+        )
+        for benchmark, environment, owner, groups, count in connection.execute(query)
+    ]
+    known = shelf.known_audiences(connection, {name for _, _, groups, _ in found for name in groups})
+    counts = Counter[tuple[str, str, tuple[str, ...]]]()
+    for key, owner, groups, count in found:
+        counts[key, owner, tuple(known(owner, groups))] += int(count)
+    made: dict[str, list[Audience]] = {}
+    for (key, owner, groups), count in counts.items():
+        made.setdefault(key, []).append(Audience(owner, list(groups), count))
     return made
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
@@ -83,6 +83,11 @@ class _OpenToAll:
 
     def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
         return list(headers)
+
+    def known_audiences(
+        self, connection: Connection, among: Set[str]
+    ) -> Callable[[str, Sequence[str]], list[str]]:
+        return lambda owner, names: list(names)
 
 
 class DirectoryShelf(_OpenToAll):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Protocol, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, and_
@@ -50,6 +50,11 @@ class Shelf(Protocol):
 
     def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
         """The same headers, but published only in groups of which the reader may know."""
+
+    def known_audiences(
+        self, connection: Connection, among: Set[str]
+    ) -> Callable[[str, Sequence[str]], list[str]]:
+        """A function of an owner and groups (some `among` these): those of the groups of which the reader may know."""
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
         """An open recording of the catalog; NotFoundError if there is none. Others use it at the same time: do not

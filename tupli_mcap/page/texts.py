@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import datetime
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
 
 from tupli_mcap.schema.times import local_text, time_ns
 
-__all__ = ["duration", "iso", "moment", "number", "percent", "spread"]
+__all__ = ["duration", "iso", "moment", "names", "number", "percent", "spread"]
 
 _TIME = Markup('<time datetime="{}">{}</time>')
 _DASH = Markup("–")
@@ -26,6 +27,13 @@ def number(value: float | None) -> str:
         return f"{int(value):,}".replace("-", "\N{MINUS SIGN}")
     shown = f"{value:.4g}" if abs(value) < 1e4 or abs(value) >= 1e7 else f"{value:,.0f}"
     return shown.replace("-", "\N{MINUS SIGN}")
+
+
+def names(given: Sequence[str]) -> str:
+    """`ann, bob, cid`; of more than four, the first three: `ann, bob, cid and 7 more`."""
+    if len(given) <= 4:
+        return ", ".join(given)
+    return f"{', '.join(given[:3])} and {len(given) - 3} more"
 
 
 def percent(part: int, whole: int) -> str:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
-from collections import Counter
 from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Response
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection
 
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
@@ -17,11 +15,9 @@ from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
 from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
-from tupli_mcap.server.people.access import DeniedError, known_audiences, readable
+from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.storage.benchmark_json import unpack
-from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
-from tupli_mcap.storage.texts import unescape_text
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
@@ -88,15 +84,14 @@ def _turn_benchmark(
 def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200) -> Response:
     shelf = visit.shelf()
 
-    def ask(connection: Connection) -> tuple[Dataset, list[dict[str, Any]], list[str]]:
-        found = find_dataset(shelf, connection, key)
-        return found, _audiences(connection, visit, key), _groups(connection, visit)
+    def ask(connection: Connection) -> tuple[Dataset, list[str]]:
+        return find_dataset(shelf, connection, key), _groups(connection, visit)
 
-    dataset, audiences, groups = shelf.ask(ask)
+    dataset, groups = shelf.ask(ask)
     facts = {
         "dataset": dataset.key,
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
-        "episodes": audiences,
+        "episodes": [part._asdict() for part in dataset.audiences],
     }
     shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter}
     return visit.page("share.html", facts, wrong, status, **shown)
@@ -107,29 +102,6 @@ def _groups(connection: Connection, visit: Visit) -> list[str]:
     name = visit.caller.name
     groups = accounts.memberships_of(connection, name)
     return [group for group in groups if group != name and visit.caller.may(Right.EPISODE_CREATE, group)]
-
-
-def _audiences(connection: Connection, visit: Visit, key: str) -> list[dict[str, Any]]:
-    """The numbers of readable episodes of a dataset, by owner and by the groups that see them."""
-    seen = readable(visit.caller, Right.EPISODE_READ, TALLY.c.created_by, TALLY.c.published_in)
-    query = (
-        select(TALLY.c.created_by, TALLY.c.published_in, func.sum(TALLY.c.episodes))
-        .join(RECORDING, RECORDING.c.id == TALLY.c.recording_id)
-        .where(of_dataset(key), seen)
-        .group_by(TALLY.c.created_by, TALLY.c.published_in)
-    )
-    found = [
-        (unescape_text(owner), json.loads(groups), count)
-        for owner, groups, count in connection.execute(query)
-    ]
-    known = known_audiences(connection, visit.caller, {name for _, groups, _ in found for name in groups})
-    counts = Counter[tuple[str, tuple[str, ...]]]()
-    for owner, groups, count in found:
-        counts[owner, tuple(known(owner, groups))] += int(count)
-    return [
-        {"owner": owner, "published_in": list(groups), "episodes": count}
-        for (owner, groups), count in counts.items()
-    ]
 
 
 @router.get("/upload")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import TypeVar
 from urllib.parse import quote
 
@@ -17,7 +17,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Right
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people.access import Caller, as_told, readable, readable_episodes
+from tupli_mcap.server.people.access import Caller, as_told, known_audiences, readable, readable_episodes
 from tupli_mcap.server.stored.selection import Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
@@ -61,6 +61,11 @@ class LibraryShelf:
 
     def as_told(self, connection: Connection, headers: Sequence[EpisodeHeader]) -> list[EpisodeHeader]:
         return as_told(connection, self._caller, headers)
+
+    def known_audiences(
+        self, connection: Connection, among: Set[str]
+    ) -> Callable[[str, Sequence[str]], list[str]]:
+        return known_audiences(connection, self._caller, among)
 
     def open(self, recording: str, *, of: int = 1) -> Recording:
         """The recording; if the caller may read only some of its episodes, a recording of these."""
