@@ -48,7 +48,8 @@ def verify(
 
     Checks structure, CRCs, indexes, layouts, alignment and digests: every episode has to
     have a start and an end, and no missing or repeated step. In a storage, artifacts,
-    benchmarks and the catalog are checked too. Nothing is executed, nothing is written. The
+    benchmarks and the catalog are checked too. Nothing is executed, nothing is written. A
+    file at a URL is downloaded whole, into a temporary file, as every byte is checked. The
     command exits with 1 if something is damaged.
 
     --rerun rebuilds the environment of each recording, runs every episode again with its
