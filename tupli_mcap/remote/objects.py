@@ -35,7 +35,11 @@ def _nobody(_: int) -> None:
 
 
 class NoRangesError(Exception):
-    """The server sends whole files only."""
+    """The server sends whole files only; this one has `size` bytes."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(size)
+        self.size = size
 
 
 class End(NamedTuple):
@@ -192,9 +196,10 @@ class _StoredObject:
         try:
             meta = self._ask({"range": (0, 1)}).meta
         except (RefusedError, NotSupportedError) as err:
-            if not self._ask({}).meta["size"]:
+            size = self._ask({}).meta["size"]
+            if not size:
                 return End(memoryview(b""), 0, "")
-            raise NoRangesError from err
+            raise NoRangesError(size) from err
         size, version = meta["size"], _version(meta)
         return End(self.get(max(0, size - length), size, version), size, version)
 

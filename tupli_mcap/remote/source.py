@@ -253,14 +253,15 @@ def open_url(url: str) -> RemoteSource | BinaryIO:
     remote = find(url)
     try:
         return RemoteSource(url, remote, remote.tail(_TAIL))
-    except NoRangesError:
+    except NoRangesError as err:
+        size = err.size
         warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
             "a server that supports range requests avoids this"
         )
     file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it
     try:
-        _download(url, remote, file, 0)
+        _download(url, remote, file, size)
     except BaseException:
         file.close()
         raise
@@ -278,8 +279,8 @@ def copied(url: str) -> Iterator[Path]:
     remote = find(url)
     try:
         size = remote.tail(1).size
-    except NoRangesError:
-        size = 0  # unknown
+    except NoRangesError as err:
+        size = err.size
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
         path = Path(folder) / (Path(urlsplit(url).path).name or "recording.mcap")
         with path.open("xb") as file:
@@ -299,5 +300,5 @@ def _download(url: str, remote: RemoteObject, file: IO[bytes], size: int) -> Non
         file.flush()
     except OSError as err:
         raise RecordingError(f"{shown(url)} cannot be copied to {tempfile.gettempdir()}: {err}") from err
-    if size and done != size:
+    if done != size:
         raise RecordingError(f"{shown(url)}: expected {size} bytes, found {done}; try again")
