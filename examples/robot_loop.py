@@ -30,17 +30,24 @@ class Robot:
     """Stands in for the driver of a real robot."""
 
     def __init__(self) -> None:
-        self._random = np.random.default_rng(0)
         self._joints = np.zeros(6, np.float32)
 
     def observe(self, instruction: str) -> dict[str, object]:
         """Reads the sensors."""
         return {
-            "front": self._random.integers(0, 255, (48, 64, 3), dtype=np.uint8),
-            "wrist": self._random.integers(0, 255, (32, 32, 3), dtype=np.uint8),
+            "front": self._picture(48, 64, self._joints[:2]),
+            "wrist": self._picture(32, 32, self._joints[3:5]),
             "joints": self._joints.copy(),
             "instruction": instruction,
         }
+
+    @staticmethod
+    def _picture(high: int, wide: int, place: np.ndarray) -> np.ndarray:
+        """A bright square on a dark table, where two joints say."""
+        x, y = (np.clip(0.5 + place, 0, 1) * (wide - 8, high - 8)).astype(int)
+        picture = np.full((high, wide, 3), (40, 44, 52), np.uint8)
+        picture[y : y + 8, x : x + 8] = (240, 150, 40)
+        return picture
 
     def act(self, action: np.ndarray) -> float:
         """Moves for one period; returns the motor current (A)."""

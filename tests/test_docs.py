@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import builtins
 import functools
 import json
 import re
 import shlex
+import symtable
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -63,6 +65,31 @@ def test_pages_with_cells_are_run() -> None:
     assert cells
     for path in cells:
         assert path.read_text(encoding="utf-8").startswith("---\nfile_format: mystnb\n"), path
+
+
+def unknown_names(text: str) -> list[str]:
+    """The names that the Python cells of a page use and none of those that a reader sees has made."""
+    known, found = set(dir(builtins)), set[str]()
+    for block in _FENCE.finditer(text):
+        if block[1] != "{code-cell} python" or re.match(r":tags: \[remove-(cell|input)", block[2]):
+            continue
+        table = symtable.symtable(re.sub(r"(?m)^:.*", "", block[2]), "cell", "exec")
+        symbols = [*table.get_symbols()]
+        known |= {each.get_name() for each in symbols if each.is_assigned() or each.is_imported()}
+        found |= {each.get_name() for each in symbols if each.is_referenced()} - known
+    return sorted(found)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_readers_see_where_names_are_from(path: Path) -> None:
+    assert unknown_names(path.read_text(encoding="utf-8")) == []
+
+
+def test_names_of_hidden_cells_are_found() -> None:
+    hidden = "```{code-cell} python\n:tags: [remove-cell]\nrobot = 1\n```\n"
+    seen = "```{code-cell} python\nimport math\nmath.sin(robot)\n```\n"
+    assert unknown_names(hidden + seen) == ["robot"]
+    assert unknown_names(hidden.replace(":tags: [remove-cell]\n", "") + seen) == []
 
 
 def docstring_blocks() -> Iterator[tuple[str, str]]:
