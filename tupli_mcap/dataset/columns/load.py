@@ -21,13 +21,12 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIELDS, FIVE, OTHER_NAMES, OTHER_STEP_NAMES
+from tupli_mcap.recording.columns.fields import FIVE, OTHER_NAMES, OTHER_STEP_NAMES
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
 
 _BLOCK_BYTES = 64 << 20
-_RECORDED = tuple(field for field in FIELDS if field != "infos")
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,7 @@ def _read_block(
     recording: Recording, positions: Array, lengths: Array, fields: Sequence[str]
 ) -> dict[str, Any]:
     """The fields of some whole episodes; steps that were recorded after the listing are left out."""
-    recorded = [field for field in fields if field in _RECORDED]
+    recorded = [field for field in fields if field != "steps"]
     # None for all episodes is cheaper than a list of them: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
     found = recording.read(None if everything else positions, fields=recorded)
@@ -183,19 +182,10 @@ def _read_block(
     now = found.episode_lengths
     if "steps" in fields:
         columns["steps"] = steps_within(now)
-    if "infos" in fields:
-        columns["infos"] = [info for i in positions.tolist() for info in _infos(recording, i)]
     if (now > lengths).any():
         listed = steps_within(now) < np.repeat(lengths, now)
         columns = {field: pick(column, np.flatnonzero(listed)) for field, column in columns.items()}
     return columns
-
-
-def _infos(recording: Recording, position: int) -> list[dict[str, Any]]:
-    infos = recording.infos(position)
-    if infos is None:
-        return [{} for _ in range(int(recording.index["length"][position]))]
-    return [info or {} for info in infos]
 
 
 def steps_within(lengths: Array) -> Array:
@@ -206,7 +196,7 @@ def steps_within(lengths: Array) -> Array:
 
 # ---- columns that are filled, recording after recording
 
-Keep = Array | None  # a bool mask of rows, a slice as None: all
+Keep = Array | None  # a bool mask of rows; None for all
 
 
 class _LeafBuilder:
