@@ -304,7 +304,7 @@ class TupleSelector:
         for one in filters:
             if isinstance(one, BaseFilter):
                 check_keys(one, STEP_KEYS)
-                needed |= {field for key, field in STEP_KEYS.items() if _names(one, key)}
+                needed |= {STEP_KEYS[path_of(comparison)[0]] for comparison in comparisons(one)}
             elif callable(one):
                 needed |= {*FIVE, "infos"}
             else:
@@ -340,14 +340,6 @@ def _warn_of_unseen(filters: Sequence[TupleFilter], keys: Collection[str]) -> No
         if name == "info" and inside and inside[0] not in keys:
             known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
             warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
-
-
-def _names(filter: BaseFilter, key: str) -> bool:
-    try:
-        check_keys(filter, [name for name in STEP_KEYS if name != key])
-    except FilterError:
-        return True
-    return False
 
 
 def _flag(value: object) -> bool:
