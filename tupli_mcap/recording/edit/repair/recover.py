@@ -17,7 +17,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.assemble import replacing, tidy
-from tupli_mcap.recording.edit.repair.write import RepairWriter
+from tupli_mcap.recording.edit.repair.write import RepairWriter, rows_lost
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_tail
@@ -270,7 +270,7 @@ def _recover_ours(
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
-        report.infos_lost = _infos_lost(evidence, channels)
+        report.infos_lost = 0 if channels.info is None else rows_lost(evidence, [channels.info])
         report.frames_lost = writer.frames_lost
     writer.finish()
     if evidence.metadata is None:
@@ -296,18 +296,6 @@ def _report_plan(report: RecoveryReport, plan: Plan) -> None:
     ]
     report.starts_lost, report.ends_lost = plan.lost_starts, plan.lost_ends
     report.final_states_lost = plan.lost_finals
-
-
-def _infos_lost(evidence: Evidence, channels: RecordedChannels) -> int:
-    """Number of rows missing in `/info`, as far as the file shows."""
-    if channels.info is None:
-        return 0
-    ranges = evidence.ranges(channels.info)
-    stop = ranges[-1][1] if ranges else 0
-    if evidence.tail.index is not None:
-        table = evidence.tail.index.chunks
-        stop = max(stop, int(table["rows"][table["channel"] == channels.info].sum()))
-    return stop - sum(b - a for a, b in ranges)
 
 
 def _attachments_lost(evidence: Evidence) -> list[str]:

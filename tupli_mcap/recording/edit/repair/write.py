@@ -8,7 +8,7 @@ import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -132,7 +132,7 @@ class RepairWriter:
         topics = {channel.topic: channel.id for channel in self._container.channels.values()}
         for name, pairs in cameras.items():
             for pair, place, episodes in zip(pairs, places, by_env, strict=True):
-                self.frames_lost += _frames_lost(self._evidence, pair)
+                self.frames_lost += rows_lost(self._evidence, pair)
                 new_pair = topics[place.camera(name)], topics[place.frame(name)]
                 self._frames(store, pair, new_pair, episodes)
 
@@ -278,9 +278,9 @@ def _kept_frames(
                     yield time_ns, row, place
 
 
-def _frames_lost(evidence: Evidence, ids: tuple[int, int]) -> int:
-    """The number of a camera's frames that are known to have been recorded and are not whole."""
-    whole = intersection(*map(evidence.ranges, ids))
+def rows_lost(evidence: Evidence, ids: Sequence[int]) -> int:
+    """The number of rows that are known to have been recorded, and were not found in every one of these channels."""
+    whole = reduce(intersection, map(evidence.ranges, ids))
     counts = [evidence.stop(channel) for channel in ids]
     if evidence.tail.index is not None:
         table = evidence.tail.index.chunks
