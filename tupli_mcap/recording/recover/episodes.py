@@ -15,7 +15,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.index import HAS_SEED, EpisodeIndex
-from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, decoded
 from tupli_mcap.recording.recover.step_runs import Ranges, StepRun, step_runs
 
 _END = 1 << 64  # above any row number
@@ -147,23 +147,11 @@ def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channe
 def _read_records(evidence: Evidence, store: PackedStore, channels: RecordedChannels) -> EpisodeRecords:
     """Reads starts, ends and final states; in repair, it skips messages that cannot be decoded."""
     records = EpisodeRecords()
-    for row, time, body in store.all_messages(channels.start):
-        try:
-            start = EpisodeStart.decode(body)
-        except FormatError:
-            if evidence.strict:
-                raise
-            continue
+    for row, time, start in decoded(store, channels.start, EpisodeStart.decode, strict=evidence.strict):
         if start.episode in records.starts:
             records.resets.setdefault(start.episode, []).append(records.starts[start.episode])
         records.starts[start.episode] = Start(time, start, row)
-    for row, time, body in store.all_messages(channels.end):
-        try:
-            end = EpisodeEnd.decode(body)
-        except FormatError:
-            if evidence.strict:
-                raise
-            continue
+    for row, time, end in decoded(store, channels.end, EpisodeEnd.decode, strict=evidence.strict):
         records.ends[end.episode] = End(time, end, row)
     for row, _, body in store.all_messages(channels.final):
         records.finals[int.from_bytes(body[:4], "little")] = row

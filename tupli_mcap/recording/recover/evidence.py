@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -30,6 +30,7 @@ from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA, check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeIndex
 
+T = TypeVar("T")
 _CACHE = 64 << 20
 
 
@@ -257,6 +258,20 @@ class PackedStore(ChunkStore):
         """The body of one message."""
         ((_, body),) = self.messages(channel, row, 1)
         return bytes(body)
+
+
+def decoded(
+    store: PackedStore, channel: int | None, decode: Callable[[memoryview], T], *, strict: bool
+) -> Iterator[tuple[int, int, T]]:
+    """(row, log_time, message) of a channel, without those that cannot be decoded; FormatError for one if `strict`."""
+    for row, time_ns, body in store.all_messages(channel):
+        try:
+            message = decode(body)
+        except FormatError:
+            if strict:
+                raise
+        else:
+            yield row, time_ns, message
 
 
 # ---- the file up to its first damage

@@ -40,7 +40,7 @@ from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, head
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels, decoded, head
 from tupli_mcap.spaces.leaves import Leaf
 
 STEPS_IN_JOURNAL = "steps that are not yet in a chunk are nowhere else"
@@ -349,11 +349,5 @@ class _Steps:
 
 def _starts(store: PackedStore, channels: RecordedChannels) -> dict[tuple[int, int], int]:
     """First rows of episodes, by sub-environment and number."""
-    first_rows = {}
-    for _, _, body in store.all_messages(channels.start):
-        try:
-            start = EpisodeStart.decode(body)
-        except FormatError:
-            continue
-        first_rows[start.env, start.episode] = start.first_row
-    return first_rows
+    starts = decoded(store, channels.start, EpisodeStart.decode, strict=False)
+    return {(start.env, start.episode): start.first_row for _, _, start in starts}
