@@ -7,7 +7,7 @@ value of null removes the key.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, RecordingError, plural
@@ -27,12 +27,12 @@ class Annotation(NamedTuple):
 
 
 class Annotations:
-    """The annotations of a recording, in their order; raises FormatError if `data` is something else."""
+    """The annotations of a recording, in their order."""
 
-    def __init__(self, data: bytes | None = None, where: str = "") -> None:
-        self.said: list[Annotation] = [] if data is None else _read(data, where)
+    def __init__(self, said: Sequence[Annotation] = ()) -> None:
+        self.said = said
         self._of_episode: dict[int, list[Annotation]] = {}
-        for annotation in self.said:
+        for annotation in said:
             for number in dict.fromkeys(annotation.episodes):
                 self._of_episode.setdefault(number, []).append(annotation)
 
@@ -65,15 +65,16 @@ class Annotations:
             raise RecordingError(f"annotations: expected at most {MAX_ANNOTATIONS} bytes, found {len(data)}")
         return data
 
-
-def _read(data: bytes, where: str) -> list[Annotation]:
-    try:
-        document = jsonvalue.loads(data.decode())
-    except (FormatError, ValueError, RecursionError) as err:
-        raise FormatError(f"{where}: expected annotations as JSON, found something else: {err}") from err
-    if not isinstance(document, list) or not all(map(_is_annotation, document)):
-        raise FormatError(f"{where}: expected a list of annotations, see annotations.schema.json")
-    return [Annotation(one["episodes"], one["values"], one["by"], one["at"]) for one in document]
+    @classmethod
+    def from_json(cls, data: bytes, where: str) -> Self:
+        """The annotations in `data`; raises FormatError if it is something else."""
+        try:
+            document = jsonvalue.loads(data.decode())
+        except (FormatError, ValueError, RecursionError) as err:
+            raise FormatError(f"{where}: expected annotations as JSON, found something else: {err}") from err
+        if not isinstance(document, list) or not all(map(_is_annotation, document)):
+            raise FormatError(f"{where}: expected a list of annotations, see annotations.schema.json")
+        return cls([Annotation(**one) for one in document])
 
 
 def _is_annotation(value: object) -> bool:

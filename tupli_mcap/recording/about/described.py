@@ -93,7 +93,7 @@ class DescribedRecording(OpenedRecording):
         data = self._small_attachment(ANNOTATIONS_NAME, MAX_ANNOTATIONS)
         if data is None:
             return Annotations()
-        return Annotations(data, f"{self.name}: {ANNOTATIONS_NAME}")
+        return Annotations.from_json(data, f"{self.name}: {ANNOTATIONS_NAME}")
 
     @cached_property
     def readable_runs(self) -> list[Run]:

@@ -65,9 +65,8 @@ def annotate_episodes(
             raise RecordingError(
                 f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
             )
-        said = Annotations()
         added = Annotation(chosen, dict(values), user_name(), iso_utc(time.time_ns()))
-        said.said = [*recording.annotations.said, added]
+        said = Annotations([*recording.annotations.said, added])
         say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
     return chosen
 
@@ -79,12 +78,10 @@ def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> A
         RecordingError: there is no annotation. Other errors are those of `annotate_episodes`.
     """
     with _changing(path, dry_run) as (recording, say):
-        said = Annotations()
-        said.said = [*recording.annotations.said]
-        if not said.said:
+        if not recording.annotations.said:
             raise RecordingError(f"{path} has no annotation to take back")
-        last = said.said.pop()
-        say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
+        *kept, last = recording.annotations.said
+        say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, Annotations(kept).to_json())
     return last
 
 

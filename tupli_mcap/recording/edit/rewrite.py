@@ -187,7 +187,7 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
     runs: list[Run] = []
     known: list[Run] = []  # as the files have them: names and times of files differ within a run
     places: list[int] = []
-    annotations = Annotations()
+    annotations = []
     several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
     for recording, rows, shift in parts:
         said_runs = recording.runs if several else recording.recorded_runs.runs
@@ -203,7 +203,7 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
         for said in recording.annotations.said:
             numbers = [number + shift for number in said.episodes if number in kept]
             if numbers:
-                annotations.said.append(said._replace(episodes=numbers))
+                annotations.append(said._replace(episodes=numbers))
     spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
     found = {}
     if runs and runs != [Run()]:
@@ -211,8 +211,8 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
         edits = first.before if not several and runs == first.runs else ()
         carried = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
         found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
-    if annotations.said:
-        found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, annotations.to_json())
+    if annotations:
+        found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, Annotations(annotations).to_json())
     return found
 
 
