@@ -27,8 +27,9 @@ from tupli_mcap.mcap.records import (
 from tupli_mcap.mcap.source import Source, TemporarySource, open_source
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import FINAL_STATE_SCHEMA, STEP_SCHEMA, StepLayout
-from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, Topics
+from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.columns.read import ColumnReader
 from tupli_mcap.recording.contents import (
@@ -80,6 +81,12 @@ class OpenFile(NamedTuple):
     topics: Mapping[str, int]
     steps: Sequence[int]
     cameras: Cameras
+
+    @property
+    def infos(self) -> InfoCodec | None:
+        """The codec of the infos; None if the file has none."""
+        channel = self.topics.get(INFO)
+        return None if channel is None else InfoCodec.from_metadata(self.contents.channels[channel].metadata)
 
 
 class RecordedBenchmark(NamedTuple):

@@ -14,7 +14,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT, EpisodeEnd, EpisodeStart
-from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.check.report import Findings
@@ -287,15 +286,14 @@ class _Checker:
 
     def infos(self) -> None:
         """Checks that each info is of a step of the recording, and that each step has at most one."""
-        channel = self._topics.get(INFO)
-        if channel is None:
+        codec = self._recording.file.infos
+        if codec is None:
             return
-        decoder = InfoCodec.from_metadata(self._channels[channel].metadata)
         last: dict[int, int] = {}
         for row, _, body in self._messages(INFO):
             place: dict[str, Any] = {"channel": INFO}
             try:
-                number, step, _ = decoder.decode(body)
+                number, step, _ = codec.decode(body)
             except FormatError as err:
                 self._error("info", f"row {row} cannot be decoded: {err}", **place)
                 continue

@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
-from tupli_mcap.messages.infos import InfoCodec, with_text_keys
+from tupli_mcap.messages.infos import with_text_keys
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
@@ -103,15 +103,14 @@ def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS
     """Infos of steps of these episodes, by the texts of their keys: all, or of a recording with more than `most` or
     with large ones some at even distances; none of a URL."""
     file = recording.file
-    channel = file.topics.get(INFO)
-    total = 0 if channel is None or recording.path is None else file.store.count(channel)
-    if channel is None or not total:
+    codec, channel = file.infos, file.topics.get(INFO, 0)
+    total = 0 if recording.path is None else file.store.count(channel)
+    if codec is None or not total:
         return []
     table = file.contents.table
     size = int(table["uncompressed"][table["channel"] == channel].sum())
     each = max(1, min(most, READ_BYTES * total // max(1, size)) // _PLACES)
     places, each = (1, total) if total <= _PLACES * each else (_PLACES, each)
-    codec = InfoCodec.from_metadata(file.contents.channels[channel].metadata)
     wanted = set(recording.index["episode"][positions].tolist())
     starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
     bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)

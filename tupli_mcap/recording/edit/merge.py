@@ -366,25 +366,15 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
                 )
 
 
-def _infos_of(recording: Recording) -> InfoCodec | None:
-    """The codec of a recording's infos; None if it has none."""
-    channel = recording.file.topics.get(INFO)
-    return (
-        None
-        if channel is None
-        else InfoCodec.from_metadata(recording.file.contents.channels[channel].metadata)
-    )
-
-
 def _new_infos(recording: Recording, codec: InfoCodec | None) -> tuple[InfoCodec, InfoCodec] | None:
     """A recording's codec of infos, and the merged one's, if they differ."""
-    own = _infos_of(recording)
+    own = recording.file.infos
     return None if own is None or codec is None or own.names == codec.names else (own, codec)
 
 
 def _common_infos(sources: Sequence[Excerpt]) -> InfoCodec | None:
     """The codec of all infos: with a typed field for each entry that has one in a recording."""
-    found = [codec for source in sources if (codec := _infos_of(source.recording)) is not None]
+    found = [codec for source in sources if (codec := source.recording.file.infos) is not None]
     return InfoCodec(list(dict.fromkeys(name for codec in found for name in codec.names))) if found else None
 
 
