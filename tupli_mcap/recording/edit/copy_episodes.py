@@ -110,12 +110,9 @@ class EpisodeCopier:
         # by channel, the time of the last new frame: times must not decrease, even if the clock went back
         self._held: dict[int, int] = {}
 
-    def run(self, rows: Array) -> None:
-        """Copies the episodes in `rows` of the source's index."""
-        self._target.add_episodes(self.copy(rows))
-
     def copy(self, rows: Array) -> list[CopiedEpisode]:
-        """Copies the steps of episodes with their images, frames and infos; returns their other records.
+        """Copies the steps of the episodes in `rows` of the source's index, with their images, frames and infos;
+        returns their other records.
 
         If sub-environments get other numbers, it does not copy infos: the caller adds those of `infos`.
         """
@@ -135,10 +132,11 @@ class EpisodeCopier:
                 images = self._topics[topics.image(leaf.name)]
                 self._copy(images, spans, layout.image_messages[leaf.name].dtype)
         self._frames(rows)
-        if infos and self._first_env is None and self._info_codecs is None:
-            self._copy_places(self._topics[INFO], self._infos(rows), numbered=True)
-        elif infos and self._first_env is None:
-            self._target.add_messages(self._to(self._topics[INFO]), self.infos(rows))
+        if infos and self._first_env is None:
+            if self._info_codecs is None:
+                self._copy_places(self._topics[INFO], self._infos(rows), numbered=True)
+            else:
+                self._target.add_messages(self._to(self._topics[INFO]), self.infos(rows))
         return self._episodes(rows, firsts)
 
     def _trimmed(self, rows: Array) -> Array:
@@ -287,10 +285,9 @@ class EpisodeCopier:
         channel, place = self._topics[FINAL_STATE], int(row["final_row"])
         if place < 0:
             return None
-        new = self._values.finals.get(int(row["episode"]))
+        new, time_ns = self._values.finals.get(int(row["episode"])), self._time_of(channel, place)
         if new is not None:
-            return self._time_of(channel, place), partial(bytes, numbers + new)
-        time_ns = self._time_of(channel, place)
+            return time_ns, partial(bytes, numbers + new)
         if not self._layout.state:
             return time_ns, lambda: numbers
         return time_ns, lambda: numbers + next(body for _, body in self._messages(channel, place, 1))[8:]

@@ -147,7 +147,8 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        EpisodeCopier(source, target, cameras, frames=frames, trims=trims).run(rows)
+        copier = EpisodeCopier(source, target, cameras, frames=frames, trims=trims)
+        target.add_episodes(copier.copy(rows))
     target.finish(now)
     return target.copied
 
