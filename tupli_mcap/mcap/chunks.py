@@ -24,6 +24,7 @@ from tupli_mcap.mcap.records import (
     MAX_ROWS_A_BYTE,
     RECORD,
     iter_records,
+    message_index,
     parse_record,
 )
 
@@ -117,9 +118,11 @@ class ChunkRecords(NamedTuple):
         """The channel of all messages."""
         return int(self.headers["#channel"][0])
 
-    def index_entries(self) -> Array:
-        """The entries that the chunk's MessageIndex must have."""
-        return index_entries(self.headers["#log_time"], self.headers["#offset"], self.skip)
+    def is_indexed_by(self, body: memoryview) -> bool:
+        """Whether the body of a MessageIndex record is the one that the chunk must have."""
+        channel, entries = message_index(body)
+        wanted = index_entries(self.headers["#log_time"], self.headers["#offset"], self.skip)
+        return channel == self.channel and np.array_equal(entries, wanted)
 
     @property
     def first(self) -> int:

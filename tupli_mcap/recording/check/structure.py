@@ -19,7 +19,6 @@ from tupli_mcap.mcap.records import (
     MAGIC,
     PROFILE,
     check_crc,
-    message_index,
     parse_record,
     records,
 )
@@ -270,9 +269,7 @@ class Structure:
         if waiting is None:
             self._error("message_index", "expected it behind a good chunk only", offset=record.offset)
             return
-        number, entries = message_index(record.body)
-        content = waiting.records
-        if number != content.channel or not np.array_equal(entries, content.index_entries()):
+        if not waiting.records.is_indexed_by(record.body):
             why = "it has other times or offsets than its chunk"
             self._error("message_index", why, offset=record.offset)
 

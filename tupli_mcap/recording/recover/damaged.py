@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from typing import NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
@@ -23,7 +22,6 @@ from tupli_mcap.mcap.records import (
     check_crc,
     checked_attachment,
     has_summary,
-    message_index,
     parse_record,
     read_attachment,
     read_summary,
@@ -137,8 +135,8 @@ def gather(source: Source, tail: Tail) -> Evidence:
         elif item.chunk is not None:
             indexed = _take_chunk(evidence, item, item.chunk, chunks)
         else:
-            if item.opcode == Opcode.MESSAGE_INDEX and indexed is not None:
-                _check_index(evidence, item, indexed)
+            if item.opcode == Opcode.MESSAGE_INDEX and indexed and not indexed.is_indexed_by(item.body):
+                _add_damage(evidence, item, "the message index says other than its chunk holds")
             indexed = None
             _take(evidence, item)
     for channel, found_chunks in chunks.items():
@@ -153,12 +151,6 @@ class _FoundChunk(NamedTuple):
     length: int
     piece: Piece
     repaired: str  # what is wrong in its header
-
-
-def _check_index(evidence: Evidence, record: Found, records: ChunkRecords) -> None:
-    number, entries = message_index(record.body)
-    if number != records.channel or not np.array_equal(entries, records.index_entries()):
-        _add_damage(evidence, record, "the message index says other than its chunk holds")
 
 
 def _add_damage(evidence: Evidence, record: Found, why: str) -> None:
