@@ -178,10 +178,6 @@ class ChunkStore:
         """The chunks of a channel in the order of their rows."""
         return [int(i) for i in self._by_channel[channel][0]] if channel in self._by_channel else []
 
-    def table_of(self, channel: int) -> Array:
-        """CHUNK_ROWS of a channel in the order of their rows."""
-        return self.table[self.chunks(channel)]
-
     def spans(self, channel: int, first: int, count: int) -> Iterator[Span]:
         """The places of the rows `first:first + count` of a channel."""
         if count == 0:
