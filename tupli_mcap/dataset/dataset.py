@@ -172,7 +172,7 @@ class Dataset(RandomAccess):
         """A recording with the dataset's episodes in it, or at least the `needed` ones."""
         return self._recordings.get(name, self._chosen[name], needed)
 
-    def _of(self, headers: Sequence[EpisodeHeader]) -> Dataset:
+    def _of(self, headers: Sequence[EpisodeHeader] | None) -> Dataset:
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
         made._filter = self._filter
@@ -216,14 +216,14 @@ class Dataset(RandomAccess):
             return self._of([header for header in self.headers if test(self._episode(header))])
         wanted = parse_filter(test) if isinstance(test, str) else test
         check_keys(wanted, EpisodeHeader)
-        made = self._of([])
-        made._filter = wanted if self._filter is None else self._filter & wanted
-        made._listed = None
+        found = None  # listed later, by this filter too
         if self._listed is not None:
             matches = compile_predicate(wanted, EpisodeHeader)
-            made._listed = [header for header in self._listed if matches(header)]
-            if not made._listed:
+            found = [header for header in self._listed if matches(header)]
+            if not found:
                 check_metadata(wanted, self._listed)
+        made = self._of(found)
+        made._filter = wanted if self._filter is None else self._filter & wanted  # what `save` notes
         return made
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
