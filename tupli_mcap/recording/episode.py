@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
     from tupli_mcap.replay import Film
+    from tupli_mcap.schema import EpisodeHeader
 
 
 class _Step(NamedTuple):
@@ -63,12 +64,6 @@ class Step(_Step, SaysWhatIsMeant):
         return self.timeout
 
 
-class Described(Protocol):
-    """Knows the metadata of an episode."""
-
-    metadata: dict[str, Any]
-
-
 class Episode(GymnasiumNames):
     """One episode of a recording.
 
@@ -87,7 +82,7 @@ class Episode(GymnasiumNames):
         self._recording = recording
         self._position = position
         self._row = recording.index[position]
-        self.listed: Described | None = None
+        self.listed: EpisodeHeader | None = None
         """The dataset's entry of this episode; its metadata follow later annotations."""
         self.alone: Callable[[], Dataset] | None = None
         """Makes a dataset of this episode only, if it comes from a dataset."""
