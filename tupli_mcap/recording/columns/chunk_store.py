@@ -67,7 +67,7 @@ class ChunkCache:
         self._lock = threading.Lock()
         self._process = os.getpid()
 
-    def _held(self) -> threading.Lock:
+    def _own_lock(self) -> threading.Lock:
         if self._process != os.getpid():  # forked: a thread of the parent may hold the lock
             self._lock, self._process = threading.Lock(), os.getpid()
         return self._lock
@@ -75,13 +75,13 @@ class ChunkCache:
     def get(self, key: tuple[int, int]) -> KeptChunk | None:
         if not self._kept:  # so that threads that read a whole recording do not wait for each other
             return None
-        with self._held():
+        with self._own_lock():
             if key in self._kept:
                 self._kept.move_to_end(key)
             return self._kept.get(key)
 
     def put(self, key: tuple[int, int], kept: KeptChunk) -> None:
-        with self._held():
+        with self._own_lock():
             before = self._kept.pop(key, None)
             self._kept[key] = kept
             self._bytes += len(kept.data) - (0 if before is None else len(before.data))
@@ -90,7 +90,7 @@ class ChunkCache:
 
     def clear(self) -> None:
         """Forgets all chunks."""
-        with self._held():
+        with self._own_lock():
             self._kept.clear()
             self._bytes = 0
 
@@ -146,7 +146,7 @@ class ChunkStore:
         self._memory = memory
         self._cache = ChunkCache(cache) if isinstance(cache, int) else cache
         self._checked = np.zeros(len(table), np.bool_)
-        self._held = np.zeros(len(table), np.bool_)  # against `claims`
+        self._compared = np.zeros(len(table), np.bool_)  # with `claims`
         self._number = next(_numbers)  # tells stores apart that share a cache
         self.codecs: Mapping[int, ImageCodec] = {}  # by channel; rows of other channels are not encoded
         # By step channel, the rows that the episode index names. Unless it is None, the rows of all channels are
@@ -209,7 +209,7 @@ class ChunkStore:
         self.__dict__.update(state)
         self._number = next(_numbers)
         self._checked = np.zeros(len(self.table), np.bool_)
-        self._held = np.zeros(len(self.table), np.bool_)
+        self._compared = np.zeros(len(self.table), np.bool_)
 
     def locate(self, channels: Array, first: Array, counts: Array) -> tuple[Array, Array, Array]:
         """The places of the runs `first[i]:first[i] + counts[i]` of rows of `channels[i]` (int64), in their order:
@@ -322,12 +322,12 @@ class ChunkStore:
             raise FormatError(
                 f"{self._source.name}: chunk {i} holds records that are not rows of its channel"
             )
-        if self.claims is not None and not self._held[i]:
-            self._hold_rows(i, data, channel, n, dtype.itemsize)
+        if self.claims is not None and not self._compared[i]:
+            self._compare_rows(i, data, channel, n, dtype.itemsize)
         kept.rows = rows
         return rows
 
-    def _hold_rows(self, i: int, data: Any, channel: int, n: int, size: int) -> None:
+    def _compare_rows(self, i: int, data: Any, channel: int, n: int, size: int) -> None:
         """Raises FormatError unless the rows of a chunk are those that the index names."""
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(channel)
@@ -335,9 +335,9 @@ class ChunkStore:
             _check_sequence(np.ndarray(n, _U4, data, SEQUENCE_OFFSET, (size,)), first, where)
         else:
             claims.check(first, n, np.ndarray(n, _U8, data, BODY, (size,)).__getitem__, where)
-        self._held[i] = True  # once is enough: the CRC shows later changes
+        self._compared[i] = True  # once is enough: the CRC shows later changes
 
-    def _hold_records(self, i: int, data: Any, records: Array) -> None:
+    def _compare_records(self, i: int, data: Any, records: Array) -> None:
         """The same for a chunk of variable layout."""
         first, where = int(self.table["first"][i]), f"{self._source.name}: chunk {i}"
         claims = None if self.claims is None else self.claims.get(int(self.table["channel"][i]))
@@ -347,15 +347,15 @@ class ChunkStore:
                 raise FormatError(f"{where} holds messages that are not steps")
             numbers = np.ndarray(len(data) - 7, _U8, data, 0, (1,))
             claims.check(first, len(records), lambda places: numbers[starts[places] + BODY], where)
-        self._held[i] = True
+        self._compared[i] = True
 
     def records(self, i: int, *, keep: bool = True) -> tuple[Any, Array]:
         """A chunk of variable layout, and the offsets where each message record begins and ends: int64 (rows, 2)."""
         kept = self._chunk(i, None, keep=keep)
         if kept.records is None:
             records = self._find_records(i, kept.data)
-            if self.claims is not None and not self._held[i]:
-                self._hold_records(i, kept.data, records)
+            if self.claims is not None and not self._compared[i]:
+                self._compare_records(i, kept.data, records)
             kept.records = records
         return kept.data, kept.records
 
