@@ -258,28 +258,24 @@ class Recording(DescribedRecording, DatasetVerbs):
         fields = FIVE if fields is None else field_names(fields)
         if not images and "next_states" in fields:
             raise RecordingError("expected images=True for next_states, found False; read states instead")
-        rows = self.index
-        if episodes is not None:
-            rows = rows[self._positions(episodes)]
+        positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
+        rows = self.index if episodes is None else self.index[positions]
         lengths = rows["length"].astype(np.int64)
         total = int(lengths.sum())
         columns = Columns(lengths)
         if self._layout is None:
             return columns
-        threads = threads or _THREADS
-        keep = episodes is not None
         needed = [field for field in fields if field not in ("next_states", "infos", "frames")]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
         with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {total} steps"):
             runs = runs_of(rows, self._step_channels)
-            found = self._reader.read(runs, total, needed, threads, keep, images)
+            found = self._reader.read(runs, total, needed, threads or _THREADS, episodes is not None, images)
             if "next_states" in fields:
                 columns.next_states = self._next_states(found["states"], rows, lengths)
         for field in fields:
             if field in found:
                 setattr(columns, field, found[field])
-        positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
         if "infos" in fields:
             columns.infos = [info for i in positions.tolist() for info in self._infos_of(i)]
         if "frames" in fields:
