@@ -222,20 +222,16 @@ class _LeafBuilder:
                 self._array, self._filled = rows, len(rows)  # all rows at once: nothing to copy
                 return
             self._array = np.empty((self._capacity, *rows.shape[1:]), rows.dtype)
-        elif self._array.dtype != rows.dtype:
-            self._widen(common_dtype(self._array.dtype, rows.dtype))
+        dtype = common_dtype(self._array.dtype, rows.dtype) or self._array.dtype
+        if dtype != self._array.dtype:
+            wider = np.empty(self._array.shape, dtype)
+            wider[: self._filled] = self._array[: self._filled]
+            self._array = wider
         if rows.shape[1:] != self._array.shape[1:]:  # other columns are checked by their layouts
             sizes = f"{self._array.shape[1:3]} and {rows.shape[1:3]}"
             raise SpaceError(f"expected frames of one size, found {sizes}; choose episodes by a filter")
         self._array[self._filled : self._filled + len(rows)] = rows
         self._filled += len(rows)
-
-    def _widen(self, dtype: np.dtype[Any] | None) -> None:
-        if dtype is None or self._array is None or dtype == self._array.dtype:
-            return
-        wider = np.empty(self._array.shape, dtype)
-        wider[: self._filled] = self._array[: self._filled]
-        self._array = wider
 
     def finish(self) -> Any:
         """The rows so far; the builder is empty afterwards."""
