@@ -18,8 +18,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rotation import series
 
-__all__ = ["Part", "split_recording"]
-
 
 class Part(NamedTuple):
     """One of the files that a recording is split into; it has the episodes with the numbers `first` to `last`."""

@@ -11,8 +11,6 @@ from tupli_mcap.mcap.container import COMPRESSIONS, Container
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.edit.rewrite import kept_metadata, write
 
-__all__ = ["stream_excerpts"]
-
 _PIECE = 1 << 16  # bytes that a pipe holds
 
 
@@ -33,10 +31,8 @@ def stream_excerpts(
     def send(fd: int) -> None:
         with opening as excerpts:
             source, rows, *_ = excerpts[0]
-            table = source.file.store.table
-            compression = COMPRESSIONS[
-                int(table["compression"][0])
-            ]  # so that chunks can be copied as they are
+            # the source's compression, so that chunks can be copied as they are
+            compression = COMPRESSIONS[int(source.file.store.table["compression"][0])]
             container = Container(fd, source.name, compression)
             if len(excerpts) > 1 or without:
                 merge_excerpts(excerpts, container, without)
