@@ -86,9 +86,8 @@ class FrameValues:
 def info_keys(fields: Sequence[str]) -> tuple[list[str], list[str]]:
     """The keys of infos that fields name ("info.x": "x"; "infos": ""), and the other fields."""
     given = list(fields) if isinstance(fields, Sequence) and not isinstance(fields, str) else [fields]
-    named = [isinstance(name, str) and name.partition(".")[0] in (INFOS, "info") for name in given]
-    keys = [name.partition(".")[2] for name, is_info in zip(given, named, strict=True) if is_info]
-    return keys, [name for name, is_info in zip(given, named, strict=True) if not is_info]
+    infos = [name for name in given if isinstance(name, str) and name.partition(".")[0] in (INFOS, "info")]
+    return [name.partition(".")[2] for name in infos], [name for name in given if name not in infos]
 
 
 def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None = None) -> dict[str, Any]:
