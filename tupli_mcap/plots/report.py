@@ -14,6 +14,7 @@ import numpy as np
 from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
 from tupli_mcap.dataset.which import named_positions
 from tupli_mcap.errors import RecordingError, os_reason
+from tupli_mcap.files import write_bytes
 from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes
 from tupli_mcap.plots.draw_trace import add_trace
@@ -22,7 +23,6 @@ from tupli_mcap.plots.groups import X, groups_of, shown_numbers
 from tupli_mcap.plots.measure import READ_BYTES, Measured, Trace, measure, trace
 from tupli_mcap.plots.style import Page, styled
 from tupli_mcap.schema import BaseFilter
-from tupli_mcap.storage.atomic import write_bytes
 
 FORMATS = (".png", ".svg", ".pdf", ".html")
 _LONGEST_NAME = 200  # characters of a run's name that are shown
@@ -121,7 +121,7 @@ class Report:
             goal.suffix.lower()
         ]()
         try:
-            write_bytes(goal, data, replace=overwrite)
+            write_bytes(goal, data, overwrite=overwrite)
         except OSError as err:
             raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
         return goal

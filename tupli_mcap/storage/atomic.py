@@ -26,15 +26,11 @@ _Class = TypeVar("_Class")
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def write_bytes(path: Path, data: bytes, *, replace: bool = True) -> None:
+def write_bytes(path: Path, data: bytes) -> None:
     """Write a file atomically, and make its directory if it is missing: a crash leaves the old file, or none.
-
-    Raises:
-        FileExistsError: The file exists and `replace` is false.
-        OSError: The directory cannot be written to, the disk is full, ...
-    """
+    OSError if the directory cannot be written to, the disk is full, ..."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(path, data, overwrite=replace)
+    files.write_bytes(path, data)
 
 
 def read_model(kind: type[_Model], path: Path, expected: str, advice: str = "") -> _Model:

@@ -261,14 +261,14 @@ class Session:
             f"{shown(self.url)} does not answer: {why}; is the server running, and the address right?"
         )
 
-    def stream(self, path: str, start: int = 0, **options: Any) -> Iterator[bytes]:
+    def stream(self, path: str, start: int) -> Iterator[bytes]:
         """The bytes of an answer from an offset on. If the connection breaks off, asks for the rest."""
         import httpx
 
         fruitless = 0
         while True:
             try:
-                for piece in self._pieces(path, start, **options):
+                for piece in self._pieces(path, start):
                     fruitless, start = 0, start + len(piece)
                     yield piece
                 return
@@ -278,9 +278,9 @@ class Session:
                     raise self._unreachable(err) from None
             time.sleep(0.2 * 2**fruitless)
 
-    def _pieces(self, path: str, start: int, **options: Any) -> Iterator[bytes]:
-        headers = {"Accept-Encoding": "identity", "Range": f"bytes={start}-", **options.pop("headers", {})}
-        with contextlib.closing(self.send("GET", path, headers=headers, stream=True, **options)) as response:
+    def _pieces(self, path: str, start: int) -> Iterator[bytes]:
+        headers = {"Accept-Encoding": "identity", "Range": f"bytes={start}-"}
+        with contextlib.closing(self.send("GET", path, headers=headers, stream=True)) as response:
             if response.status_code == _NOTHING_LEFT:
                 return
             skipped = 0 if response.status_code == 206 else start  # all of it comes

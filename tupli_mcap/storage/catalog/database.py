@@ -206,8 +206,6 @@ class Database:
 class MemoryDatabase:
     """A database in the memory of this process: one connection, which threads use one after the other."""
 
-    path = None
-
     def __init__(self) -> None:
         self._engine = _prepared(
             create_engine("sqlite://", poolclass=StaticPool, connect_args={"check_same_thread": False})

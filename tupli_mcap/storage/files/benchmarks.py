@@ -40,7 +40,7 @@ class BenchmarkFiles:
         self._directory = directory
         self._lock = lock
 
-    def store(self, query: BenchmarkQuery, *, created_by: str = LOCAL_USER) -> BenchmarkHeader:
+    def store(self, query: BenchmarkQuery) -> BenchmarkHeader:
         metadata = restored(plain(query.metadata))
         uri, document, pickle = document_of(query)
         path = self._path(uri)
@@ -48,7 +48,7 @@ class BenchmarkFiles:
             if path.exists():
                 return self.header(uri)
             header = BenchmarkHeader.create_new(
-                id=uri, hash=query.hash, metadata=metadata, created_by=created_by
+                id=uri, hash=query.hash, metadata=metadata, created_by=LOCAL_USER
             )
             document["benchmark"] = {**(document.get("benchmark") or {}), **benchmark_entry(header)}
             if pickle is not None:
