@@ -112,6 +112,14 @@ def unpack(serialized: str, *, where: str = "the benchmark") -> BenchmarkContent
     return BenchmarkContent(record, artifacts_of(record, where))
 
 
+def artifacts_needed(serialized: str) -> tuple[str, ...]:
+    """The ids of the artifacts that a serialized benchmark needs; none if another program wrote its text."""
+    try:
+        return unpack(serialized).artifacts
+    except FormatError:
+        return ()
+
+
 def artifacts_of(record: EnvironmentRecord, where: str) -> tuple[str, ...]:
     """The artifact ids that the `benchmark` entry of a document names. FormatError if they are no ids."""
     ids = (record.benchmark or {}).get("artifacts", [])

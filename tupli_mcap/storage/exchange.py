@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap import trust
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError, did_you_mean, plural, warn
+from tupli_mcap.errors import NotFoundError, StorageError, did_you_mean, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -33,7 +33,7 @@ from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
-from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, unpack
+from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.bundles.read import deleted_beside, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
@@ -130,9 +130,7 @@ def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
     """Copies a benchmark and the artifacts that it needs; returns how many of these were new."""
     benchmark = source.load_benchmark(uri)
-    wanted: Sequence[str] = ()
-    with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names none
-        wanted = unpack(benchmark.serialized).artifacts
+    wanted = artifacts_needed(benchmark.serialized)
     held = {item.id for item in target.list_artifacts(FilterIN(key="id", value=list(wanted)))}
     missing = [artifact for artifact in wanted if artifact not in held]
     if dry_run:
@@ -303,11 +301,8 @@ def publish_benchmark(
 def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str, *, dry_run: bool) -> None:
     """Makes the artifacts that the caller's benchmark needs visible to a group; a warning counts those that are
     somebody else's, unless the group sees them already."""
-    needed: Sequence[str] = ()
-    with contextlib.suppress(FormatError):  # an invalid benchmark of another writer names no artifacts
-        needed = unpack(benchmark.serialized).artifacts
-    hidden = set(needed)
-    for item in client.list_artifacts(FilterIN(key="id", value=list(needed))):
+    hidden = set(artifacts_needed(benchmark.serialized))
+    for item in client.list_artifacts(FilterIN(key="id", value=sorted(hidden))):
         is_own = item.created_by == benchmark.created_by
         if is_own and not dry_run:
             client.publish_artifact(item.id, group)

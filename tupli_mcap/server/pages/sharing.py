@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Response
 from sqlalchemy import Connection
 
-from tupli_mcap.errors import FormatError, NotFoundError, StorageError
+from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
@@ -17,7 +16,7 @@ from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.stored import episodes
-from tupli_mcap.storage.benchmark_json import unpack
+from tupli_mcap.storage.benchmark_json import artifacts_needed
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
@@ -75,9 +74,8 @@ def _turn_benchmark(
         return True
     library.items.publish(connection, caller, "benchmark", dataset.benchmark_id, group)
     found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
-    with contextlib.suppress(FormatError):  # a benchmark of another program may not name its artifacts
-        for artifact in unpack(found.serialized).artifacts:
-            library.items.publish(connection, caller, "artifact", artifact, group)
+    for artifact in artifacts_needed(found.serialized):
+        library.items.publish(connection, caller, "artifact", artifact, group)
     return True
 
 

@@ -38,7 +38,7 @@ from tupli_mcap.server.people.access import (
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import ITEM
 from tupli_mcap.storage.base import no_such, oldest_first, published_in
-from tupli_mcap.storage.benchmark_json import artifacts_of, plain, unpack
+from tupli_mcap.storage.benchmark_json import artifacts_needed, plain
 from tupli_mcap.storage.files.benchmarks import document_of, name_in
 from tupli_mcap.storage.texts import is_hash
 
@@ -65,9 +65,6 @@ class Items:
         uri, document, _ = document_of(query)
         own = self._own(connection, caller, "benchmark", uri)
         if not own:
-            needs: Sequence[str] = ()
-            if document.get("environment") is not None:
-                needs = artifacts_of(unpack(query.serialized).record, "the benchmark")
             header = BenchmarkHeader.create_new(
                 id=uri,
                 hash=query.hash,
@@ -75,10 +72,9 @@ class Items:
                 created_by=caller.name,
                 environment=name_in(document),
             )
-            size = len(query.serialized)
-            own = self._add(
-                connection, caller, "benchmark", header, content=query.serialized, needs=needs, size=size
-            )
+            text = query.serialized
+            needs, size = artifacts_needed(text), len(text)
+            own = self._add(connection, caller, "benchmark", header, content=text, needs=needs, size=size)
         return _told(connection, caller, BenchmarkHeader, *own)[0]
 
     def load_benchmark(self, connection: Connection, caller: Caller, uri: str) -> Benchmark:
