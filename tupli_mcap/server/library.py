@@ -40,12 +40,12 @@ from tupli_mcap.server.database import (
     settle,
 )
 from tupli_mcap.server.people import accounts, limits
-from tupli_mcap.server.people.access import Caller, DeniedError
+from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored import arrivals, episodes
 from tupli_mcap.server.stored.items import Items, artifact_key
-from tupli_mcap.server.tables import AUDIT, FILE, ITEM, MEMBERSHIP, USER
+from tupli_mcap.server.tables import FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.base import with_tuples
@@ -297,21 +297,6 @@ class Library:
             return Recording(self.blobs.place(unescape_text(place)))
 
         return with_tuples(headers, opened)
-
-    @contextlib.contextmanager
-    def deleting(self, caller: Caller, action: str, uri: str) -> Iterator[None]:
-        """For PyTupli's client: deleting a missing item is no error for an admin, nor for the user who deleted it. All
-        others get DeniedError, both for missing items and for those that they may not read."""
-        try:
-            yield
-        except NotFoundError:
-            done = select(AUDIT.c.number).where(
-                AUDIT.c.user == caller.name, AUDIT.c.action.startswith(action), AUDIT.c.target.contains(uri)
-            )
-            with self.database.reading() as connection:
-                known = connection.execute(done.limit(1)).first()
-            if known is None and not caller.may(Right.ROLE_MANAGEMENT):
-                raise DeniedError("You do not have sufficient permissions for this operation.") from None
 
     def delete_episodes(self, caller: Caller, filter: BaseFilter) -> int:
         """Deletes episodes, and files without any episode left; returns the number of episodes."""

@@ -15,6 +15,7 @@ from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
 from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import select
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, NotFoundError
@@ -38,11 +39,12 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, as_told
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import Turns
-from tupli_mcap.server.routes.accounts import Credentials
+from tupli_mcap.server.routes.accounts import Credentials, list_roles
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
+from tupli_mcap.server.tables import AUDIT
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
 from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog.order import After
@@ -81,6 +83,23 @@ def _hidden(caller: Caller, text: str) -> Iterator[None]:
         if caller.may(Right.ROLE_MANAGEMENT):
             raise NotFoundError(text) from err
         raise DeniedError(_DENIED) from err
+
+
+@contextlib.contextmanager
+def _deleting(library: Library, caller: Caller, kind: str, uri: str) -> Iterator[None]:
+    """Deleting a missing item is no error for an admin, nor for the user who deleted it. All others get DeniedError."""
+    try:
+        yield
+    except NotFoundError:
+        done = select(AUDIT.c.number).where(
+            AUDIT.c.user == caller.name,
+            AUDIT.c.action.startswith(f"delete_{kind}"),
+            AUDIT.c.target.contains(uri),
+        )
+        with library.database.reading() as connection:
+            known = connection.execute(done.limit(1)).first()
+        if known is None and not caller.may(Right.ROLE_MANAGEMENT):
+            raise DeniedError(_DENIED) from None
 
 
 # --- users ---
@@ -208,12 +227,7 @@ def create_role(library: Served, caller: Changing, told: UserRole) -> UserRole:
     return told
 
 
-@router.get("/access/roles/list")
-def list_roles(library: Served, caller: Reader) -> list[UserRole]:
-    """All roles."""
-    caller.demand(Right.ROLE_MANAGEMENT)
-    with library.database.reading() as connection:
-        return [UserRole.model_validate(role) for role in accounts.list_roles(connection)]
+router.get("/access/roles/list")(list_roles)
 
 
 @router.delete("/access/roles/delete")
@@ -226,14 +240,12 @@ def delete_role(library: Served, caller: Changing, role_name: str) -> None:
 # --- benchmarks and artifacts ---
 
 
-def _publish(library: Library, caller: Caller, kind: Kind, uri: str, group: str) -> None:
+def _publish(
+    library: Library, caller: Caller, kind: Kind, uri: str, group: str, *, published: bool = True
+) -> None:
+    change = library.items.publish if published else library.items.unpublish
     with _hidden(caller, f"{kind.title()} not found"), library.database.writing() as connection:
-        library.items.publish(connection, caller, kind, uri, group)
-
-
-def _unpublish(library: Library, caller: Caller, kind: Kind, uri: str, group: str) -> None:
-    with _hidden(caller, f"{kind.title()} not found"), library.database.writing() as connection:
-        library.items.unpublish(connection, caller, kind, uri, group)
+        change(connection, caller, kind, uri, group)
 
 
 @router.post("/benchmarks/create", response_model=BenchmarkHeader)
@@ -270,13 +282,13 @@ def publish_benchmark(library: Served, caller: Changing, benchmark_id: str, publ
 @router.put("/benchmarks/unpublish")
 def unpublish_benchmark(library: Served, caller: Changing, benchmark_id: str, unpublish_from: str) -> None:
     """Takes a benchmark away from a group."""
-    _unpublish(library, caller, "benchmark", benchmark_id, unpublish_from)
+    _publish(library, caller, "benchmark", benchmark_id, unpublish_from, published=False)
 
 
 @router.delete("/benchmarks/delete")
 def delete_benchmark(library: Served, caller: Changing, benchmark_id: str) -> None:
     """Deletes a benchmark; its episodes and artifacts stay."""
-    with library.deleting(caller, "delete_benchmark", benchmark_id), library.database.writing() as connection:
+    with _deleting(library, caller, "benchmark", benchmark_id), library.database.writing() as connection:
         library.items.delete_benchmark(connection, caller, benchmark_id)
 
 
@@ -313,13 +325,13 @@ def publish_artifact(library: Served, caller: Changing, artifact_id: str, publis
 @router.put("/artifacts/unpublish")
 def unpublish_artifact(library: Served, caller: Changing, artifact_id: str, unpublish_from: str) -> None:
     """Takes an artifact away from a group."""
-    _unpublish(library, caller, "artifact", artifact_id, unpublish_from)
+    _publish(library, caller, "artifact", artifact_id, unpublish_from, published=False)
 
 
 @router.delete("/artifacts/delete")
 def delete_artifact(library: Served, caller: Changing, artifact_id: str) -> None:
     """Deletes an artifact, needed or not, as PyTupli does."""
-    with library.deleting(caller, "delete_artifact", artifact_id):
+    with _deleting(library, caller, "artifact", artifact_id):
         library.delete_artifact(caller, artifact_id, force=True)
 
 
@@ -391,7 +403,7 @@ def unpublish_episode(library: Served, caller: Changing, episode_id: str, unpubl
 @router.delete("/episodes/delete")
 def delete_episode(library: Served, caller: Changing, episode_id: str) -> None:
     """Deletes an episode."""
-    with library.deleting(caller, "delete_episode", episode_id):
+    with _deleting(library, caller, "episode", episode_id):
         if not library.delete_episodes(caller, FilterEQ(key="id", value=episode_id)):
             raise no_such("episode", episode_id)
 
