@@ -44,11 +44,11 @@ class Address(BaseModel):
 
 
 class _Asked(NamedTuple):
-    """The caller and the query; `ticket` goes into the addresses in the manifest."""
+    """The caller and the query, and the given parameters that mean it, for the addresses in the manifest."""
 
     caller: Caller
     query: EpisodeQuery
-    ticket: str | None
+    given: dict[str, str]
 
 
 _RRD = {**MADE, 501: {"model": Error, "description": "The server has no rerun-sdk."}}
@@ -94,16 +94,15 @@ def _asked(
         known = query.recordings
         named = [name for name in recording if known is None or name in known]
         query = query.model_copy(update={"recordings": named})
-    return _Asked(holder.caller, query, ticket)
+    words = {"ticket": ticket, "filter": filter, "benchmark_filter": benchmark_filter}
+    return _Asked(holder.caller, query, {name: word for name, word in words.items() if word is not None})
 
 
 _Wanted = Annotated[_Asked, Depends(_asked)]
 
 
 @router.get("/manifest")
-def manifest(
-    library: Served, asked: _Wanted, filter: str | None = None, benchmark_filter: str | None = None
-) -> dict[str, Any]:
+def manifest(library: Served, asked: _Wanted) -> dict[str, Any]:
     """The manifest for Foxglove: for each recording its file if all is selected, else a source made of episodes."""
     with library.database.reading() as connection:
         selected = select_episodes(connection, asked.caller, library.items, asked.query)
@@ -112,15 +111,13 @@ def manifest(
     for each, file in zip(selected, files, strict=True):
         if file.whole and len(each.numbers) == file.episodes:
             told = {"version": file.digest[:16]}  # the loader's cache key
-            if asked.ticket is not None:
+            if "ticket" in asked.given:
                 told["ticket"] = library.tokens.ticket(asked.caller, recording=file.name)
             url = f"files/{quote(file.name)}?{urlencode(told)}"
             sources.append({"url": url, "supportsRangeRequests": True})
             continue
         number = _id(each, file.digest)
-        words = {"ticket": asked.ticket, "filter": filter, "benchmark_filter": benchmark_filter}
-        told = {name: word for name, word in words.items() if word is not None}
-        url = f"data?{urlencode({**told, 'recording': each.name, 'id': number})}"
+        url = f"data?{urlencode({**asked.given, 'recording': each.name, 'id': number})}"
         sources.append({"url": url, "id": number, **_described(library, each)})
     name = selected[0].name.rpartition("/")[2] if len(selected) == 1 else f"{len(selected)} recordings"
     return {"name": name, "sources": sources}
