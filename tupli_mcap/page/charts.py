@@ -56,8 +56,11 @@ def line_path(at: Array, values: Array, across: tuple[float, float], up: tuple[f
     return "".join(parts)
 
 
-def lines(given: Sequence[Line], across: tuple[float, float], up: tuple[float, float]) -> Markup:
-    """The same value of some episodes over their steps, each in its colour, without axes."""
+def lines(given: Sequence[Line], steps: int, ends: tuple[float, float]) -> Markup:
+    """The same value of some episodes over so many steps, each in its colour, without axes. ends: the smallest and the
+    largest value of all."""
+    room = 0.04 * (ends[1] - ends[0])
+    across, up = (0.0, max(1.0, steps - 1.0)), (ends[0] - room, ends[1] + room)
     paths = (_PATH.format(f"line s{i % 8}", line_path(*line, across, up)) for i, line in enumerate(given))
     return _drawing(Markup("").join(paths), "track")
 

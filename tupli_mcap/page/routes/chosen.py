@@ -73,11 +73,9 @@ def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
 def _overlaid(name: str, tracks: Sequence[Track], steps: int) -> Compared:
     ends = np.array([track.ends for track in tracks])
     known = ends[np.isfinite(ends).all(axis=1)]
-    low, high = (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
-    room = 0.04 * (high - low)
+    both = (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
     lines = [(track.at, track.values) for track in tracks]
-    drawn = charts.lines(lines, (0.0, max(1.0, steps - 1.0)), (low - room, high + room))
-    return Compared(name, drawn, (low, high))
+    return Compared(name, charts.lines(lines, steps, both), both)
 
 
 @router.get("/sparks")

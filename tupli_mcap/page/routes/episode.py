@@ -129,10 +129,7 @@ class Seen(NamedTuple):
 
     def drawn(self, track: Track) -> Markup:
         """A track as SVG, over the steps that were read."""
-        low, high = track.ends
-        room = 0.04 * (high - low)
-        across = (0.0, max(1.0, self.curves.read - 1.0))
-        return charts.lines([(track.at, track.values)], across, (low - room, high + room))
+        return charts.lines([(track.at, track.values)], self.curves.read, track.ends)
 
 
 def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:
