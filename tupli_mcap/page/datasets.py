@@ -9,7 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, and_, func, select, true
@@ -19,7 +19,7 @@ from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterEQ, format_filter
 from tupli_mcap.schema.times import time_ns
 from tupli_mcap.storage.catalog.tables import RECORDING, TALLY
-from tupli_mcap.storage.catalog.tallies import Tally, tallies
+from tupli_mcap.storage.catalog.tallies import Tally, recordings_seen, tallies
 from tupli_mcap.storage.listing import LIVE
 from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
@@ -216,6 +216,15 @@ def of_dataset(key: str) -> ColumnElement[bool]:
     if benchmark_id:
         return RECORDING.c.benchmark_id == escape_text(benchmark_id)
     return and_(RECORDING.c.benchmark_id == "", RECORDING.c.environment == escape_text(environment))
+
+
+def seen_in(
+    shelf: Shelf, connection: Connection, key: str, *conditions: ColumnElement[bool]
+) -> dict[str, Any]:
+    """The arguments with which `find_episodes` and `count_episodes` look only at what the reader may see: of a dataset,
+    unless its key is empty, and of the recordings that all conditions are true of."""
+    of = and_(recordings_seen(shelf.seen), *([of_dataset(key)] if key else []), *conditions)
+    return {"only": shelf.seen_episodes(connection), "of": of, "told": partial(shelf.as_told, connection)}
 
 
 def _grouped(

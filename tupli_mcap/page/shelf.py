@@ -11,7 +11,6 @@ from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
-from tupli_mcap.storage.catalog.tallies import recordings_seen
 
 T = TypeVar("T")
 
@@ -77,11 +76,6 @@ def seen_episodes(
 ) -> ColumnElement[bool]:
     """A condition for the episodes that the reader may see and that meet all conditions."""
     return and_(shelf.seen_episodes(connection), *conditions)
-
-
-def seen_recordings(shelf: Shelf, *conditions: ColumnElement[bool]) -> ColumnElement[bool]:
-    """The recordings of which some episodes may be read, and that all conditions are true of."""
-    return and_(recordings_seen(shelf.seen), *conditions)
 
 
 def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
@@ -22,9 +21,9 @@ from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
-from tupli_mcap.page.datasets import of_dataset
+from tupli_mcap.page.datasets import seen_in
 from tupli_mcap.page.routes.episode import FIELDS, Seen, look
-from tupli_mcap.page.shelf import Shelf, find_episode, find_some, seen_episodes, seen_recordings
+from tupli_mcap.page.shelf import Shelf, find_episode, find_some
 from tupli_mcap.plots.measure import thinned_to
 from tupli_mcap.plots.statistics import drawable_numbers
 from tupli_mcap.recording import Recording
@@ -93,9 +92,8 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
         if uris:
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        of = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
-        only, told = seen_episodes(shelf, connection), partial(shelf.as_told, connection)
-        return each_once(find_episodes(connection, wanted, only=only, of=of, told=told))
+        seen = seen_in(shelf, connection, dataset)
+        return each_once(find_episodes(connection, wanted, **seen))
 
     def ask(connection: Connection) -> tuple[EpisodeHeader | None, dict[str, list[int]]]:
         first: EpisodeHeader | None = None

@@ -15,7 +15,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page import charts, texts
 from tupli_mcap.page.answers import PageRoute, Shown, page
-from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_dataset, of_recording
+from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_recording, seen_in
 from tupli_mcap.page.routes.episode import Seen, look
 from tupli_mcap.page.samples import (
     SampledEpisodes,
@@ -24,7 +24,7 @@ from tupli_mcap.page.samples import (
     sample_numbers,
     sample_values,
 )
-from tupli_mcap.page.shelf import Shelf, python_line, seen_episodes, seen_recordings
+from tupli_mcap.page.shelf import Shelf, python_line
 from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe
@@ -111,9 +111,8 @@ def shown_first(shelf: Shelf, connection: Connection, dataset: Dataset, show: st
     else:
         chosen = min(known, key=lambda item: item.return_least or 0.0)
         order = Sort("return")
-    of = seen_recordings(shelf, of_dataset(dataset.key), of_recording(chosen.recording))
-    found = find_episodes(connection, None, limit=1, only=seen_episodes(shelf, connection), of=of, sort=order)
-    return next(found, None)
+    seen = seen_in(shelf, connection, dataset.key, of_recording(chosen.recording))
+    return next(find_episodes(connection, None, limit=1, sort=order, **seen), None)
 
 
 def _ends(values: Array) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Request, Response
@@ -16,9 +16,9 @@ from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
-from tupli_mcap.page.datasets import Dataset, dataset_of, of_dataset, of_recording
+from tupli_mcap.page.datasets import Dataset, dataset_of, of_recording, seen_in
 from tupli_mcap.page.pictures import Camera, cameras_of
-from tupli_mcap.page.shelf import Shelf, find_episode, opened, python_line, seen_episodes, seen_recordings
+from tupli_mcap.page.shelf import Shelf, find_episode, opened, python_line
 from tupli_mcap.page.texts import iso
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader, FilterEQ, format_filter, parse_bound
@@ -147,12 +147,9 @@ def _neighbours(
         order = Sort.parse(sort)
     except FilterError:
         wanted, order = None, None
-    of: list[Any] = [of_dataset(dataset)] if dataset else []
-    if not (dataset or filter or sort):
-        of = [of_recording(header.recording)]
-    find = partial(
-        find_episodes, connection, wanted, limit=1, after=After(header.recording, header.episode), sort=order,
-        only=seen_episodes(shelf, connection), of=seen_recordings(shelf, *of), told=partial(shelf.as_told, connection),
-    )  # fmt: skip
+    own = [] if dataset or filter or sort else [of_recording(header.recording)]
+    seen = seen_in(shelf, connection, dataset, *own)
+    place = After(header.recording, header.episode)
+    find = partial(find_episodes, connection, wanted, limit=1, after=place, sort=order, **seen)
     before, after = (next(find(backwards=backwards), None) for backwards in (True, False))
     return Neighbours(None if before is None else before.id, None if after is None else after.id)

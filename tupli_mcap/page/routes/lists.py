@@ -19,8 +19,8 @@ from tupli_mcap.errors import FilterError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
-from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, of_dataset
-from tupli_mcap.page.shelf import Shelf, find_episode, python_line, seen_episodes, seen_recordings
+from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, seen_in
+from tupli_mcap.page.shelf import Shelf, find_episode, python_line
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
 from tupli_mcap.schema.facts import comparisons, path_in
@@ -134,25 +134,23 @@ def table_of(
     try:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         order = Sort.parse(sort)
-        only = seen_episodes(shelf, connection)
-        of_some = seen_recordings(shelf, *([of_dataset(dataset)] if dataset else []))
+        seen = seen_in(shelf, connection, dataset)
         at = find_episode(shelf, connection, after or before) if after or before else None
         place = None if at is None else After(at.recording, at.episode)
-        told = functools.partial(shelf.as_told, connection)
-        find = functools.partial(find_episodes, connection, only=only, of=of_some, told=told)
-        found = list(find(wanted, limit=_ROWS + 1, sort=order, after=place, backwards=bool(before)))
+        seen_from = {**seen, "after": place, "backwards": bool(before)}
+        found = list(find_episodes(connection, wanted, limit=_ROWS + 1, sort=order, **seen_from))
         if not found and at is None and wanted is not None:
-            among = list(find(None, limit=_ASKED + 1))
+            among = list(find_episodes(connection, None, limit=_ASKED + 1, **seen))
             if len(among) <= _ASKED:
                 check_metadata(wanted, among)
     except FilterError as err:
         return Table((), str(err), err.position)
-    more, rows = len(found) > _ROWS, told(found[:_ROWS])
+    more, rows = len(found) > _ROWS, shelf.as_told(connection, found[:_ROWS])
     if before:
         rows.reverse()
     count = len(rows)
     if more or at is not None:  # there are others
-        count = count_episodes(connection, wanted, only=only, of=of_some, told=told, most=_COUNTED + 1)
+        count = count_episodes(connection, wanted, most=_COUNTED + 1, **seen)
     return Table(
         rows,
         count=count if count <= _COUNTED else None,
