@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -211,15 +210,12 @@ def _shorten_names(measured: Sequence[Measured]) -> None:
     """The names of the runs if all differ; else file names without directories and extension, or longer parts of the
     paths if two would be equal."""
     names = [one.run.name[:_LONGEST_NAME] for one in measured]
-    if len(measured) > 1 and all(names) and len(set(names)) == len(names):
-        for one, name in zip(measured, names, strict=True):
-            one.name = name
-        return
-    parts = [Path(one.name).with_suffix("").parts for one in measured]
-    for depth in range(1, max(map(len, parts)) + 1):
-        names = ["/".join(part[-depth:]) for part in parts]
-        if max(Counter(names).values()) == 1:
-            break
+    if len(measured) == 1 or not all(names) or len(set(names)) < len(names):
+        parts = [Path(one.name).with_suffix("").parts for one in measured]
+        for depth in range(1, max(map(len, parts)) + 1):
+            names = ["/".join(part[-depth:]) for part in parts]
+            if len(set(names)) == len(names):
+                break
     for one, name in zip(measured, names, strict=True):
         one.name = name
 

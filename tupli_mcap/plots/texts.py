@@ -98,11 +98,8 @@ def _group_text(group: Group) -> str:
 def _success_text(group: Group) -> str:
     said = group.numbers(SUCCESS)
     known = said[np.isfinite(said)]
-    return (
-        f"{known.mean():.0%}" + (f" of {len(known):,}" if len(known) < len(said) else "")
-        if len(known)
-        else ""
-    )
+    of = f" of {len(known):,}" if len(known) < len(said) else ""
+    return f"{known.mean():.0%}{of}" if len(known) else ""
 
 
 def _space_text(lines: Sequence[str]) -> str:

@@ -264,21 +264,18 @@ def _in_metadata(filter: BaseFilter) -> Condition:
     wanted = [classify(value) for value in _values(filter)]
     texts = [scalar.value for scalar in wanted if scalar.kind == "text"]
     ordered_texts = filter.type in ORDERING and texts
-    if ordered_texts or not can_search(path) or not all(map(str.isprintable, texts)):
-        return true()
-    if len(wanted) > _MOST_VALUES:
+    unprintable = not all(map(str.isprintable, texts))
+    if ordered_texts or unprintable or not can_search(path) or len(wanted) > _MOST_VALUES:
         return true()
     value = value_at(path)
     parts = [EPISODE.c.metadata.contains('"$', autoescape=True)]  # tags stand for other values
     for scalar in wanted:
         if filter.type is FilterType.CONTAINS:
             parts.append(_occurs(scalar.value, text_at(path)))
-        elif scalar.kind == "text":
+        elif scalar.kind in ("text", "bool"):
             parts.append(value == scalar.value)
         elif scalar.kind == "null":
             parts.append(kind_at(path) == "null")
-        elif scalar.kind == "bool":
-            parts.append(value == scalar.value)
         elif scalar.kind != "nan":
             parts.append(_number_in_metadata(filter.type, value, nearest_float(scalar.value)))
     if filter.type not in ORDERING:
@@ -302,7 +299,7 @@ def _of_groups(filter: BaseFilter) -> Narrowed:
     if filter.type not in (FilterType.EQ, FilterType.IN):
         return ALL
     groups = _values(filter)
-    if len(groups) > _MOST_VALUES:
+    if filter.type not in (FilterType.EQ, FilterType.IN) or len(groups) > _MOST_VALUES:
         return ALL
     held = (EPISODE.c.published_in.contains(json.dumps(group), autoescape=True) for group in groups)
     return ALL._replace(may=or_(false(), *held))

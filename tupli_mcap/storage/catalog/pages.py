@@ -249,10 +249,8 @@ def _groups(connection: Connection, asked: Asked) -> Iterator[tuple[list[tuple[i
     sums = select(func.sum(TALLY.c.episodes)).where(TALLY.c.recording_id == RECORDING.c.id).scalar_subquery()
     query = select(RECORDING.c.id, path, sums).where(asked.recordings()).limit(_RECORDINGS)
     query = query.order_by(path.desc() if asked.backwards else path)
-    if reached is not None:
-        found = connection.execute(query.where(path <= reached if asked.backwards else path >= reached)).all()
-    else:
-        found = connection.execute(query).all()
+    first = query if reached is None else query.where(path <= reached if asked.backwards else path >= reached)
+    found = connection.execute(first).all()
     while found:
         group: list[tuple[int, str]] = []
         size = 0
