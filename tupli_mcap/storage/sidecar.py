@@ -129,7 +129,7 @@ class Notes(NamedTuple):
         FormatError if a file with notes holds something else."""
         recording = recording.absolute()
         root = storage_of(recording) if root is None else root.absolute()
-        # first: who finishes it notes everything beside the recordings before he removes it
+        # `deleting.json` first: whoever finishes a deletion writes the sidecars, and only then removes `deleting.json`
         deleting = Deletion.read(root).of(recording.relative_to(root).as_posix())
         return cls(deleting, Sidecar.read(recording))
 

@@ -128,7 +128,7 @@ def _keyring() -> KeyringBackend | None:
     except ImportError:
         return None
     backend = keyring.get_keyring()
-    # less are those that keep nothing, or without protection
+    # a backend with a lower priority keeps nothing, or keeps it unprotected
     return backend if backend.priority >= 1 else None
 
 

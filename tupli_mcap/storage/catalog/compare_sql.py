@@ -76,8 +76,8 @@ class Narrowed(NamedTuple):
 
     Attributes:
         may: a condition that is true for all rows that match.
-        unsure: where one of these conditions is true, SQL cannot tell whether a row matches. Without any, `may` is true
-            for no other rows. Unless one of them is simply true, neither they nor `may` are ever NULL.
+        unsure: conditions: where one is true, Python has to look at the row; elsewhere, `may` decides alone. Neither
+            these nor `may` are ever NULL, unless one of these is simply true.
         ids: a query of ids of episodes, and of their recordings, that an index finds: all that match are among them.
     """
 
@@ -296,8 +296,6 @@ def _number_in_metadata(kind: FilterType, value: ColumnElement[Any], near: float
 
 def _of_groups(filter: BaseFilter) -> Narrowed:
     """A comparison with groups; the column has a list of them in JSON."""
-    if filter.type not in (FilterType.EQ, FilterType.IN):
-        return ALL
     groups = _values(filter)
     if filter.type not in (FilterType.EQ, FilterType.IN) or len(groups) > _MOST_VALUES:
         return ALL

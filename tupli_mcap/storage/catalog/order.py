@@ -70,7 +70,8 @@ class Range(NamedTuple):
         table: the one whose index has the order: EPISODE or ORDERED.
         having: which episodes these are.
         places: what they are ordered by, the most important first, and their ids last; none is NULL.
-        led_by: what an index has before the first of these: NULL, for all of them.
+        led_by: columns that the index has before those of `places`, and that are NULL in all these rows. A statement
+            has to order by them too, or the database does not use the index.
     """
 
     table: FromClause

@@ -1,13 +1,13 @@
 """A page of episodes: the first in some order that a filter is true of, without a look at all others.
 
-1. Where an index names few episodes that may match, these are put in order and looked at one after another. If a page
-   is sorted, there may also be few in the recordings that the query is about.
-2. Where it names many, or there is none, the next episodes in order are looked at, if an index has that order: of many,
-   some are among them.
-3. If they are not, all that may match by all indexes are put in order, and looked at one after another.
+1. If an index finds only a few episodes that may match, they are sorted, and checked one after another. Of a sorted
+   page, the episodes of the recordings that the query is about may also be only a few.
+2. If it finds many, or there is no index for the filter, but one for the order: the next episodes in that order are
+   checked, since some of the many are probably among them.
+3. If those were not enough, all episodes that all indexes find are sorted, and checked one after another.
 
-The statements of 1 and 2 leave a database one way to go: from columns that depend on each other, as `VALUE` has, it
-cannot tell how many rows it will find.
+The statements of 1 and 2 can be run in one way only. A database with a choice would choose badly: the columns of
+`VALUE` depend on each other, so it cannot estimate how many rows it will find.
 """
 
 from __future__ import annotations
