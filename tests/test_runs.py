@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -574,7 +575,7 @@ def test_what_counts_as_success(kind: str, tmp_path: Path, recwarn: pytest.Warni
     elif kind == "vector":
         # a vector environment makes one array of what its sub-environments say
         for flag in flags:
-            made = gym.vector.SyncVectorEnv([lambda flag=flag: Telling([flag])] * 2)  # type: ignore[misc]
+            made = gym.vector.SyncVectorEnv([partial(Telling, [flag])] * 2)
             with RecordVectorEpisodes(made, path, mode="a") as recorded:
                 recorded.reset()
                 recorded.step(np.zeros(2, np.int64))
