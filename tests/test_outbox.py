@@ -13,7 +13,7 @@ import pytest
 from between import Between
 from waiting import wait_for
 
-from tupli_mcap import TupliEnvWrapper
+from tupli_mcap import TupliEnvWrapper, files
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import F
 from tupli_mcap.storage.api import TupliAPIClient
@@ -112,7 +112,7 @@ RECORDS = """
 import os, sys
 import gymnasium as gym
 import tupli_mcap.recording.write.writer
-from tupli_mcap import TupliEnvWrapper
+from tupli_mcap import TupliEnvWrapper, files
 from tupli_mcap.storage import TupliAPIClient
 
 client = TupliAPIClient(sys.argv[1])
@@ -270,3 +270,13 @@ def test_of_two_processes_one_sends_and_the_other_waits_for_that(
     assert waiting(admin) == 0
     assert sorted(header.seed or 0 for header in admin.list_episodes()) == list(range(6))
     assert proxy.up - before < 6 * 15_000  # each was sent once
+
+
+def test_a_directory_that_another_program_removes_meanwhile_is_passed_over(admin: TupliAPIClient) -> None:
+    directory = admin._outbox.directory
+    directory.mkdir(parents=True)
+    with ThreadPoolExecutor(1) as pool:
+        writing = pool.submit(lambda: [files.write_bytes(directory / "note", b"") for _ in range(400)])
+        while not writing.done():
+            assert not admin._outbox.waiting()
+        writing.result()

@@ -9,6 +9,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from tupli_mcap import (
     RecordEpisodes,
     Recording,
     RecordingError,
+    files,
     journal_path,
     recover_recording,
     verify_recording,
@@ -407,6 +409,15 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
     assert "gone.mcap.journal is the journal of a recording that is not here" in said(other)
     assert "was left by a process that was killed" in said(other)
     assert kinds(again[1]) == {"sidecar"}
+
+
+def test_a_storage_in_which_a_program_writes_meanwhile(tmp_path: Path) -> None:
+    with storage_at(tmp_path / "lab") as storage, ThreadPoolExecutor(1) as pool:
+        note = storage.root / "artifacts" / "note"
+        writing = pool.submit(lambda: [files.write_bytes(note, b"") for _ in range(400)])
+        while not writing.done():
+            assert not [report.problems for report in verify_paths([storage.root]) if report.problems]
+        writing.result()
 
 
 def test_a_plain_directory_and_several_paths(tmp_path: Path) -> None:

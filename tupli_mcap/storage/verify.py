@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -172,7 +173,7 @@ def _leftovers(root: Path, findings: Findings) -> None:
     """Reports files of killed processes, and those of recordings that are gone."""
     for path in files.left_below(root):
         _left(str(path.relative_to(root)), findings)
-    for path in sorted(root.rglob("*")):
+    for path in sorted(Path(directory, name) for directory, _, names in os.walk(root) for name in names):
         name, relative = path.name, str(path.relative_to(root))
         if name.endswith(".mcap.journal") and not path.with_name(name.removesuffix(".journal")).exists():
             what = f"{relative} is the journal of a recording that is not here"

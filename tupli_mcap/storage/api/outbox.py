@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import glob
 import json
 import os
 import threading
@@ -112,7 +113,7 @@ class Outbox:
     def waiting(self) -> list[Waiting]:
         """The recordings that the server does not have yet."""
         found = []
-        for path in self._paths():
+        for path in _recordings_in(self.directory):
             with contextlib.suppress(FileNotFoundError):
                 found.append(Waiting(path, path.stat().st_size, _state_of(path)))
         return found
@@ -121,15 +122,12 @@ class Outbox:
         """The number of recordings that wait for other servers and users, by (address, name)."""
         found = {}
         for path in self.directory.parent.glob(f"*/{_WHOSE}"):
-            waiting = len(list(path.parent.glob("*/*.mcap")))
+            waiting = len(_recordings_in(path.parent))
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 whose = json.loads(path.read_bytes())
                 if waiting and path.parent != self.directory:
                     found[str(whose["url"]), str(whose["username"])] = waiting
         return found
-
-    def _paths(self) -> list[Path]:
-        return sorted(self.directory.glob("*/*.mcap"))
 
     def _is_ours(self, path: Path) -> bool:
         """Whether this process records to the path, or to the first file of its series (`run` of `run_0001`)."""
@@ -151,7 +149,7 @@ class Outbox:
         """Sends the recordings of ended processes in the background."""
         if self.directory.is_dir():
             files.remove_left(files.left_below(self.directory))
-        for path in self._paths():
+        for path in _recordings_in(self.directory):
             if not self._is_ours(path):
                 self.send(path)
 
@@ -168,7 +166,7 @@ class Outbox:
         """
         with self._turn:
             refused, behind = dict(self._refused), set(self._behind)
-        for path in self._paths():
+        for path in _recordings_in(self.directory):
             ours = everything or self._is_ours(path)
             if path in refused or not (ours or path in behind):
                 continue
@@ -282,6 +280,12 @@ def _data_dir() -> Path:
 
 
 # ---- the files of waiting recordings
+
+
+def _recordings_in(outbox: Path) -> list[Path]:
+    """The recordings in an outbox, where other processes may write."""
+    # Path.glob raises FileNotFoundError if a directory goes meanwhile
+    return sorted(map(Path, glob.glob(f"{glob.escape(str(outbox))}/*/*.mcap")))  # noqa: PTH207
 
 
 def _state_of(path: Path) -> str:
