@@ -5,7 +5,8 @@
 1. PPO of stable-baselines3 learns with and without `VecRecordEpisodes`, in turns, in this process: CPU time. Must
    reach: at most 3 % more (the median of the rounds).
 2. `write_rollout` beside `numpy.save` of the same arrays, in turns: wall-clock time. Must reach: half of its speed.
-   Recordings are messages with checksums: with steps of few bytes, most of the time goes into these.
+   "The least" is what no valid recording can go without: the messages of the steps, with the checksums of their chunk
+   and of the file; it has no index, no episodes and no journal.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from tupli_mcap import write_rollout
+from tupli_mcap.mcap.records import BODY, crc32
 from tupli_mcap.sb3 import VecRecordEpisodes
 
 ENVS, STEPS = 8, 256
+CHUNK = 256 << 10  # bytes, as a recording has them
 
 
 def learn(path: Path | None) -> None:
@@ -49,6 +52,26 @@ def rollout(width: int, steps: int) -> dict[str, Any]:
 def save(path: Path, arrays: dict[str, Any]) -> None:
     for name, array in arrays.items():
         np.save(path.with_suffix(f".{name}.npy"), array)
+
+
+def least(path: Path, arrays: dict[str, Any]) -> None:
+    """Writes the arrays as messages, with two checksums."""
+    flags = {name: np.zeros(len(arrays["rewards"]), np.bool_) for name in ("terminals", "timeouts")}
+    fields = [(name, array.dtype, array.shape[1:]) for name, array in {**arrays, **flags}.items()]
+    message = np.dtype([("head", f"V{BODY + 8}"), *fields])
+    together = max(1, CHUNK // message.itemsize)
+    rows: Any = np.zeros(together, message)
+    in_file = 0
+    with path.open("wb", buffering=0) as file:
+        for first in range(0, len(arrays["rewards"]), together):
+            given = {name: array[first : first + together] for name, array in arrays.items()}
+            part = rows[: len(given["rewards"])]
+            for name, values in given.items():
+                part[name] = values
+            data = part.view(np.uint8).data
+            crc32(data)  # of the chunk
+            in_file = crc32(data, in_file)
+            file.write(data)
 
 
 def in_turns(rounds: int, clock: Callable[[], float], *work: Callable[[], object]) -> tuple[list[float], ...]:
@@ -79,19 +102,22 @@ def main() -> None:
         for width, steps in ((17, 500_000), (1_000, 20_000), (30_000, 600)):
             arrays = rollout(width, steps)
             for compression in ("zstd", "none"):
-                saving, writing = in_turns(
+                saving, bounding, writing = in_turns(
                     rounds,
                     time.perf_counter,
                     lambda arrays=arrays: save(path, arrays),
+                    lambda arrays=arrays: least(path, arrays),
                     lambda arrays=arrays, kind=compression: write_rollout(
                         path, **arrays, mode="w", compression=kind
                     ),
                 )
-                ratio = statistics.median(saving) / statistics.median(writing)
+                ratio, most = (
+                    statistics.median(saving) / statistics.median(took) for took in (writing, bounding)
+                )
                 size = sum(array.nbytes for array in arrays.values()) / 1e6
                 print(
                     f"write_rollout, {width} floats a step, {compression}: {ratio:.2f} of numpy.save "
-                    f"(must reach: 0.5), {size:.0f} MB in {statistics.median(writing):.2f} s"
+                    f"(must reach: 0.5; the least: {most:.2f}), {size:.0f} MB in {statistics.median(writing):.2f} s"
                 )
                 good &= ratio >= 0.5
     sys.exit(not good)
