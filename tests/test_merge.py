@@ -476,6 +476,9 @@ class TestSplit:
                 assert (len(recording), recording.n_steps) == (part.episodes, part.steps)
                 assert [recording.episodes[i].number for i in (0, -1)] == [part.first, part.last]
                 found += facts(recording)
+                made_of = recording.made_of
+                assert made_of is not None
+                assert (made_of["how"], made_of["sources"][0]["name"]) == ("split", "run.mcap")
         with Recording(path) as recording:
             assert same(found, facts(recording))
         assert {part.episodes for part in parts[:-1]} == {12}

@@ -822,6 +822,13 @@ def test_the_files_of_a_run_are_one_line_and_what_was_made_of_them_is_another(tm
     assert [len(group.rows) for group in twice.groups] == [3, 3]
 
 
+def test_the_files_that_a_run_was_split_into_are_one_line(tmp_path: Path) -> None:
+    scored(tmp_path / "a.mcap", [2, 3, 4], name="ppo")
+    parts = tupli_mcap.split_recording(tmp_path / "a.mcap", tmp_path / "parts" / "p.mcap", episodes=2)
+    made = report([part.path for part in parts])
+    assert [(group.name, len(group.rows)) for group in made.groups] == [("ppo", 3)]
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 9])
 def test_the_legend_is_beside_the_title(count: int, tmp_path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -85,13 +85,14 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 
     Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
     settings, the same other settings, and the same environment and split. A run that names no seed is a group by
-    itself, with all its files; so is a recording that was made of others.
+    itself, with all its files, also those it was split into; so is a recording that was made of others in another way.
     """
     found: dict[Any, dict[Any, list[Measured]]] = {}
     uuids = set()
     for place, one in enumerate(measured):
         key: tuple[Any, ...] = ("", "", place)
-        if not one.facts.made_of and one.facts.uuid not in uuids:
+        made_of = one.facts.made_of
+        if (made_of is None or made_of.get("how") == "split") and one.facts.uuid not in uuids:
             key = _seedless(one) or (("", one.run.name, one.run.id) if one.run.id else key)
         uuids.add(one.facts.uuid)
         found.setdefault(key, {}).setdefault(one.run.id or place, []).append(one)

@@ -66,8 +66,8 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def made_of(self) -> dict[str, Any] | None:
-        """Of which recordings this one was made, and how ("merge", "filter", "map", "trim"): `how`, `sources`, and
-        others, as `schemas/made_of.schema.json` has it; None if it says nothing.
+        """Of which recordings this one was made, and how ("merge", "filter", "map", "trim", "split"): `how`, `sources`,
+        and others, as `schemas/made_of.schema.json` has it; None if it says nothing.
 
         Raises:
             FormatError: it says something else.

@@ -221,7 +221,7 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
     """The attachment that names the sources of a new recording.
 
     Args:
-        how: "merge", "filter", "map", "trim".
+        how: "merge", "filter", "map", "trim", "split".
         facts: other facts: the query, the function's name, the steps.
     """
     sources = list(sources)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.edit.rewrite import new_metadata, write
+from tupli_mcap.recording.edit.rewrite import new_metadata, say_made_of, write
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rotation import series
@@ -71,11 +71,14 @@ def split_recording(
         taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
         if taken:
             raise RecordingError(f"{taken[0]} exists; choose another path")
+        said = say_made_of([recording], "split")
         parts = []
         for path, numbers in zip(paths, groups, strict=True):
             lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
             part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
-            parts.append(part if dry_run else _write_part(recording, part, numbers.tolist(), compression))
+            parts.append(
+                part if dry_run else _write_part(recording, part, numbers.tolist(), said, compression)
+            )
     return parts
 
 
@@ -99,10 +102,15 @@ def _groups(
     return [*groups, numbers[begin:]]
 
 
-def _write_part(recording: Recording, part: Part, numbers: list[int], compression: str) -> Part:
+def _write_part(
+    recording: Recording,
+    part: Part,
+    numbers: list[int],
+    said: Mapping[str, tuple[str, bytes]],
+    compression: str,
+) -> Part:
     with replacing(part.path) as (fd, _):
         container = Container(fd, str(part.path), compression)
-        copied = write(
-            recording, container, new_metadata(recording), numbers, {}, signed=False, left_out=STATEMENTS
-        )
+        metadata = new_metadata(recording)
+        copied = write(recording, container, metadata, numbers, said, signed=False, left_out=STATEMENTS)
     return part._replace(copied=copied, size=part.path.stat().st_size)
