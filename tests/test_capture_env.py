@@ -220,7 +220,7 @@ def test_an_unregistered_environment_is_named(tmp_path: Path) -> None:
     for command, shown in (("info", "environment  Robot"), ("trust", f"{__name__}:Robot")):
         words = [command, str(path), *(["--show"] if command == "trust" else [])]
         assert shown in CliRunner().invoke(app, words).output
-    result = CliRunner().invoke(app, ["verify", "--replay", str(path)])
+    result = CliRunner().invoke(app, ["verify", "--rerun", str(path)])
     assert result.exit_code == 1
 
 

@@ -778,14 +778,14 @@ class TestLook:
         with Recording(cartpole) as recording:
             lengths = recording.index["length"]
         args = ("verify", cartpole, "--rerun", "--filter", "steps > 20")
-        (replay,) = run(*args, "--json").json["replays"]
+        (replay,) = run(*args, "--json").json["reruns"]
         assert replay["certificate"]["chosen"]["episodes"] == (lengths > 20).sum()
-        (replay,) = run("verify", cartpole, "--rerun", "--episodes", "best,0-2", "--json").json["replays"]
+        (replay,) = run("verify", cartpole, "--rerun", "--episodes", "best,0-2", "--json").json["reruns"]
         assert replay["certificate"]["chosen"]["episodes"] in (3, 4)
         shutil.copy(cartpole, "a.mcap")
         ok("record", "CartPole-v1", "-o", "b.mcap", "--steps", 5)
         told = run("verify", ".", "--rerun", "--filter", "steps > 20", "--json").json
-        assert [item["path"] for item in told["replays"]] == ["a.mcap"]
+        assert [item["path"] for item in told["reruns"]] == ["a.mcap"]
         none = run("verify", cartpole, "--rerun", "--filter", "steps > 999")
         assert (none.code, none.err.count("\n")) == (1, 1)
         assert "no episode was run again" in none.err

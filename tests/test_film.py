@@ -19,7 +19,7 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
 from tupli_mcap.recording.edit.attach import add_attachments
-from tupli_mcap.replay import film
+from tupli_mcap.reexecute import film
 
 
 class Camera(gym.Env[Any, Any]):

@@ -31,7 +31,7 @@ from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.write import writer
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.replay.render import render
+from tupli_mcap.reexecute.render import render
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 SPACE = spaces.Dict(

@@ -27,8 +27,8 @@ from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.replay import render
-from tupli_mcap.replay.movie import Indexed
+from tupli_mcap.reexecute import render
+from tupli_mcap.reexecute.movie import Indexed
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.vector import RecordEpisodes as RecordVector

@@ -180,7 +180,7 @@ def test_names_and_texts_of_a_recording(recording: Path, tmp_path: Path) -> None
         ("plot", recording, "-o", tmp_path / "p.png"),
         ("replay", recording, "--save", tmp_path / "r.rrd"),
         ("replay", recording, "--layout", tmp_path / "l.json"),
-        ("verify", recording, "--replay"),
+        ("verify", recording, "--rerun"),
         ("recover", recording, "-o", tmp_path / "new.mcap"),
     ):
         run(*args)

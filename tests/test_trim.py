@@ -21,7 +21,7 @@ from tupli_mcap import RecordEpisodes, Recording, RecordingError, doctor
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import Episode, annotate_episodes, verify_recording
-from tupli_mcap.replay.starts import plan_episodes
+from tupli_mcap.reexecute.starts import plan_episodes
 
 ROOT = Path(__file__).parents[1]
 

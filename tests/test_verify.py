@@ -544,7 +544,7 @@ def test_nothing_to_verify_or_to_replay_is_said(tmp_path: Path) -> None:
         1, "", "error: there is nothing to verify; give recordings (.mcap) or directories of them\n"
     )  # fmt: skip
     (tmp_path / "empty.mcap").touch()
-    code, _, err = tell("verify", "--replay", tmp_path)
+    code, _, err = tell("verify", "--rerun", tmp_path)
     assert (code, err.count("\n")) == (1, 1)
     assert err.startswith("error: no episode was run again")
 

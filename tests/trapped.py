@@ -47,7 +47,7 @@ from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.sign.carried_code import carried_code
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.replay import certify, render
+from tupli_mcap.reexecute import certify, render
 from tupli_mcap.viewer.foxglove_layout import write_layout
 
 # Starting programs, networks, native code, other processes: never, whatever the arguments are.
@@ -210,7 +210,7 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     yield "tupli-mcap info --json", _cli("info", str(path), "--json")
     yield "tupli-mcap trust --show", _cli("trust", str(path), "--show")
     yield "tupli-mcap trust --show --json", _cli("trust", str(path), "--show", "--json")
-    yield "tupli-mcap verify --replay", _cli("verify", "--replay", str(path))
+    yield "tupli-mcap verify --rerun", _cli("verify", "--rerun", str(path))
     yield "tupli-mcap recover", _cli("recover", str(path), "-o", str(work / f"again_{name}"), "--force")
     yield (
         "tupli-mcap bundle",

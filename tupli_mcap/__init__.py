@@ -9,7 +9,7 @@ storage, benchmark         recordings in a directory or on a server; environment
 dataset, torch             `open`: episodes of files, directories and servers; DataLoaders
 server, page, remote       shares a storage over HTTP; its pages, and `browse`; reads files at URLs
 viewer, plots              shows episodes in Rerun and Foxglove, live too; draws figures
-doctor, replay             finds defects of the data; steps an environment with recorded actions
+doctor, reexecute          finds defects of the data; steps an environment with recorded actions
 trust, signing             which code and keys this user trusts; signatures
 cli                        the commands
 errors, progress, files, cache, jsonvalue, arrays, lazy    what all of them use
@@ -105,7 +105,7 @@ _HOMES = {
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names.split()}
 _MODULES = (
-    "benchmark", "dataset", "doctor", "errors", "plots", "recording", "replay", "sb3", "schema", "storage", "torch",
+    "benchmark", "dataset", "doctor", "errors", "plots", "recording", "reexecute", "sb3", "schema", "storage", "torch",
     "trust", "vector", "viewer",
 )  # fmt: skip
 

@@ -3,7 +3,7 @@
 app            lists the commands, with the module of each; turns an error into a line and an exit code
 record         record
 lists, info    ls, episodes; info
-replay         view
+view           view
 render         render, plot
 edit           tag, edit, merge, split, filter, trim, recover
 doctor         doctor

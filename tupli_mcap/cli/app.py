@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
-from tupli_mcap.cli import doctor, edit, info, lists, record, render, replay, storage, verify
+from tupli_mcap.cli import doctor, edit, info, lists, record, render, storage, verify, view
 from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.share import bundle, exchange, people, serve, trust
 from tupli_mcap.cli.terminal import (
@@ -253,7 +253,7 @@ def _help(
 
 _FUNCTIONS: dict[str, list[Callable[..., None]]] = {
     "Record": [record.record],
-    "Look": [lists.ls, info.info, lists.episodes, replay.view, serve.browse, render.plot, render.render],
+    "Look": [lists.ls, info.info, lists.episodes, view.view, serve.browse, render.plot, render.render],
     "Check": [doctor.doctor, verify.verify],
     "Edit": [edit.tag, edit.edit, edit.filter_, storage.delete, storage.restore, edit.trim, edit.merge,
         edit.split, edit.recover],
@@ -386,7 +386,7 @@ _ASKING = {*_COMMANDS["Server"], *_COMMANDS["People"]} - {"serve", "backup-serve
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
         app.command(_name, cls=_Command)(_command)
-app.command("replay", cls=_Command, hidden=True)(replay.view)  # the earlier name of `view`
+app.command("replay", cls=_Command, hidden=True)(view.view)  # the earlier name of `view`
 
 
 def main() -> None:

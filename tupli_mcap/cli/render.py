@@ -17,7 +17,7 @@ from tupli_mcap.errors import RecordingError, bytes_of
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
-    from tupli_mcap.replay import RenderReport
+    from tupli_mcap.reexecute import RenderReport
     from tupli_mcap.schema import BaseFilter
 
 _MOST_NAMES = 5
@@ -79,7 +79,7 @@ def render(
     episode cannot be run again.
     """
     check_extras([source], **({"video": "av"} if output.suffix.lower() == ".mp4" else {"frames": "PIL"}))
-    from tupli_mcap.replay import film, has_pictures, render
+    from tupli_mcap.reexecute import film, has_pictures, render
 
     # nothing is shown on a screen: pygame must not look for one
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

@@ -16,7 +16,7 @@ from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Recording, VerifyReport
-    from tupli_mcap.replay import Certificate
+    from tupli_mcap.reexecute import Certificate
     from tupli_mcap.schema import BaseFilter
 
 _STATES = {"unfinished": "not finished", "recording": "being recorded"}
@@ -30,11 +30,9 @@ def verify(
         list[str],
         typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs of recordings."),
     ],
-    replay: Annotated[
+    rerun: Annotated[
         bool,
-        typer.Option(
-            "--rerun", "--replay", help="Also run the episodes again, and compare them bit for bit."
-        ),
+        typer.Option("--rerun", help="Also run the episodes again, and compare them bit for bit."),
     ] = False,
     trust: Annotated[
         bool,
@@ -57,8 +55,8 @@ def verify(
     if an episode differs, or if none could be checked. --episodes and --filter choose the
     episodes; those that they depend on are run again too.
     """
-    replays = _Replays(trust, episodes, filter_of(filter_text)) if replay else None
-    if replays is None and (trust or episodes is not None or filter_text is not None):
+    reruns = _Reruns(trust, episodes, filter_of(filter_text)) if rerun else None
+    if reruns is None and (trust or episodes is not None or filter_text is not None):
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import verify_paths
 
@@ -68,21 +66,21 @@ def verify(
         reports.append(report)
         if not as_json:
             _print_verified(report)
-        if replays is not None and report.kind == "recording" and report.ok:
-            replays.add(addresses.get(report.path, report.path), quiet=as_json)
+        if reruns is not None and report.kind == "recording" and report.ok:
+            reruns.add(addresses.get(report.path, report.path), quiet=as_json)
     if not reports:
         raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
     damaged = sum(not report.ok for report in reports)
     if as_json:
         told: dict[str, Any] = {"ok": not damaged, "files": len(reports), "damaged": damaged}
         told["reports"] = [report.to_json() for report in reports]
-        told["replays"] = None if replays is None else replays.to_json()
+        told["reruns"] = None if reruns is None else reruns.to_json()
         print_json(told)
     elif len(reports) > 1:
         say(f"{number(len(reports) - damaged)} of {number(len(reports))} undamaged")
-    if replays is not None and not replays.tried and not as_json:
+    if reruns is not None and not reruns.tried and not as_json:
         fail("no episode was run again: no undamaged recording has such an episode")
-    if damaged or (replays is not None and not replays.ok):
+    if damaged or (reruns is not None and not reruns.ok):
         raise typer.Exit(1)
 
 
@@ -123,7 +121,7 @@ def _print_verified(report: VerifyReport) -> None:
 # --- with --rerun ---
 
 
-class _Replays:
+class _Reruns:
     """Runs the episodes of recordings again, and goes on after a recording that fails."""
 
     def __init__(self, trust: bool, episodes: str | None, wanted: BaseFilter | None) -> None:
@@ -150,7 +148,7 @@ class _Replays:
     def add(self, path: str, *, quiet: bool) -> None:
         """Runs the chosen episodes of a recording again; prints the outcome unless `quiet`."""
         from tupli_mcap.recording import Recording
-        from tupli_mcap.replay import certify
+        from tupli_mcap.reexecute import certify
 
         began = time.perf_counter()
         try:

@@ -30,7 +30,7 @@ _LARGEST: Final = 1 << 20
 
 _INSTEAD: Final = (
     "record with capture_env='pickle', or make the environment yourself and pass it on: "
-    "tupli_mcap.replay.certify(path, env=...), tupli_mcap.replay.render(path, env=...)"
+    "tupli_mcap.reexecute.certify(path, env=...), tupli_mcap.reexecute.render(path, env=...)"
 )
 
 

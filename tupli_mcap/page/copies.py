@@ -92,7 +92,7 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
 def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:
     """Writes the pictures of an episode as a temporary MP4. MissingExtraError without PyAV, NotFoundError if the
     episode is gone, or has no pictures."""
-    from tupli_mcap.replay import film
+    from tupli_mcap.reexecute import film
 
     episode = opened(shelf, header)
     with _folder() as folder:

@@ -12,7 +12,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.images.pictures import encode_pixels, format_of
 from tupli_mcap.recording import Episode
-from tupli_mcap.replay.recorded_film import as_picture
+from tupli_mcap.reexecute.recorded_film import as_picture
 from tupli_mcap.spaces.labels import short_path
 from tupli_mcap.spaces.leaves import Leaf
 

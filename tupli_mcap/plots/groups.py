@@ -91,8 +91,7 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
     uuids = set()
     for place, one in enumerate(measured):
         key: tuple[Any, ...] = ("", "", place)
-        made_of = one.facts.made_of
-        if (made_of is None or made_of.get("how") == "split") and one.facts.uuid not in uuids:
+        if one.is_recorded and one.facts.uuid not in uuids:
             key = _seedless(one) or (("", one.run.name, one.run.id) if one.run.id else key)
         uuids.add(one.facts.uuid)
         found.setdefault(key, {}).setdefault(one.run.id or place, []).append(one)

@@ -35,6 +35,7 @@ class Measured:
     """One recording.
 
     index: the index rows of all episodes. positions, rows: positions and rows of the chosen episodes. run: their run.
+    is_recorded: see `Recording.is_recorded`.
     numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata: key`, and `info: key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
     read_episodes, read_steps: how many episodes and steps the values are from.
@@ -44,6 +45,7 @@ class Measured:
     name: str
     facts: RecordingDescription
     run: Run
+    is_recorded: bool
     index: Array
     positions: Array
     layout: StepLayout | None
@@ -70,6 +72,7 @@ class Measured:
 
     @property
     def leaves(self) -> list[LeafValues]:
+        """The values of the leaves of states, actions and rewards."""
         return [*self.states, *self.actions, *self.rewards]
 
     def notes(self) -> list[str]:
@@ -97,8 +100,8 @@ def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES
     layout = recording.layout if recording.num_envs else None
     rows = recording.index[positions]
     measured = Measured(
-        recording.name, describe(recording), recording.readable_runs[0], recording.index, positions, layout,
-        _metadata_numbers(recording, positions),
+        recording.name, describe(recording), recording.readable_runs[0], recording.is_recorded, recording.index,
+        positions, layout, _metadata_numbers(recording, positions),
     )  # fmt: skip
     if layout is None:
         return measured

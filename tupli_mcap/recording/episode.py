@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
     from tupli_mcap.recording.recording import Recording
-    from tupli_mcap.replay import Film
+    from tupli_mcap.reexecute import Film
     from tupli_mcap.schema import EpisodeHeader
 
 
@@ -324,9 +324,9 @@ class Episode(GymnasiumNames):
     ) -> Film:
         """A film of recorded pictures (frames, or an image of the states), which a notebook shows; nothing is executed.
 
-        `episode.video("best.mp4")` also writes it. See `tupli_mcap.replay.film` for the arguments and errors.
+        `episode.video("best.mp4")` also writes it. See `tupli_mcap.reexecute.film` for the arguments and errors.
         """
-        from tupli_mcap.replay import film
+        from tupli_mcap.reexecute import film
 
         return film([self], target, camera=camera, fps=fps, every=every, width=width, overwrite=overwrite)
 

@@ -19,7 +19,6 @@ from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, Run
-from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.describe.description import state_of, successes
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -386,7 +385,7 @@ def _listed(
                 split=run.split,
                 tags=run.tags,
                 settings=_shared(each.metadata for each in runs),
-                run_id=run.id if len(runs) == 1 and MADE_OF_NAME not in recording.attachments else "",
+                run_id=run.id if len(runs) == 1 and recording.is_recorded else "",
                 span=(iso_utc(int(ends.min())), iso_utc(int(ends.max()))) if len(ends) else ("", ""),
             )
     except (TupliError, OSError) as err:

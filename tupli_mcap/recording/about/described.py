@@ -84,6 +84,15 @@ class DescribedRecording(OpenedRecording):
         return document
 
     @cached_property
+    def is_recorded(self) -> bool:
+        """Whether its episodes are those of a run as they were recorded: it was made of no other recordings, or is one
+        of the files that one was split into."""
+        try:
+            return self.made_of is None or self.made_of.get("how") == "split"
+        except FormatError:
+            return False
+
+    @cached_property
     def annotations(self) -> Annotations:
         """The annotations of its episodes.
 

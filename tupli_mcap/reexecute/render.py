@@ -18,12 +18,12 @@ from tupli_mcap.recording import Episode, Recording, rewrite_recording
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
-from tupli_mcap.replay.attempt import Watch
-from tupli_mcap.replay.certificate import Divergence, SkipKind, Skipped
-from tupli_mcap.replay.certify import Certifier
-from tupli_mcap.replay.movie import RenderedFrames, check_goal, check_pictures, film_rate, write_movie
-from tupli_mcap.replay.reapply import Replayer
-from tupli_mcap.replay.starts import EpisodePlan
+from tupli_mcap.reexecute.attempt import Watch
+from tupli_mcap.reexecute.certificate import Divergence, SkipKind, Skipped
+from tupli_mcap.reexecute.certify import Certifier
+from tupli_mcap.reexecute.movie import RenderedFrames, check_goal, check_pictures, film_rate, write_movie
+from tupli_mcap.reexecute.reapply import Reexecutor
+from tupli_mcap.reexecute.starts import EpisodePlan
 
 _KINDS: Final = (".mcap", ".mp4", ".gif")
 _FPS: Final = 30.0  # if neither the recording nor the environment has the duration of a step
@@ -264,7 +264,7 @@ class _Renderer(Certifier):
         fps = (env.metadata or {}).get("render_fps")
         return float(fps) if isinstance(fps, int | float) and 0 < fps < 1e6 else _FPS
 
-    def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
+    def _watch(self, plan: EpisodePlan, reexecutor: Reexecutor) -> Watch | None:
         if plan.number not in self._chosen:
             return lambda step: None
         number, length = plan.number, int(self._recording.index["length"][plan.position])
@@ -273,7 +273,7 @@ class _Renderer(Certifier):
 
         def watch(step: int) -> None:
             if step % self._every == 0 or step == length:
-                self._frames.add(number, step, self._picture(replayer.env, number, step))
+                self._frames.add(number, step, self._picture(reexecutor.env, number, step))
 
         return watch
 
@@ -291,9 +291,9 @@ class _Renderer(Certifier):
         self.size = (picture.shape[0], picture.shape[1])
         return picture
 
-    def _replay(self, plans: list[EpisodePlan]) -> None:
+    def _reexecute(self, plans: list[EpisodePlan]) -> None:
         self.divergence = self._earlier = None  # a second try may agree
-        super()._replay(plans)
+        super()._reexecute(plans)
 
     def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
         if plan.number not in self._chosen:

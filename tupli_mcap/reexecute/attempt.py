@@ -10,10 +10,10 @@ import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
-from tupli_mcap.replay.compare import Checker, Tally
-from tupli_mcap.replay.reapply import EnvironmentFailedError, Moment, Replayer, recorded_actions
-from tupli_mcap.replay.recorded_values import RecordedValues
-from tupli_mcap.replay.starts import EpisodePlan
+from tupli_mcap.reexecute.compare import Checker, Tally
+from tupli_mcap.reexecute.reapply import EnvironmentFailedError, Moment, Reexecutor, recorded_actions
+from tupli_mcap.reexecute.recorded_values import RecordedValues
+from tupli_mcap.reexecute.starts import EpisodePlan
 
 Watch = Callable[[int], None]
 """Called with the number of each step whose state agrees, while the environment is in that state; then for the final
@@ -35,7 +35,7 @@ class Attempt(NamedTuple):
 
 def attempt(
     recording: Recording,
-    replayer: Replayer,
+    reexecutor: Reexecutor,
     plan: EpisodePlan,
     values: RecordedValues,
     checker: Checker,
@@ -45,17 +45,17 @@ def attempt(
     first difference."""
     tally = Tally(values.length)
     try:
-        moment = replayer.start(plan)
+        moment = reexecutor.start(plan)
         for block in values:
             checker.bind(block.columns, block.start)
-            action_of = recorded_actions(recording, block.columns.actions, plain=replayer.plain)
+            action_of = recorded_actions(recording, block.columns.actions, plain=reexecutor.plain)
             for step in range(block.start, block.stop):
                 checker.state(step, moment.state, tally)
                 if watch is not None:
                     if tally.first is not None:
                         return Attempt(tally)
                     watch(step)
-                moment = replayer.step(step, action_of(step - block.start))
+                moment = reexecutor.step(step, action_of(step - block.start))
                 if not checker.result(step, moment, tally) and step + 1 < values.length:
                     tally.ended = step  # the environment ended the episode: no later step can be compared
                     return Attempt(tally)
@@ -70,22 +70,25 @@ def attempt(
 
 
 def repeats_itself(
-    recording: Recording, plan: EpisodePlan, values: RecordedValues, replayers: tuple[Replayer, Replayer]
+    recording: Recording,
+    plan: EpisodePlan,
+    values: RecordedValues,
+    reexecutors: tuple[Reexecutor, Reexecutor],
 ) -> bool:
     """Whether two new environments return the same in the first steps of an episode with a seed."""
-    first, second = (_prints(recording, plan, values, replayer) for replayer in replayers)
+    first, second = (_prints(recording, plan, values, reexecutor) for reexecutor in reexecutors)
     return list(first) == list(second)
 
 
 def _prints(
-    recording: Recording, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
+    recording: Recording, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor
 ) -> Iterator[bytes]:
     try:
-        yield _print(recording.layout, replayer.start(plan))
+        yield _print(recording.layout, reexecutor.start(plan))
         for block in values:
-            action_of = recorded_actions(recording, block.columns.actions, plain=replayer.plain)
+            action_of = recorded_actions(recording, block.columns.actions, plain=reexecutor.plain)
             for step in range(block.start, min(block.stop, _SAMPLE)):
-                moment = replayer.step(step, action_of(step - block.start))
+                moment = reexecutor.step(step, action_of(step - block.start))
                 yield _print(recording.layout, moment)
                 if moment.terminal or moment.timeout:
                     return

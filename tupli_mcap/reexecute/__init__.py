@@ -8,10 +8,10 @@ render, movie             keeps what the environment renders, too; writes it as 
 recorded_film             a film of recorded pictures, for which nothing is executed
 """
 
-from tupli_mcap.replay.certificate import Certificate, Counts, Divergence, Skipped
-from tupli_mcap.replay.certify import certify
-from tupli_mcap.replay.recorded_film import Film, film, has_pictures
-from tupli_mcap.replay.render import RenderedEpisode, RenderReport, render
+from tupli_mcap.reexecute.certificate import Certificate, Counts, Divergence, Skipped
+from tupli_mcap.reexecute.certify import certify
+from tupli_mcap.reexecute.recorded_film import Film, film, has_pictures
+from tupli_mcap.reexecute.render import RenderedEpisode, RenderReport, render
 
 __all__ = [
     "Certificate",

@@ -17,7 +17,7 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns
-from tupli_mcap.replay.reapply import Moment
+from tupli_mcap.reexecute.reapply import Moment
 from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -193,10 +193,8 @@ class Checker:
         differs = np.asarray(_bits(expected) != _bits(array))
         first = tuple(int(i) for i in np.argwhere(differs)[0])
         path = leaf.path + (f"[{', '.join(map(str, first))}]" if first else "")
-        recorded, replayed = _text(expected[first]), _text(array[first])
-        return Difference(
-            step, leaf.name, path, recorded, replayed, _largest(expected[differs], array[differs])
-        )
+        recorded, rerun = _text(expected[first]), _text(array[first])
+        return Difference(step, leaf.name, path, recorded, rerun, _largest(expected[differs], array[differs]))
 
 
 def _bits(array: Any) -> Any:

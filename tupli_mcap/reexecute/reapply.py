@@ -17,7 +17,7 @@ from tupli_mcap.environment import resets_itself
 from tupli_mcap.errors import TupliError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
-from tupli_mcap.replay.starts import EpisodePlan, ResetCall
+from tupli_mcap.reexecute.starts import EpisodePlan, ResetCall
 
 
 class EnvironmentFailedError(TupliError):
@@ -43,7 +43,7 @@ class Moment(NamedTuple):
     info: Any = None
 
 
-class Replayer:
+class Reexecutor:
     """Runs the episodes of one sub-environment again, in the order of the calls.
 
     make: builds the environment. owned: whether this object closes it; otherwise the caller does. plain: pass numbers

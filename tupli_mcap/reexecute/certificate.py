@@ -73,7 +73,9 @@ class Divergence(_Model):
         if self.kind == "error":
             return f"{where}: the environment fails at {_place(self.step, self.length)} with {self.found}"
         place = _place(self.step, self.length)
-        return f"{where} diverges at {place}: {self.path} is {self.expected} recorded, {self.found} replayed"
+        return (
+            f"{where} diverges at {place}: {self.path} is {self.expected} recorded, {self.found} in the rerun"
+        )
 
 
 def _place(step: int, length: int) -> str:

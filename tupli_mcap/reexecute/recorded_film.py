@@ -16,7 +16,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.images.pictures import Picture, resized
 from tupli_mcap.recording import Episode
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.replay.movie import check_goal, check_pictures, film_rate, write_movie
+from tupli_mcap.reexecute.movie import check_goal, check_pictures, film_rate, write_movie
 from tupli_mcap.spaces.labels import leaves_by_name
 from tupli_mcap.spaces.leaves import Leaf
 

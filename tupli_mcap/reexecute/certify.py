@@ -13,8 +13,8 @@ import gymnasium as gym
 from tupli_mcap.errors import RecordingError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
-from tupli_mcap.replay.attempt import Attempt, Watch, attempt, repeats_itself
-from tupli_mcap.replay.certificate import (
+from tupli_mcap.reexecute.attempt import Attempt, Watch, attempt, repeats_itself
+from tupli_mcap.reexecute.certificate import (
     REASONS,
     Certificate,
     Counts,
@@ -25,10 +25,10 @@ from tupli_mcap.replay.certificate import (
     platform_facts,
     versions_of,
 )
-from tupli_mcap.replay.compare import Checker, Difference
-from tupli_mcap.replay.reapply import Replayer
-from tupli_mcap.replay.recorded_values import RecordedValues, recorded_values
-from tupli_mcap.replay.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
+from tupli_mcap.reexecute.compare import Checker, Difference
+from tupli_mcap.reexecute.reapply import Reexecutor
+from tupli_mcap.reexecute.recorded_values import RecordedValues, recorded_values
+from tupli_mcap.reexecute.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
 from tupli_mcap.spaces.leaves import own_space
 
 _MAX_DIVERGENCES = 100
@@ -118,30 +118,30 @@ class Certifier:
     def _build(self) -> gym.Env[Any, Any]:
         return self._recording.benchmark.make_env(trust=self._trust)
 
-    def _watch(self, plan: EpisodePlan, replayer: Replayer) -> Watch | None:
+    def _watch(self, plan: EpisodePlan, reexecutor: Reexecutor) -> Watch | None:
         """The watcher of the next attempt at an episode; further attempts may follow."""
         return None
 
     def _stops(self, plan: EpisodePlan, outcome: Divergence | SkipKind | None) -> bool:
         return False
 
-    def _replayer(self, *, plain: bool = False) -> Replayer:
-        return Replayer(self._make, owned=self._given is None, plain=plain)
+    def _reexecutor(self, *, plain: bool = False) -> Reexecutor:
+        return Reexecutor(self._make, owned=self._given is None, plain=plain)
 
     def _sub_environment(self, plans: list[EpisodePlan]) -> None:
         """Runs the chosen episodes of one sub-environment, and those that they continue. If one differs, runs them anew
         after all episodes before them: a wrapper may carry state over a seeded reset."""
         everything = up_to_last(plans, self._chosen)
         needed = needed_for(everything, self._chosen)
-        self._replay(needed)
+        self._reexecute(needed)
         if len(needed) < len(everything) and self._given is None:
             outcomes = [self._outcomes.get(plan.position) for plan in needed if plan.number in self._chosen]
             if any(isinstance(outcome, Divergence) for outcome in outcomes):
                 self._stopped = False
-                self._replay(everything)
+                self._reexecute(everything)
 
-    def _replay(self, plans: list[EpisodePlan]) -> None:
-        replayer = self._replayer(plain=self._plain)
+    def _reexecute(self, plans: list[EpisodePlan]) -> None:
+        reexecutor = self._reexecutor(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:
             values = recorded_values(self._recording, [plan.position for plan in plans])
@@ -151,7 +151,7 @@ class Certifier:
                 if self._withheld(plan):
                     outcome = doubt = "untrusted"
                 else:
-                    result, replayer = self._attempt(plan, recorded, replayer)
+                    result, reexecutor = self._attempt(plan, recorded, reexecutor)
                     if result.agrees:
                         doubt = None if doubt == "after_divergence" else doubt
                     else:
@@ -165,7 +165,7 @@ class Certifier:
                 if self._stopped:
                     return
         finally:
-            replayer.close()
+            reexecutor.close()
 
     def _withheld(self, plan: EpisodePlan) -> bool:
         """Whether an episode is not run, because its reset options could run code and are not trusted."""
@@ -184,31 +184,31 @@ class Certifier:
         return before if plan.needs_predecessor else "unseeded"
 
     def _attempt(
-        self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer
-    ) -> tuple[Attempt, Replayer]:
+        self, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor
+    ) -> tuple[Attempt, Reexecutor]:
         """Runs an episode in the environment of those before it; if it differs, in new ones: another process may have
         continued the recording, or the policy may have given Python's numbers."""
-        used = replayer.used
-        found = self._attempted(plan, values, replayer)
+        used = reexecutor.used
+        found = self._attempted(plan, values, reexecutor)
         if found.agrees:
             self._settled = True
         if found.agrees or not plan.starts_chain or self._given is not None:
-            return found, replayer
-        others = [self._replayer(plain=self._plain)] if used else []
+            return found, reexecutor
+        others = [self._reexecutor(plain=self._plain)] if used else []
         if not self._settled and any(leaf.is_scalar for leaf in self._recording.layout.action):
-            others.append(self._replayer(plain=True))
+            others.append(self._reexecutor(plain=True))
         for other in others:
             again = self._attempted(plan, values, other)
             if again.agrees:
-                replayer.close()
+                reexecutor.close()
                 self._settled, self._plain = True, other.plain
                 return again, other
             other.close()
-        return found, replayer
+        return found, reexecutor
 
-    def _attempted(self, plan: EpisodePlan, values: RecordedValues, replayer: Replayer) -> Attempt:
-        watch = self._watch(plan, replayer)
-        return attempt(self._recording, replayer, plan, values, self._checker, watch)
+    def _attempted(self, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor) -> Attempt:
+        watch = self._watch(plan, reexecutor)
+        return attempt(self._recording, reexecutor, plan, values, self._checker, watch)
 
     # ---- the first difference of an episode
 
@@ -265,12 +265,12 @@ class Certifier:
 
     def _repeats_itself(self, plan: EpisodePlan, values: RecordedValues) -> bool | None:
         if self._deterministic is None and self._given is None:
-            replayers = self._replayer(), self._replayer()
+            reexecutors = self._reexecutor(), self._reexecutor()
             try:
-                self._deterministic = repeats_itself(self._recording, plan, values, replayers)
+                self._deterministic = repeats_itself(self._recording, plan, values, reexecutors)
             finally:
-                for replayer in replayers:
-                    replayer.close()
+                for reexecutor in reexecutors:
+                    reexecutor.close()
         return self._deterministic
 
     # ---- the result

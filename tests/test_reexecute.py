@@ -38,7 +38,7 @@ from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.sign.sign import sign_recording
-from tupli_mcap.replay import Certificate, certify, recorded_values, render
+from tupli_mcap.reexecute import Certificate, certify, recorded_values, render
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -344,7 +344,7 @@ def test_a_certificate_tells_which_episodes_it_is_of(tmp_path: Path) -> None:
 def test_a_certificate_in_a_file_is_an_attachment_like_any_other(tmp_path: Path, text: bytes) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 20)
     add_attachments(path, {"replay-certificate.json": ("application/json", text)})
-    for command in (["info"], ["verify", "--replay"], ["episodes"]):
+    for command in (["info"], ["verify", "--rerun"], ["episodes"]):
         code, out, err = run(*command, path)
         assert (code, err) == (0, ""), command
         assert "\ncertificate" not in out
@@ -455,18 +455,18 @@ def test_rendering_gives_no_such_options_either(tmp_path: Path, levels: Any) -> 
 def test_options_are_trusted_with_their_file(tmp_path: Path, levels: Any) -> None:
     path = record_levels(tmp_path / "a.mcap", levels, {"level": "../x"}, None)
     other = record_levels(tmp_path / "b.mcap", levels, {"level": "../y"}, None)
-    code, out, _ = run("verify", "--replay", path)
+    code, out, _ = run("verify", "--rerun", path)
     assert code == 1
     assert "2 episodes could not be checked, the first is 0: reset with options that need trust" in out
     shown = run("trust", path, "--show")[1]
     assert "options      of a reset hold '../x' and may name a file or code\n" in shown
     assert re.search("^trusted +no$", shown, re.MULTILINE)
     assert re.search("^trusted +yes$", run("trust", path)[1], re.MULTILINE)
-    assert run("verify", "--replay", path)[0] == 0
-    assert run("verify", "--replay", other)[0] == 1  # the same environment, from somebody else
+    assert run("verify", "--rerun", path)[0] == 0
+    assert run("verify", "--rerun", other)[0] == 1  # the same environment, from somebody else
     assert {"level": "../y"} not in GIVEN
     assert run("untrust", path)[0] == 0
-    assert run("verify", "--replay", path)[0] == 1
+    assert run("verify", "--rerun", path)[0] == 1
     assert json.loads(run("trust", "--list", "--json")[1])["result"]["digests"] == []
 
 
@@ -669,7 +669,7 @@ def test_several_episodes_may_differ(tmp_path: Path) -> None:
     certificate = certify(forge(path, tmp_path / "b.mcap", change))
     assert [divergence.episode for divergence in certificate.divergences] == [2, 5, 8]
     assert certificate.agreed.episodes == certificate.recorded.episodes - 3
-    assert str(certificate.first) == "episode 2 diverges at step 1: reward is 2.0 recorded, 1.0 replayed"
+    assert str(certificate.first) == "episode 2 diverges at step 1: reward is 2.0 recorded, 1.0 in the rerun"
 
 
 # --- the command line ---
@@ -678,15 +678,15 @@ def test_several_episodes_may_differ(tmp_path: Path) -> None:
 def test_verify_replay(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 100)
     before = path.read_bytes()
-    code, out, err = run("verify", "--replay", path)
+    code, out, err = run("verify", "--rerun", path)
     with Recording(path) as recording:
         episodes = len(recording)
     assert (code, err) == (0, "")
     assert f"{path}: all {episodes} episodes (100 steps) agree bit for bit\n  run again in" in out
     assert path.read_bytes() == before
-    code, out, err = run("verify", "--replay", "--json", path)
+    code, out, err = run("verify", "--rerun", "--json", path)
     assert (code, err) == (0, "")
-    (told,) = json.loads(out)["result"]["replays"]
+    (told,) = json.loads(out)["result"]["reruns"]
     assert (told.pop("path"), told.pop("agrees")) == (str(path), True)
     assert told.pop("error") is None
     told = told.pop("certificate")
@@ -707,22 +707,22 @@ def test_verify_replay_of_what_differs_or_cannot_be_replayed(
         return episode
 
     changed = forge(path, tmp_path / "b.mcap", change)
-    code, out, err = run("verify", "--replay", changed)
+    code, out, err = run("verify", "--rerun", changed)
     assert (code, err) == (1, "")
-    assert f"{changed}: episode 1 diverges at step 0: reward is 7.0 recorded, 1.0 replayed" in out
+    assert f"{changed}: episode 1 diverges at step 0: reward is 7.0 recorded, 1.0 in the rerun" in out
     assert "of reward by at most 6, at step 0" in out
-    assert run("verify", "--replay", "--episodes", "0,2-3", changed)[0] == 0
+    assert run("verify", "--rerun", "--episodes", "0,2-3", changed)[0] == 0
     pickled = record(tmp_path / "c.mcap", Drifting(gym.make("CartPole-v1")), 30)
     monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "stranger"))
-    code, out, err = run("verify", "--replay", pickled)
+    code, out, err = run("verify", "--rerun", pickled)
     assert code == 1
     assert "pickled Python code" in err and err.count("\n") == 1
-    assert run("verify", "--replay", "--trust", pickled)[0] == 0
+    assert run("verify", "--rerun", "--trust", pickled)[0] == 0
 
 
 @pytest.mark.parametrize(
     "args",
-    [["--trust"], ["--episodes", "1"], ["--replay", "--episodes", "1-x"], ["--rerun", "--filter", "a = 1"]],
+    [["--trust"], ["--episodes", "1"], ["--rerun", "--episodes", "1-x"], ["--rerun", "--filter", "a = 1"]],
 )
 def test_options_that_make_no_sense(tmp_path: Path, args: list[str]) -> None:
     code, out, err = run("verify", *args, tmp_path / "a.mcap")
