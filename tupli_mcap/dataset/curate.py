@@ -18,6 +18,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
+    Part,
     Recording,
     RecoveryReport,
     rewrite_recording,
@@ -29,7 +30,6 @@ from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
-from tupli_mcap.recording.edit.split import Part
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import path_of

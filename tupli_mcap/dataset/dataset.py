@@ -33,9 +33,8 @@ from tupli_mcap.dataset.sources import (
     place_of,
 )
 from tupli_mcap.errors import plural, warn
-from tupli_mcap.recording import Episode, Recording
+from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
-from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter

@@ -132,7 +132,7 @@ class EpisodeDeriver:
         if not width:
             before = before[np.isin(before, list(pending))]
         column = last + 1
-        if len(before):  # rare: joining structured arrays is slow
+        if len(before):
             ends = np.concatenate([self._waiting[before], ends])
             column = np.concatenate([np.zeros(len(before), np.int64), column])
             self._waits[before] = False
@@ -190,5 +190,5 @@ def sums(values: Array, firsts: Array) -> Array:
         return np.zeros(0)
     with np.errstate(over="ignore", invalid="ignore"):  # of infinite values
         if (values == np.rint(values)).all() and np.abs(values).sum() < 2**53:
-            return np.add.reduceat(values, firsts) + 0.0  # exact in any order
+            return np.add.reduceat(values, firsts) + 0.0  # exact in any order; -0.0 becomes 0.0
         return np.array([np.add.accumulate(part)[-1] for part in np.split(values, firsts)[1:]]) + 0.0

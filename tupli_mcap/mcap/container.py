@@ -276,8 +276,8 @@ class Container:
     def start_chunks(self, chunks: Sequence[Rows]) -> Callable[[], Packed]:
         """A function that compresses chunks of different channels, in any thread; `finish_chunks` takes its result.
 
-        This method and `finish_chunks` do everything that needs the interpreter lock: the compressing thread takes
-        it only once. Chunks with a codec are encoded in that thread.
+        This method and `finish_chunks` do everything that needs the interpreter lock, so that the compressing thread
+        takes it only once. Except: chunks with a codec are encoded in that thread.
         """
         if any(rows.channel in self.codecs for rows in chunks):
             return lambda: self._packed([self.prepare(rows) for rows in chunks])
@@ -367,7 +367,7 @@ class Container:
         )
 
 
-# The records of a chunk are packed here: for small chunks, the package's builder takes longer than the compressor.
+# The records of a chunk are packed here, and not by the `mcap` package's builder, which packs field by field.
 
 # RECORD; first and last time, offset and length of the chunk; length of the map of message indexes, its one channel and
 # offset; length of the message index; length of the compression's name

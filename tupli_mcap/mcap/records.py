@@ -142,7 +142,7 @@ def with_crc(values: Mapping[str, str]) -> dict[str, str]:
 
 def check_crc(values: Mapping[str, str], known: Collection[str], where: str) -> dict[str, str]:
     """The pairs without `crc`; FormatError if `crc` differs, or if it is missing, and there are other keys than the
-    `known` ones: old recordings have no `crc`, but a damaged key must not pass for a missing one."""
+    `known` ones: `crc` is optional in format 1, but a damaged key must not pass for a missing one."""
     pairs = {key: value for key, value in values.items() if key != _KEY}
     if _KEY not in values:
         # A damaged length may have put the key into a value. Such a value holds the zeros of the key's length.

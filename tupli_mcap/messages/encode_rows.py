@@ -224,7 +224,7 @@ def _head(source: Source, layout: StepLayout) -> Packed:
     return packed
 
 
-# The state of the encoder is in closure variables: attributes take twice the bytecode.
+# The state of the encoder is in closure variables, which need no `self`.
 _ENCODER = """\
 def encoder():
     offset = start = last = end = 0

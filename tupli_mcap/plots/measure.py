@@ -14,8 +14,7 @@ from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.messages.infos import InfoCodec, with_text_keys
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
-from tupli_mcap.recording import Recording
-from tupli_mcap.recording.about.run import Run
+from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import KEYS, success_of
 from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.describe.description import RecordingDescription, describe, nan_text

@@ -299,7 +299,6 @@ class StepClaims:
         mine = index["env"] == self._env
         if not mine.all():
             index = index[mine]
-        # field by field: NumPy is slow with rows of many fields
         firsts, lengths = index["first_row"].astype(np.int64), index["length"].astype(np.int64)
         numbers = index["episode"].astype("<u8") + (lengths - 1 << 32).astype("<u8")
         if (firsts[1:] < firsts[:-1]).any():

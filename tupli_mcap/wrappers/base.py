@@ -15,8 +15,8 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import FlagCheck
-from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of

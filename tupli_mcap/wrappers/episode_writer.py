@@ -19,10 +19,10 @@ from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
-from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.infos import entries_of

@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.errors import RecordingError, TupliError, brief
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import spread_of
-from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.options import RENDER_MODE, Mode, RecordOptions
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes

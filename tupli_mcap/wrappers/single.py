@@ -17,8 +17,8 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import names_success, with_success
-from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import (
     Capture,

@@ -132,7 +132,7 @@ class Stream:
             self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
             self.put_infos(infos)
             return
-        check = step_check(writer.laid())
+        check = step_check(writer.fixed_layout())
         for i in range(n):
             check(*(arrays_at(column, i) for column in columns))
         for i in range(n):
@@ -178,7 +178,7 @@ class Stream:
         exactly; nothing is recorded."""
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)
         numbers = np.arange(writer.next_episode, writer.next_episode + count)
-        final_bytes = None if finals is None else _final_bytes(writer.laid(), finals, count)
+        final_bytes = None if finals is None else _final_bytes(writer.fixed_layout(), finals, count)
         now, first_row = time.time_ns(), store.count
         states, actions, rewards, terminals, timeouts = columns
         store.put_many(states, actions, rewards, terminals, timeouts, np.repeat(numbers, lengths))
@@ -215,7 +215,7 @@ class Stream:
 
     def _encoded(self, final_state: Any) -> bytes | None:
         """A final state as it is stored; None if it is not known. StepError if it cannot be stored exactly."""
-        return None if final_state is None else final_encoder(self._writer.laid())(final_state)
+        return None if final_state is None else final_encoder(self._writer.fixed_layout())(final_state)
 
     def discard(self) -> int | None:
         """Ends the running episode and marks it as discarded; returns its number, None if it has no step."""

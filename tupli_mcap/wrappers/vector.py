@@ -16,8 +16,8 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import SpaceError, StepError, warn
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import tells_success, with_success
-from tupli_mcap.recording.episode import Step
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import (
     Capture,

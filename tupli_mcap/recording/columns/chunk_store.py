@@ -33,7 +33,7 @@ IN_MEMORY = 1 << 63  # chunk offsets from here on are indexes of rows in memory
 _U4, _U8 = np.dtype("<u4"), np.dtype("<u8")
 _LEAST_STEP = PREFIX + 2  # bytes of a step's record: after its episode and step, terminal and timeout
 _ROW_HEAD = struct.Struct("<BQH")  # opcode, length, channel: the same in every row of a channel
-# bytes 0 to 7 and 7 to 10: NumPy copies them faster than items of 11
+# bytes 0 to 7 and 7 to 10 of it, in two items of sizes that NumPy copies at once
 _HEAD, _REST = np.dtype("V8"), np.dtype("V4")
 
 

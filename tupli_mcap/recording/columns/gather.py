@@ -339,7 +339,7 @@ def _work(left: deque[Callable[[], None]], take: Callable[[], Callable[[], None]
 
 def _are_bools(column: Array) -> bool:
     """Whether all bytes of a column of bools are 0 or 1."""
-    if column.nbytes < _FEW:  # faster than NumPy for so few
+    if column.nbytes < _FEW:  # not worth a call of NumPy
         return not column.tobytes().translate(None, b"\0\1")
     return bool(np.bitwise_or.reduce(column.view(np.uint8), axis=None) <= 1)
 

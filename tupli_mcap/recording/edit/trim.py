@@ -36,7 +36,6 @@ def trim_recording(
     *,
     episodes: Sequence[int] | None = None,
     overwrite: bool = False,
-    dry_run: bool = False,
 ) -> TrimReport:
     """Writes `target` with only some consecutive steps of some episodes.
 
@@ -65,8 +64,6 @@ def trim_recording(
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
     left_out = sum(lengths[number] - (trim.stop - trim.start) for number, trim in trims.items())
     report = TrimReport(target, len(rows), total - left_out, left_out)
-    if dry_run:
-        return report
     said = say_made_of([source], "trim", steps={str(n): [trim.start, trim.stop] for n, trim in trims.items()})
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), "zstd")

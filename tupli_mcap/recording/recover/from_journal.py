@@ -247,7 +247,7 @@ def _take_log(
 
 
 def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> None:
-    """Completes rows of constant size and takes them."""
+    """Takes tables of completed rows."""
     completed = [
         even_rows(channel, int(rows["#sequence"][0]), rows.view(np.uint8).tobytes(), rows) for rows in tables
     ]

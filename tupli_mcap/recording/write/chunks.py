@@ -22,9 +22,11 @@ from tupli_mcap.mcap.lock import FileLock
 _MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the journal must not come to LAST_ROW
 
 T = TypeVar("T")
-# Seconds of work: handing a chunk over costs the recording thread some 0.05 ms, on virtual machines ten times as much.
+# Seconds of work from which a job is handed over: that costs the recording thread time, too, on virtual machines most.
 WORTH_A_THREAD = 0.001
-LARGE = 3 << 20  # bytes that take as long at 3 GB/s; how long they do is known from the second job on
+LARGE = (
+    3 << 20
+)  # bytes of a first job that is handed over; how long a job takes is known from the second one on
 
 
 class ChunkWorker:
@@ -89,7 +91,7 @@ class ChunkWriter:
     def __init__(self, path: Path, container: Container, lock: FileLock, settle: Callable[[], None]) -> None:
         self._path, self._container, self._lock, self._settle = path, container, lock, settle
         self._worker = ChunkWorker()
-        self._told_deleted = False
+        self._warned_of_deletion = False
 
     def add(self, rows: Rows) -> None:
         """Writes a chunk."""
@@ -125,8 +127,8 @@ class ChunkWriter:
 
     def warn_if_deleted(self) -> None:
         """Once: what is written to a file without a name is lost when it is closed."""
-        if self._lock.is_deleted and not self._told_deleted:
-            self._told_deleted = True
+        if self._lock.is_deleted and not self._warned_of_deletion:
+            self._warned_of_deletion = True
             warn(
                 f"{self._path} was deleted while it is being recorded, and nothing of it will remain; "
                 "record to another file",

@@ -54,7 +54,7 @@ class ResetFacts(NamedTuple):
         return self.seed is None and self.drawn_seed is None and not self.continued
 
 
-# makes a StartedEpisode of its fields without a call of Python
+# makes a StartedEpisode of its fields
 _new: Callable[[type[StartedEpisode], tuple[Any, ...]], StartedEpisode] = tuple.__new__
 
 
@@ -114,7 +114,6 @@ class EpisodeLog(EventLog):
             final_row = self.sequences[self._final]
             final = EPISODE_AND_ENV.pack(number, env) + state
             now = self.append(now, (self._final, final), (self._end, body))
-        # no EpisodeRow: to make one takes as long as to add it
         row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)
 
@@ -133,7 +132,7 @@ class EpisodeLog(EventLog):
         begun, final, ended = self._tables(batch)
         final_rows = final["#sequence"] if len(final) else np.full(len(ended), -1)
         self.latest_ns = max(self.latest_ns, *(int(t["#log_time"][-1]) for t in (begun, ended) if len(t)))
-        self._tell_index(begun, ended, final_rows)
+        self._add_to_index(begun, ended, final_rows)
         self._add({self._start: begun, self._final: final, self._end: ended})
 
     def _tables(self, batch: EpisodeBatch) -> tuple[Array, Array, Array]:
@@ -160,7 +159,7 @@ class EpisodeLog(EventLog):
         table["#log_time"] = np.maximum.accumulate(np.maximum(rows["time"], np.uint64(self.latest_ns)))
         return table
 
-    def _tell_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
+    def _add_to_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
         rows = _index_rows(ended, final_rows)
         at = np.searchsorted(begun["episode"], ended["episode"])
         here = np.append(begun["episode"], -1)[at] == ended["episode"]

@@ -205,7 +205,7 @@ class RecordingWriter:
         for name, (media_type, data) in arriving.items():
             container.add_attachment(name, media_type, data, time.time_ns())
 
-    def laid(self) -> StepLayout:
+    def fixed_layout(self) -> StepLayout:
         """The layout; RecordingError before the first step."""
         if self.layout is None:
             raise RecordingError(f"{self.path} has no step yet, so its layout is not known")
@@ -373,7 +373,7 @@ class RecordingWriter:
         """A journal with room for steps of variable size of at least `step_capacity` bytes."""
         channels = self.channels
         areas = plan_areas(
-            self.laid(), self.num_envs, self.options.chunk_size, step_capacity,
+            self.fixed_layout(), self.num_envs, self.options.chunk_size, step_capacity,
             vector=self.is_vector and not self._apart, infos=channels.info is not None,
             frames=bool(channels.cameras),
         )  # fmt: skip
@@ -394,7 +394,7 @@ class RecordingWriter:
         """
         if self.closed:
             return
-        if self.journal is None and (not self._is_cut or self._is_new_and_empty()):
+        if self.journal is None and (not self._is_cut or self._may_be_removed()):
             self._leave()
             return
         self.flush()
@@ -439,7 +439,7 @@ class RecordingWriter:
         """
         if self.closed:
             return
-        if self.lock.replaces or (self.journal is None and self._is_new_and_empty()):
+        if self.lock.replaces or (self.journal is None and self._may_be_removed()):
             self._leave()
             return
         options = RecordOptions(
@@ -463,7 +463,8 @@ class RecordingWriter:
         self.closed = True
         self.let_go()
 
-    def _is_new_and_empty(self) -> bool:
+    def _may_be_removed(self) -> bool:
+        """Whether a file without a step goes when it is closed."""
         return self.options.mode != "a" and not self._keep_empty
 
     def _leave(self) -> None:

@@ -62,8 +62,8 @@ class RecoveryReport:
         target: the new file; None if none was written.
         finished: the file has its end.
         journal: "none", "used", "missing", "damaged" or "stale".
-        lost_steps: number of lost steps that are known to have been there.
-        lost: their episodes.
+        steps_lost: how many steps are known to be lost.
+        lost: which they are, by episode.
     """
 
     source: str

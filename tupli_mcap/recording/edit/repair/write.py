@@ -8,6 +8,7 @@ import re
 import time
 import uuid
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial, reduce
 from typing import Any
 
@@ -74,8 +75,7 @@ class RepairWriter:
                 container.write(
                     evidence.source.read(at, min(_COPY, attachment.offset + attachment.length - at))
                 )
-            moved = type(attachment)(**{**attachment.__dict__, "offset": offset})
-            container.attachment_indexes.append(moved)
+            container.attachment_indexes.append(replace(attachment, offset=offset))
 
     def _metadata_of_recording(self) -> dict[str, str]:
         """The recording's metadata, with new values for lost or damaged parts."""

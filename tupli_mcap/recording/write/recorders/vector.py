@@ -53,7 +53,7 @@ class VectorRecorder:
         derives_episodes: bool = False,
     ) -> None:
         self.derives_episodes = derives_episodes and autoreset.mode == "NextStep" and not autoreset.is_assumed
-        self._derives = False  # no start or end is logged now
+        self._derives = False  # True while starts and ends are derived from rows instead of logged
         self._writer = writer
         self._spaces = spaces
         self._n = num_envs
@@ -64,7 +64,7 @@ class VectorRecorder:
         self._first: Any = None
         self._facts: list[ResetFacts | None] = [None] * num_envs
         self._earlier: list[list[ResetFacts]] = [[] for _ in range(num_envs)]  # resets that no step followed
-        self._fresh = False  # some sub-environments have no episode:
+        self._any_waits = False  # whether one of these, which have no episode, must begin one
         self._waiting = set(range(num_envs))
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
         numbers = np.zeros((num_envs, 2), "<u4")  # of the running episodes: number, steps so far
@@ -108,7 +108,7 @@ class VectorRecorder:
             ended[int(i)] = False
         self._writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
-        self._fresh = True
+        self._any_waits = True
         self._was_reset = True
         self._refused = False
         if self._writer.vector is None:
@@ -163,7 +163,7 @@ class VectorRecorder:
             # the whole batch is checked, then episodes are started, then it is written: recorded or refused as one
             final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
             batch = store.check(actions, states, rewards, terminals, timeouts, active)
-            if self._fresh:
+            if self._any_waits:
                 self._start(store, active)
             if final_states:
                 self._put_finals(final_states)
@@ -328,7 +328,7 @@ class VectorRecorder:
         self._lengths[waiting] = 0
         self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
-        self._fresh = bool(self._waiting)
+        self._any_waits = bool(self._waiting)
         self._start_deriving()
 
     # ---- episodes derived from rows
@@ -343,7 +343,7 @@ class VectorRecorder:
         store.start_deriving(events, self._episodes)
         self._episodes = [None] * self._n
         self._waiting.clear()
-        self._derives, self._fresh = True, False
+        self._derives, self._any_waits = True, False
 
     def _begin_derived(self, holes: Array, infos: Mapping[str, Any]) -> None:
         """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
@@ -370,7 +370,7 @@ class VectorRecorder:
                 self._episodes[i], self._totals[i] = events.take_back(number), total
                 continue
             self._waiting.add(i)
-            self._fresh = True
+            self._any_waits = True
             if not self._ended[i]:  # begun, and no step yet
                 self._writer.next_episode -= 1
                 self._facts[i] = ResetFacts(None, None, "", "{}", now)
@@ -395,7 +395,7 @@ class VectorRecorder:
         found = of(infos, chosen, self._n) if infos else [{}] * len(chosen)
         for i, info in zip(chosen, found, strict=True):
             self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
-        self._fresh = True
+        self._any_waits = True
 
     # ---- ends
 
@@ -409,7 +409,7 @@ class VectorRecorder:
             text, self._texts[i] = self._texts[i], "{}"
             if episode is None:
                 continue
-            self._fresh = True
+            self._any_waits = True
             self._waiting.add(i)
             now = time.time_ns() if now is None else now
             facts = episode, how, int(self._lengths[i]), float(self._totals[i])
@@ -441,7 +441,7 @@ class VectorRecorder:
         self._facts, self._earlier = before._facts, before._earlier
         self._ended, self._any_ended = before._ended, before._any_ended
         self._was_reset, self._refused = before._was_reset, before._refused
-        self._fresh = True
+        self._any_waits = True
         self._first = copy.deepcopy(states)
 
     def refuse(self) -> None:

@@ -1,7 +1,7 @@
 """The interface of all stores of rows.
 
-1. A row is committed by one store of a machine word, once all of it is in the journal: whoever reads the journal finds
-   the whole row, or nothing of it.
+1. A row is committed by its last store, once all of it is in the journal: of `sequence` and `log_time` in a row of
+   constant size, of the end of a log. Whoever reads the journal finds the whole row, or nothing of it.
 2. Committed rows stay in the journal until they are in the file: at every moment the two together hold each of them. A
    half is written over only when its chunks are in the file.
 3. The running row, of which a state is known and the step is not, is in the journal too; it moves with its store.

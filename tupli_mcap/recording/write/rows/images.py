@@ -19,8 +19,7 @@ from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
-# sequence, log_time, publish_time, the CDR header, and the stamp of an image: they follow each other, and one call
-# takes a fraction of the time that fields of a structured row do
+# sequence, log_time, publish_time, the CDR header, and the stamp of an image, which follow each other
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
 
 

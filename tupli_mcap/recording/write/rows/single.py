@@ -20,7 +20,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 
-# of a single environment: what is done once a half finds cold caches, and takes as long for few rows as for many
+# Chunks that a half of a single environment becomes. What is done once a half takes as long for few rows as for many.
 CHUNKS_PER_HALF = 2
 
 

@@ -52,10 +52,9 @@ def plan_areas(
         row = layout.image_messages[leaf.name].dtype.itemsize
         # of a stack, most rows store one frame
         stored = row // leaf.stored_shape[0] if leaf.kind == "stack" else row
-        # some images a chunk: what is done once a chunk takes as long for few of them as for many; of many
-        # sub-environments fewer, for the room that their journals take
-        some, within = (32, 3 << 20) if n == 1 else (16, 2 << 20)
-        rows = max(1, min(max(size, min(some * stored, within)) // stored, _HALF // row))
+        # images in a chunk, and their bytes, at most; fewer for many sub-environments, whose journals would be large
+        most, most_bytes = (32, 3 << 20) if n == 1 else (16, 2 << 20)
+        rows = max(1, min(max(size, min(most * stored, most_bytes)) // stored, _HALF // row))
         areas += [RowArea(f"{leaf.name}/{i}", row, rows) for i in range(n)]
     areas.append(LogArea("events", 512 * 1024))
     if infos:
@@ -72,10 +71,10 @@ class Stores:
         layout, channels: what the stores hold.
         container: counts the messages that are in the file already.
         journal: has the areas of `plan_areas`.
-        index: is told of every episode that ends.
+        index: gets the row of every episode that ends.
         file: where rows go.
-        vector: steps of sub-environments.
-        apart: which do not step together.
+        vector: whether the recording is of a vector environment.
+        apart: whether its sub-environments step one by one.
 
     Attributes:
         rows: of a single environment.
@@ -125,7 +124,7 @@ class Stores:
         self._stores = list(dict.fromkeys((*self._steps, *self._moving.values())))
 
     def _images(self, leaf: Leaf, channels: list[int]) -> list[ImageRows]:
-        """One leaf's, by sub-environment."""
+        """The stores of an image leaf, by sub-environment."""
         file, found = self._file, []
         start_chunks = file.start_chunks if leaf.size >= _LARGE_ROW else None
         for i, channel in enumerate(channels):

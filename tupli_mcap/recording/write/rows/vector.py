@@ -32,7 +32,7 @@ _BOOL = np.dtype(np.bool_)  # those may hold other bytes than 0 and 1
 # of leaves: their place in the rows, values, 1 if it is in the next rows
 _Values = list[tuple[Array, Any, int]]
 _Images = Sequence[tuple[Sequence[ImageRows], list[Array]]]  # of leaves: the stores, and what each is given
-# values, images, terminals, timeouts, and who took a step; not a class: one is made in every step
+# values, images, terminals, timeouts, and who took a step
 Batch = tuple[_Values, _Images, Array, Array, Array | None]
 
 
@@ -258,9 +258,10 @@ class VectorRows:
     def _switch(self) -> None:
         self._finish_chunks()  # a half is used again only when its chunks are in the file
         half, rows, flushed = self._half, self._area.rows, self._flushed
-        self._derive(half, rows)  # see SingleRows
+        self._derive(half, rows)  # before the other half's last rows go, whose holes may be here
         self._half = 1 - half
-        self._sequence[self._half] = HOLE  # see SingleRows
+        # a power loss may leave a part of what is written over these rows, and not the chunks they are in
+        self._sequence[self._half] = HOLE
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
         self._row = self._flushed = self._derived = 0
