@@ -33,13 +33,12 @@ from tupli_mcap.messages.encode_values import (
     add_structure_checks,
     flag_check,
 )
-from tupli_mcap.messages.layout import PREFIX, SEQUENCE_OFFSET
+from tupli_mcap.messages.layout import NUMBERS, PREFIX, SEQUENCE_OFFSET
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
 COMMIT = Struct("<IQ")
-EPISODE_AND_STEP = Struct("<II")
 _TIME = Struct("<Q")
 _MAX_LEAVES = 4096  # each takes time and memory to compile
 
@@ -121,7 +120,7 @@ def make_row_encoder(
         buffer=buffer,
         first=first,
         header=layout.step_message.header(channel),
-        numbers=EPISODE_AND_STEP.pack,
+        numbers=NUMBERS.pack,
         unknown=bytes(PREFIX),
         time_at=_TIME.unpack_from,
         switch=switch,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from typing import NamedTuple
 
 import numpy as np
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import cdr
-from tupli_mcap.messages.layout import IMAGE_SCHEMA, MessageLayout
+from tupli_mcap.messages.layout import IMAGE_SCHEMA, NUMBERS, STAMP, MessageLayout
 
 CAMERA_NAME = "sensor_msgs/msg/CompressedImage"
 CAMERA_SCHEMA = (
@@ -19,9 +18,6 @@ FRAME_NAME = "tupli_mcap/msg/Frame"
 FRAME_SCHEMA = "uint32 episode\nuint32 step\n"
 FRAME_LAYOUT = MessageLayout.of([("episode", np.dtype(np.uint32), ()), ("step", np.dtype(np.uint32), ())])
 """A row of `/frame/<name>`."""
-
-_STAMP = struct.Struct("<iI")
-_PAIR = struct.Struct("<II")
 
 
 class EncodedFrame(NamedTuple):
@@ -34,7 +30,7 @@ class EncodedFrame(NamedTuple):
 
 def encode_frame(camera: str, frame: EncodedFrame) -> bytes:
     """The CDR body of a `sensor_msgs/msg/CompressedImage`."""
-    out = bytearray(_STAMP.pack(*divmod(frame.time_ns, 10**9)))
+    out = bytearray(STAMP.pack(*divmod(frame.time_ns, 10**9)))
     cdr.write_string(out, 0, camera)
     cdr.write_string(out, 0, frame.form)
     cdr.write_length(out, 0, len(frame.data))
@@ -44,10 +40,10 @@ def encode_frame(camera: str, frame: EncodedFrame) -> bytes:
 def decode_frame(body: memoryview) -> tuple[EncodedFrame, str]:
     """The picture in a `sensor_msgs/msg/CompressedImage`, and its `frame_id`; raises FormatError if lengths do not add
     up to the message."""
-    if len(body) < _STAMP.size:
+    if len(body) < STAMP.size:
         raise FormatError(f"expected a compressed image, found {len(body)} bytes")
-    sec, nanosec = _STAMP.unpack_from(body)
-    frame_id, at = cdr.read_string(body, _STAMP.size, 0)
+    sec, nanosec = STAMP.unpack_from(body)
+    frame_id, at = cdr.read_string(body, STAMP.size, 0)
     form, at = cdr.read_string(body, at, 0)
     size, at = cdr.read_length(body, at, 0)
     if at + size != len(body):
@@ -57,4 +53,4 @@ def decode_frame(body: memoryview) -> tuple[EncodedFrame, str]:
 
 def encode_pair(episode: int, step: int) -> bytes:
     """The CDR body of a `tupli_mcap/msg/Frame`."""
-    return _PAIR.pack(episode, step)
+    return NUMBERS.pack(episode, step)

@@ -14,9 +14,9 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import cdr
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.spaces.leaves import NameRegistry
 
-_HEAD = struct.Struct("<II")
 _FIELD = struct.Struct("<d?7x")
 
 
@@ -56,7 +56,7 @@ class InfoCodec:
     ) -> bytes:
         """The CDR body of a step's info. Values of `kinds` go into typed fields, which are read as `float`."""
         rest = dict(info)
-        out = bytearray(_HEAD.pack(episode, step))
+        out = bytearray(NUMBERS.pack(episode, step))
         for name in self.names:
             value = rest.get(name)
             if type(value) in kinds:
@@ -69,13 +69,13 @@ class InfoCodec:
 
     def decode(self, body: memoryview) -> tuple[int, int, dict[str, Any]]:
         """(episode, step, info)."""
-        fixed = _HEAD.size + _FIELD.size * len(self.names)
+        fixed = NUMBERS.size + _FIELD.size * len(self.names)
         if len(body) < fixed:
             raise FormatError(f"/info: expected at least {fixed} bytes, found {len(body)}")
-        episode, step = _HEAD.unpack_from(body)
+        episode, step = NUMBERS.unpack_from(body)
         info: dict[str, Any] = {}
         for i, name in enumerate(self.names):
-            value, present = _FIELD.unpack_from(body, _HEAD.size + i * _FIELD.size)
+            value, present = _FIELD.unpack_from(body, NUMBERS.size + i * _FIELD.size)
             if present:
                 info[name] = value
         text, _ = cdr.read_string(body, fixed, 0)

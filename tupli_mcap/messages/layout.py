@@ -7,6 +7,7 @@ fields all have constant size therefore has constant offsets, and a chunk of suc
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -21,6 +22,10 @@ from tupli_mcap.spaces.leaves import Leaf
 
 SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
 PREFIX = BODY + 8  # bytes of a step's record that are the same for a whole episode: headers, episode, step
+NUMBERS = struct.Struct(
+    "<II"
+)  # of an episode, and of its step or its sub-environment: messages begin with them
+STAMP = struct.Struct("<iI")  # seconds and nanoseconds
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 SEPARATOR = "=" * 80 + "\n"  # before a nested message in a ros2msg text
 IMAGE_NAME = "sensor_msgs/msg/Image"

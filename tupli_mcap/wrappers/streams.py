@@ -15,9 +15,10 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import ENDS, STARTS, EpisodeBatch, StartedEpisode, sums
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import with_success
-from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import StepStore
@@ -234,4 +235,4 @@ def _final_bytes(layout: StepLayout, finals: Any, count: int) -> Array:
         )
         if leaf.size:
             table[leaf.name] = value
-    return table.view(np.uint8).reshape(count, -1)[:, BODY + EPISODE_AND_ENV.size :]
+    return table.view(np.uint8).reshape(count, -1)[:, BODY + NUMBERS.size :]

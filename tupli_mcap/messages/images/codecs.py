@@ -19,7 +19,7 @@ from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, MAX_CHUNK, RECORD_HEADER, iter_records
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame, encode_frame
 from tupli_mcap.messages.images.pictures import decode_pixels, encode_pixels
-from tupli_mcap.messages.layout import ImageLayout
+from tupli_mcap.messages.layout import STAMP, ImageLayout
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import parse
 from tupli_mcap.spaces.leaves import Leaf
@@ -28,7 +28,6 @@ CODEC = "codec"  # key of the metadata of an image channel
 _LENGTH = struct.Struct("<Q")  # of a Message record, after its opcode
 _HEIGHT_WIDTH = struct.Struct("<II")
 _COUNT = struct.Struct("<I")
-_STAMP = struct.Struct("<iI")  # kept bit for bit, even if it is no valid time
 
 
 class ImageCodec(Protocol):
@@ -223,9 +222,9 @@ class PngCodec:
         images = np.frombuffer(rows.data, self._dtype)
         windows = self._windows(images)
         for row, window, new in zip(images, windows, new_frames(windows), strict=True):
-            stamp = _STAMP.pack(int(row["sec"]), int(row["nanosec"]))
+            stamp = STAMP.pack(int(row["sec"]), int(row["nanosec"]))
             png = encode_pixels(window[-new:].reshape(new * self._height, self._width, self._channels))
-            body = stamp + encode_frame(self._leaf.name, EncodedFrame(0, "png", png))[_STAMP.size :]
+            body = stamp + encode_frame(self._leaf.name, EncodedFrame(0, "png", png))[STAMP.size :]
             times = int(row["#log_time"]), int(row["#publish_time"])
             head = RECORD_HEADER.pack(5, BODY - 9 + len(body), rows.channel, int(row["#sequence"]), *times)
             records.append(head + CDR_HEADER + body)
@@ -255,7 +254,7 @@ class PngCodec:
             row["#sequence"], row["#log_time"] = sequence, log_time
             row["#publish_time"] = RECORD_HEADER.unpack_from(view, start)[5]
             row["#cdr"] = int.from_bytes(view[start + BODY - 4 : start + BODY], "little")
-            row["sec"], row["nanosec"] = _STAMP.unpack_from(view, start + BODY)
+            row["sec"], row["nanosec"] = STAMP.unpack_from(view, start + BODY)
             shape = self._height, self._width, self._channels
             frames = decode_pixels(frame.data, shape, self._frames).reshape(-1, windows.shape[2])
             old = self._frames - len(frames)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -14,14 +13,13 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.about.success import without_success
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
-
-_NUMBERS = struct.Struct("<II")  # number of the episode, then of the step or the sub-environment
 
 
 class NewFrames(Protocol):
@@ -247,9 +245,9 @@ class EpisodeCopier:
         self._target.add_messages(self._to(channel), messages)
 
     def _renumbered(self, body: bytes) -> bytes:
-        number, step = _NUMBERS.unpack_from(body)
+        number, step = NUMBERS.unpack_from(body)
         trim = self._trims.get(number)
-        return _NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
+        return NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
 
     def _episodes(self, rows: Array, firsts: Array) -> list[CopiedEpisode]:
         """The other records of each episode, with its numbers in the target."""
@@ -261,7 +259,7 @@ class EpisodeCopier:
             ((end_time, body),) = self._messages(self._topics[EPISODE_END], int(row["end_row"]), 1)
             end = EpisodeEnd.decode(memoryview(body))
             total = self._values.returns.get(number, end.episode_return)
-            final = self._final(row, _NUMBERS.pack(new["episode"], new["env"]))
+            final = self._final(row, NUMBERS.pack(new["episode"], new["env"]))
             if trim is not None:
                 total, end_time = trim.episode_return, int(row["end_time"])
                 end = end._replace(length=trim.stop - trim.start, end=int(row["end"]))
@@ -364,7 +362,7 @@ class EpisodeCopier:
         """The rows of `/info` that belong to the episodes and to steps that stay."""
         channel = self._topics[INFO]
         messages = self._messages(channel, 0, self._store.count(channel))
-        numbers = np.array([_NUMBERS.unpack_from(body) for _, body in messages], np.int64).reshape(-1, 2)
+        numbers = np.array([NUMBERS.unpack_from(body) for _, body in messages], np.int64).reshape(-1, 2)
         kept = np.isin(numbers[:, 0], rows["episode"])
         if self._trims:
             trimmed = np.array([(n, t.start, t.stop) for n, t in sorted(self._trims.items())], np.int64)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,12 +22,12 @@ from tupli_mcap.messages.episodes import (
     record,
     start_texts,
 )
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
 
-EPISODE_AND_ENV = struct.Struct("<II")
 _Fields = tuple[tuple[str, str, int], ...]
 # the fields that differ between messages of plain episodes: name, format, offset in the CDR body
 _BOTH: _Fields = (("episode", "<u4", 0), ("env", "<u4", 4))
@@ -112,7 +111,7 @@ class EpisodeLog(EventLog):
             now = self.append(now, (self._end, body))
         else:
             final_row = self.sequences[self._final]
-            final = EPISODE_AND_ENV.pack(number, env) + state
+            final = NUMBERS.pack(number, env) + state
             now = self.append(now, (self._final, final), (self._end, body))
         row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)

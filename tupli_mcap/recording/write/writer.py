@@ -24,12 +24,13 @@ from tupli_mcap.journal.logs import EventLog
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.write.chunks import ChunkWriter
-from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV, EpisodeLog, ResetFacts
+from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.place import Place
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
@@ -279,7 +280,7 @@ class RecordingWriter:
         """Writes `/final_state` ahead of the step that ends the episodes; returns the first one's row."""
         channel, events = self.channels.final_state, self._events()
         row = events.sequences[channel]
-        pack = EPISODE_AND_ENV.pack
+        pack = NUMBERS.pack
         events.append(time.time_ns(), *[(channel, pack(e.number, e.env) + final) for e, final in finals])
         return row
 

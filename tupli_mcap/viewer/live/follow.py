@@ -8,7 +8,6 @@ the file. The recorder does nothing for this and does not wait.
 from __future__ import annotations
 
 import contextlib
-import struct
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
@@ -36,6 +35,7 @@ from tupli_mcap.mcap.walk import Walk
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec, with_text_keys
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import (
     EPISODE_END,
@@ -61,7 +61,6 @@ _DECODED = 200  # the same where each message is decoded on its own
 _EPISODES = 1000  # of a sub-environment, whose first row is remembered
 _CHUNKS = 8  # of each channel, the newest, that can be read
 _HEADER = RECORD_HEADER.size
-_PAIR = struct.Struct("<II")  # episode and step, with which the messages of infos and frames begin
 
 
 class _GrowingFile:
@@ -259,7 +258,7 @@ class Follower:
         newest, found = max(begins, default=-1), []
         pairs, pictures = (messages_of(self._store, channel, range(first, count)) for channel in ids)
         for row, (_, pair), (_, picture) in zip(range(first, count), pairs, pictures, strict=True):
-            episode, step = _PAIR.unpack_from(pair, BODY - _HEADER)
+            episode, step = NUMBERS.unpack_from(pair, BODY - _HEADER)
             if episode > newest:  # its steps have not been looked at: it is for the next look
                 break
             self._seen |= dict.fromkeys(ids, row + 1)
@@ -278,7 +277,7 @@ class Follower:
         self._infos = []
         for time_ns, message in new:
             body = memoryview(message)[BODY - _HEADER :]
-            episode, step = _PAIR.unpack_from(body)
+            episode, step = NUMBERS.unpack_from(body)
             if episode in begins:
                 info = with_text_keys(decoder.decode(body)[2])
                 infos.append(NewInfo(begins[episode] + step, time_ns, info))

@@ -17,7 +17,6 @@ from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import Container, library
-from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
@@ -27,6 +26,7 @@ from tupli_mcap.messages.frames import (
     encode_pair,
 )
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, camera_names, parse
 from tupli_mcap.recording.channels import register_channels
@@ -34,7 +34,6 @@ from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import intersection
-from tupli_mcap.recording.write.episodes import EPISODE_AND_ENV
 
 RECOVERED = "recovered"  # key of the episode metadata that says which steps of which old episode these are
 _METADATA = {
@@ -186,7 +185,7 @@ class RepairWriter:
             run = episode.run
             messages = store.messages(channel, store.packed(channel, run.row), run.steps)
             for step, (log_time, body) in enumerate(messages):
-                yield log_time, EPISODE_AND_STEP.pack(episode.number, step) + bytes(body[8:])
+                yield log_time, NUMBERS.pack(episode.number, step) + bytes(body[8:])
 
     # ---- episodes
 
@@ -229,15 +228,15 @@ class RepairWriter:
         if old.final is None or episode.final is None or episode.final < 0:
             return final_state(self._evidence, episode)
         body = store.message(old.final, episode.final)
-        return EPISODE_AND_ENV.pack(episode.number, episode.run.env) + body[8:]
+        return NUMBERS.pack(episode.number, episode.run.env) + body[8:]
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
         """The infos of steps that are kept, with the new numbers of these."""
         pieces = NewPlaces(plan.episodes)
         for _, log_time, body in store.all_messages(channel):
-            place = pieces.find(*EPISODE_AND_STEP.unpack_from(body))
+            place = pieces.find(*NUMBERS.unpack_from(body))
             if place is not None:
-                yield log_time, EPISODE_AND_STEP.pack(*place) + bytes(body[8:])
+                yield log_time, NUMBERS.pack(*place) + bytes(body[8:])
 
 
 # ---- frames: kept where the step is kept, and both picture and row were found

@@ -14,8 +14,9 @@ from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import STATE, Sink, seal
 from tupli_mcap.mcap.records import BODY, HOLE
-from tupli_mcap.messages.encode_rows import EPISODE_AND_STEP, ImageSink, make_row_encoder
+from tupli_mcap.messages.encode_rows import ImageSink, make_row_encoder
 from tupli_mcap.messages.episodes import EpisodeEnd
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
@@ -94,7 +95,7 @@ class SingleRows:
 
     def begin_episode(self, episode: int) -> None:
         """The rows that follow belong to `episode`."""
-        start, prefix = self._offset(), self._header + EPISODE_AND_STEP.pack(episode, 0)
+        start, prefix = self._offset(), self._header + NUMBERS.pack(episode, 0)
         self._encoder.begin(prefix)
         self._buffer[start : start + len(prefix)] = prefix
 
