@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
@@ -342,7 +343,7 @@ def _metadata(text: str, name: str, number: int) -> dict[str, Any]:
 def _benchmark_header(recording: Recording) -> BenchmarkHeader:
     """The header of a recording's benchmark; without a benchmark, the id is empty."""
     metadata, environment = BenchmarkMetadata(name=""), ""
-    if "benchmark.json" in recording.attachments:
+    if DOCUMENT_NAME in recording.attachments:
         record = recording.benchmark.record
         metadata, environment = BenchmarkMetadata(name=record.name), record.name
         entry = (record.benchmark or {}).get("metadata")

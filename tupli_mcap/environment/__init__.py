@@ -9,9 +9,19 @@ from tupli_mcap.environment._build import build, entry_point_name, more_than_dat
 from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, name_of, note, resets_itself
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._pickling import rebuild_ezpickled
-from tupli_mcap.environment._record import EnvironmentRecord, canonical_json, sha256
+from tupli_mcap.environment._record import (
+    DOCUMENT_NAME,
+    MAX_PICKLE,
+    PICKLE_NAME,
+    EnvironmentRecord,
+    canonical_json,
+    sha256,
+)
 
 __all__ = [
+    "DOCUMENT_NAME",
+    "MAX_PICKLE",
+    "PICKLE_NAME",
     "EnvironmentRecord",
     "Snapshot",
     "build",

@@ -13,6 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from tupli_mcap.errors import FormatError, TupliError
 
+DOCUMENT_NAME = "benchmark.json"
+PICKLE_NAME = "env.cloudpickle"
+MAX_PICKLE = 16 << 20  # bytes of a pickle that a recording carries
 _MAX_JSON_BYTES = 64 << 20
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
 # Fields of an EnvSpec with these values are left out, so that a field which a later gymnasium adds changes no

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, NamedTuple
 import gymnasium as gym
 from mcap.records import Channel
 
-from tupli_mcap.environment import EnvironmentRecord, build, reasons_for_distrust
+from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord, build, reasons_for_distrust
 from tupli_mcap.errors import FormatError, RecordingError, memory_for
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import (
@@ -314,16 +314,16 @@ class OpenedRecording:
     @property
     def benchmark(self) -> RecordedBenchmark:
         """The environment that was recorded, as data; `make_env()` rebuilds it."""
-        if "benchmark.json" not in self._contents.attachments:
+        if DOCUMENT_NAME not in self._contents.attachments:
             advice = "load its benchmark from the storage it is in"
             if not self.benchmark_id:
                 advice = "it was left out, could not be captured, or lived in other processes"
             raise RecordingError(f"{self.name} carries no environment; {advice}")
         pickle = None
-        if "env.cloudpickle" in self._contents.attachments:
-            pickle = self.read_attachment("env.cloudpickle")
+        if PICKLE_NAME in self._contents.attachments:
+            pickle = self.read_attachment(PICKLE_NAME)
         where = f"{self.name}: benchmark.json"
-        record = EnvironmentRecord.from_json(self.read_attachment("benchmark.json"), pickle, where=where)
+        record = EnvironmentRecord.from_json(self.read_attachment(DOCUMENT_NAME), pickle, where=where)
         signature = self.read_attachment(SIGNATURE_NAME) if SIGNATURE_NAME in self.attachments else None
         return RecordedBenchmark(self.benchmark_id, record, signature)
 

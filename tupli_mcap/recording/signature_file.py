@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import BaseModel, Field, JsonValue, ValidationError
 
 from tupli_mcap import signing, trust
-from tupli_mcap.environment import canonical_json
+from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, canonical_json
 from tupli_mcap.errors import FormatError
 
 SIGNATURE_NAME = "signature.ed25519"
@@ -23,8 +23,8 @@ _HEX_KEY = r"^[0-9a-f]{64}$"
 # An environment is rebuilt from these, or they say something about runs and episodes: they must be signed. Other
 # attachments may be added later.
 _COVERED_KINDS = (
-    "benchmark.json",
-    "env.cloudpickle",
+    DOCUMENT_NAME,
+    PICKLE_NAME,
     "artifacts/",
     "run.json",
     "annotations.json",

@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from pydantic import BaseModel
 
-from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
+from tupli_mcap.environment import (
+    DOCUMENT_NAME,
+    MAX_PICKLE,
+    PICKLE_NAME,
+    EnvironmentRecord,
+    canonical_json,
+    sha256,
+)
 from tupli_mcap.errors import FormatError, SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain, loads
 from tupli_mcap.schema import BenchmarkHeader, BenchmarkMetadata
@@ -19,10 +26,7 @@ from tupli_mcap.spaces.leaves import own_space
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 from tupli_mcap.storage.texts import is_hash
 
-PICKLE_NAME = "env.cloudpickle"
-DOCUMENT_NAME = "benchmark.json"
 ARTIFACT_PREFIX = "artifacts/"
-_MOST_PICKLE = 16 << 20  # bytes
 EDITABLE = ("name", "description")  # of a benchmark's metadata
 
 
@@ -157,7 +161,7 @@ def recording_attachments(serialized: str) -> dict[str, tuple[str, bytes]]:
         record = unpack(serialized).record
     except FormatError:
         return {}
-    too_large = record.pickle is not None and len(record.pickle) > _MOST_PICKLE
+    too_large = record.pickle is not None and len(record.pickle) > MAX_PICKLE
     return {} if too_large else attachments_of(record)
 
 

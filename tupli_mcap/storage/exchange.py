@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tupli_mcap import trust
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import NotFoundError, StorageError, did_you_mean, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
@@ -33,7 +34,7 @@ from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
-from tupli_mcap.storage.benchmark_json import DOCUMENT_NAME, artifacts_needed
+from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.bundles.read import deleted_beside, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tupli_mcap import files
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
@@ -129,7 +130,7 @@ def _benchmark(path: Path, findings: Findings) -> None:
     if any(problem.kind == "benchmark" for problem in findings.report.problems):
         return  # said already
     with Recording(path) as recording:
-        carries = "benchmark.json" in recording.attachments
+        carries = DOCUMENT_NAME in recording.attachments
         if carries and "id" in (recording.benchmark.record.benchmark or {}):
             try:
                 carried_benchmark(recording, path)

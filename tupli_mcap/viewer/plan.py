@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tupli_mcap.dataset.chosen import Chosen, extremes
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
@@ -127,7 +128,7 @@ def times_of(block: Block) -> Times:
 
 def name_of(recording: Recording) -> str:
     """The environment's name, else the file's."""
-    carried = "benchmark.json" in recording.attachments
+    carried = DOCUMENT_NAME in recording.attachments
     return (carried and recording.benchmark.record.name) or Path(recording.name).stem
 
 

@@ -25,7 +25,16 @@ from typing import Any, Final
 import gymnasium as gym
 
 from tupli_mcap import trust
-from tupli_mcap.environment import EnvironmentRecord, capture, documented_labels, note, reasons_for_distrust
+from tupli_mcap.environment import (
+    DOCUMENT_NAME,
+    MAX_PICKLE,
+    PICKLE_NAME,
+    EnvironmentRecord,
+    capture,
+    documented_labels,
+    note,
+    reasons_for_distrust,
+)
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
@@ -36,9 +45,6 @@ from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.spaces.leaves import Leaf
 
-_DOCUMENT = "benchmark.json"
-_PICKLE = "env.cloudpickle"
-_MAX_PICKLE = 16 << 20
 _PACKAGES: Final = {  # distributions, by the module that says whether one is at work
     "tupli_mcap": "tupli-mcap", "gymnasium": "gymnasium", "numpy": "numpy", "torch": "torch", "jax": "jax",
     "tensorflow": "tensorflow", "stable_baselines3": "stable-baselines3", "d3rlpy": "d3rlpy", "torchrl": "torchrl",
@@ -75,17 +81,17 @@ class Captured:
         if given is not None or capture_env is None:
             return
         record = note(env) if capture_env == "spec" else capture(_single(env), pickled=True)
-        self.attachments[_DOCUMENT] = ("application/json", record.to_json())
+        self.attachments[DOCUMENT_NAME] = ("application/json", record.to_json())
         if record.pickle is not None or _is_plugin(record):
             self._digest, self._began = record.digest, time.time_ns()
         if record.pickle is None:
             return
-        if len(record.pickle) > _MAX_PICKLE:
+        if len(record.pickle) > MAX_PICKLE:
             raise RecordingError(
-                f"capture_env='pickle': expected at most {_MAX_PICKLE} bytes in a recording, found an environment of "
+                f"capture_env='pickle': expected at most {MAX_PICKLE} bytes in a recording, found an environment of "
                 f"{len(record.pickle)}; use capture_env='spec', or TupliEnvWrapper, whose storage keeps it once"
             )
-        self.attachments[_PICKLE] = ("application/octet-stream", record.pickle)
+        self.attachments[PICKLE_NAME] = ("application/octet-stream", record.pickle)
 
     def with_labels(
         self, spaces: StepLayout, given: Mapping[str, Sequence[str]] | None
@@ -101,8 +107,8 @@ class Captured:
 
         A recording that is appended to keeps its own environment.
         """
-        carried = [one for one in writer.container.attachment_indexes if one.name == _DOCUMENT]
-        is_new = _DOCUMENT in writer.arriving or any(one.create_time >= self._began for one in carried)
+        carried = [one for one in writer.container.attachment_indexes if one.name == DOCUMENT_NAME]
+        is_new = DOCUMENT_NAME in writer.arriving or any(one.create_time >= self._began for one in carried)
         if self._digest and is_new:
             with contextlib.suppress(TupliError):  # recording goes on where no signature can be kept
                 if not trust.is_trusted(self._digest):

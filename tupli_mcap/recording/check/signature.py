@@ -11,7 +11,7 @@ from collections.abc import Container, Mapping
 from typing import Any, NamedTuple
 
 from tupli_mcap import signing, trust
-from tupli_mcap.environment import canonical_json, sha256
+from tupli_mcap.environment import DOCUMENT_NAME, canonical_json, sha256
 from tupli_mcap.errors import FormatError, SignatureError
 from tupli_mcap.recording.check.report import Findings, VerifyReport
 from tupli_mcap.recording.check.structure import Structure
@@ -84,7 +84,7 @@ def verify_signature(recording: Recording, walk: Structure | None = None) -> Sig
 
 def manifest(recording: Recording) -> dict[str, Any]:
     """The manifest of the file as it is."""
-    carried = "benchmark.json" in recording.attachments
+    carried = DOCUMENT_NAME in recording.attachments
     return {
         "format": "tupli_mcap.manifest",
         "version": 1,

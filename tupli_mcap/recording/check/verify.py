@@ -8,7 +8,7 @@ import os
 import warnings
 from pathlib import Path
 
-from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
 from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.container import Container
@@ -190,7 +190,7 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                 found = hashlib.sha256(recording.read_attachment(name)).hexdigest()
                 if found != name.removeprefix(_ARTIFACT):
                     findings.error("attachment", f"the artifact {name!r:.90} has the SHA-256 {found}")
-            elif name == "benchmark.json":
+            elif name == DOCUMENT_NAME:
                 _benchmark(recording, findings)
             elif name == RUN_NAME:
                 _ = recording.runs
@@ -201,14 +201,14 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                     _signature(recording, structure, findings)
         except TupliError as err:
             findings.error("benchmark", str(err))
-    if "env.cloudpickle" in recording.attachments and "benchmark.json" not in recording.attachments:
+    if PICKLE_NAME in recording.attachments and DOCUMENT_NAME not in recording.attachments:
         findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
 
 
 def _names_pickle(recording: Recording) -> bool:
     """Whether `benchmark.json` names a pickle."""
     try:
-        document = json.loads(recording.read_attachment("benchmark.json"))
+        document = json.loads(recording.read_attachment(DOCUMENT_NAME))
         return document["environment"]["pickle"] is not None
     except (ValueError, KeyError, TypeError, RecursionError):
         return False
@@ -227,7 +227,7 @@ def _signature(recording: Recording, structure: Structure, findings: Findings) -
 
 
 def _benchmark(recording: Recording, findings: Findings) -> None:
-    if "env.cloudpickle" not in recording.attachments and _names_pickle(recording):
+    if PICKLE_NAME not in recording.attachments and _names_pickle(recording):
         findings.note(
             "benchmark", "the pickled environment that 'benchmark.json' names is missing", _FROM_STORAGE
         )

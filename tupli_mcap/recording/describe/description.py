@@ -12,6 +12,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue, signing
 from tupli_mcap.arrays import Array, DType
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.journal.file import recorded_journal
 from tupli_mcap.mcap.lock import is_locked
@@ -129,7 +130,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
     table = contents.table
     chunks = table[table["offset"] < IN_MEMORY]
     stored = int(chunks["length"].sum())
-    named = recording.benchmark.record.name if "benchmark.json" in recording.attachments else None
+    named = recording.benchmark.record.name if DOCUMENT_NAME in recording.attachments else None
     layout = recording.layout if recording.num_envs else None
     return RecordingDescription(
         name=recording.name,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.environment import EnvironmentRecord
+from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
 from tupli_mcap.errors import RecordingError, SpaceError, warn
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
@@ -39,7 +39,6 @@ from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, common_labels
 
-_ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 _MOST_TURNS = 100
 _SPACES = ("observation_space", "action_space", "reward_space")
 
@@ -381,7 +380,7 @@ def _common_infos(sources: Sequence[Excerpt]) -> InfoCodec | None:
 def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     """The attachments of all recordings, without statements that do not fit the merged one."""
     attachments: dict[str, tuple[str, bytes]] = {}
-    carried = [recording for recording in sources if _ENVIRONMENT[0] in recording.attachments]
+    carried = [recording for recording in sources if DOCUMENT_NAME in recording.attachments]
     other = next((r for r in carried if not _is_same(carried[0].benchmark.record, r.benchmark.record)), None)
     if other is not None:
         warn(
@@ -392,7 +391,7 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     for recording in sources:
         for name, info in recording.attachments.items():
             if name in (*STATEMENTS, RUN_NAME, ANNOTATIONS_NAME, MADE_OF_NAME) or (
-                name in _ENVIRONMENT and recording is not with_environment
+                name in (DOCUMENT_NAME, PICKLE_NAME) and recording is not with_environment
             ):
                 continue
             data = recording.read_attachment(name)

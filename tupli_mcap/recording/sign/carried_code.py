@@ -13,6 +13,7 @@ import gymnasium as gym
 
 from tupli_mcap import jsonvalue, trust
 from tupli_mcap.environment import (
+    DOCUMENT_NAME,
     canonical_json,
     entry_point_name,
     more_than_data,
@@ -173,7 +174,7 @@ def options_are_trusted(recording: Recording) -> bool:
 
     Trust in the environment alone is not enough: a stranger may record the same environment with other options.
     """
-    carried = "benchmark.json" in recording.attachments
+    carried = DOCUMENT_NAME in recording.attachments
     digest = recording.benchmark.record.digest if carried else ""
     if trust.is_trusted(_options_digest(digest, _foreign_options(recording))):
         return True

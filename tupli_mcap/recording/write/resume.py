@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal, sync_file
 from tupli_mcap.mcap.container import Container
@@ -27,8 +28,6 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.write.writer import RecordingWriter
-
-_ENVIRONMENT = ("benchmark.json", "env.cloudpickle")
 
 
 def resume(writer: RecordingWriter) -> None:
@@ -64,7 +63,8 @@ def resume(writer: RecordingWriter) -> None:
     writer.container.position = contents.data_end
     known = set(contents.attachments)
     # The two halves of an environment: one that was lost is not made up for by half of another environment.
-    known |= set(_ENVIRONMENT) if known.intersection(_ENVIRONMENT) else set()
+    parts = {DOCUMENT_NAME, PICKLE_NAME}
+    known |= parts if known & parts else set()
     given = writer.options.attachments or {}
     writer.arriving = {name: a for name, a in given.items() if name not in known} | runs
     if contents.complete:

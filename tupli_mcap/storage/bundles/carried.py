@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from tupli_mcap import trust as _trust
-from tupli_mcap.environment import EnvironmentRecord, sha256
+from tupli_mcap.environment import DOCUMENT_NAME, EnvironmentRecord, sha256
 from tupli_mcap.errors import FormatError, SignatureError, StorageError, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.signature import Signature, verify_signature
@@ -17,7 +17,6 @@ from tupli_mcap.schema import ArtifactMetadata, BenchmarkHeader, BenchmarkQuery,
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
-    DOCUMENT_NAME,
     artifacts_of,
     benchmark_hash,
     header_of,

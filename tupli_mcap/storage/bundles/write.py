@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, StepError, StorageError
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.recording import Episode, EpisodeData, Recording, rewrite_recording, write_recording
@@ -18,7 +19,6 @@ from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import LOCAL_USER, anew, each_opened
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
-    DOCUMENT_NAME,
     artifacts_of,
     attachments_of,
     benchmark_entry,
