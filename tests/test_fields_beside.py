@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import pickle
 from pathlib import Path
 from typing import Any
@@ -143,6 +144,10 @@ def test_times_are_a_field(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
     assert len(both.with_tuple_filter(f"time >= {times[4]} and info.step > 4")) == 3
     assert len(both.with_tuple_filter("time > '1h ago'")) == len(times)
     assert len(both.with_tuple_filter("time <= 'yesterday'")) == 0
+    now = datetime.datetime.now(datetime.UTC)
+    assert len(
+        both.with_tuple_filter((F("time") > datetime.datetime(2020, 1, 1)) & (F("time") < now))
+    ) == len(times)
     with pytest.raises(FilterError, match="'time' is a time: expected .* found 'yesterdy'"):
         both.with_tuple_filter("time > 'yesterdy'")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import re
@@ -24,7 +25,9 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import (
     EpisodeWriter,
+    F,
     FileStorage,
+    FilterLT,
     FormatError,
     RecordEpisodes,
     Recording,
@@ -242,6 +245,13 @@ class TestRun:
                 == 3
             )
             assert len(ds.filter(f"run.started < '{LONG_AGO}'")) == 0
+            for key in (F("run.started"), F("run.ended")):
+                for then in (
+                    datetime.datetime(2020, 1, 1),
+                    datetime.datetime(2020, 1, 1, tzinfo=datetime.UTC),
+                ):
+                    assert len(ds.filter((key > then) & (key > then.date()))) == 6
+                    assert len(ds.filter(FilterLT(key=key.key, value=then))) == 0
             for text in (
                 "run.tags = 'try-1'",
                 "'try-1' in run.tags",

@@ -26,12 +26,10 @@ from tupli_mcap.schema.filters import (
 from tupli_mcap.schema.keys import join_key, split_key
 from tupli_mcap.schema.models import EpisodeHeader
 from tupli_mcap.schema.parse import key_positions, parse_filter
-from tupli_mcap.schema.times import EXPECTED, TimeSpan, span_of
+from tupli_mcap.schema.times import EXPECTED, TIME_PATHS, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
 
-TIME_KEY: Final = "created_at"
-TIME_PATHS: Final = ((TIME_KEY,), ("run", "started"), ("run", "ended"))
-_MEANT: Final[Mapping[str, str]] = {"ended": TIME_KEY, "return": "episode_return", "steps": "n_tuples"}
+_MEANT: Final[Mapping[str, str]] = {"ended": "created_at", "return": "episode_return", "steps": "n_tuples"}
 _OTHER_NAMES: Final = {**_MEANT, "truncated": "timeout"}
 _LIKE: Final = {
     "length": "steps",

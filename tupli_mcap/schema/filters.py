@@ -19,8 +19,8 @@ A filter is true or false for an item (nested mappings of JSON values), never un
 - **CONTAINS** is true for a text that contains its value, a text; A to Z equal a to z there. It is true for a list
   if it is true for one of its elements, and false for anything else.
 - **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is false.
-- **Times** (`created_at`, and an episode's `ended`, which is the same) compare as times of any zone: see
-  `tupli_mcap.schema.times`.
+- **Times** (`created_at`, and an episode's `ended`, which is the same, `run.started` and `run.ended`, the `time` of a
+  step) compare as times of any zone, with dates and `datetime`s too: see `tupli_mcap.schema.times`.
 
 A filter without a meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
 anything but a number or a text, a field compared with a value of a kind that it never has.
@@ -47,7 +47,7 @@ from pydantic import (
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.keys import join_key, split_key
-from tupli_mcap.schema.times import text_of
+from tupli_mcap.schema.times import COMPARED_PATHS, text_of
 from tupli_mcap.schema.values import classify, tag_float
 
 
@@ -70,7 +70,6 @@ class FilterType(StrEnum):
 COMBINING: Final = frozenset({FilterType.AND, FilterType.OR, FilterType.NOT})
 ORDERING: Final = frozenset({FilterType.GT, FilterType.GEQ, FilterType.LT, FilterType.LEQ})
 MAX_DEPTH: Final = 32
-_TIME_KEYS: Final = ("created_at", "ended")
 _MAX_INT_BITS: Final = 13_000  # Python converts no decimal integers that are much longer
 
 _SYMBOL: Final[Mapping[FilterType, str]] = {
@@ -315,7 +314,7 @@ def _combined(cls: type[BaseFilter], type: FilterType, left: BaseFilter, right: 
 
 def _plain(value: Any, key: str | None) -> Any:
     if isinstance(value, datetime.date):
-        if key not in _TIME_KEYS:
+        if key is None or split_key(key) not in COMPARED_PATHS:
             raise ValueError(
                 f"{key!r} holds no times: expected a text to compare it with, found {value!r:.60}"
             )

@@ -11,11 +11,11 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from tupli_mcap.errors import FilterError
-from tupli_mcap.schema.facts import TIME_PATHS, bound
+from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
 from tupli_mcap.schema.parse import parse_filter
-from tupli_mcap.schema.times import time_ns
+from tupli_mcap.schema.times import TIME_PATHS, time_ns
 from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
 
 Item: TypeAlias = Mapping[str, Any] | BaseModel

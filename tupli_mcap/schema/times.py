@@ -20,6 +20,10 @@ EXPECTED: Final = (
     'a time, such as "2026-11-23", "2026-11-23 03:31:07", "2026-11-23T03:31:07+01:00", "today", "yesterday", '
     '"last tuesday", "this week", "last month", "7d ago" (w, d, h, min), or nanoseconds since 1970'
 )
+TIME_PATHS: Final = (("created_at",), ("run", "started"), ("run", "ended"))
+"""Where stored items have times."""
+COMPARED_PATHS: Final = frozenset({*TIME_PATHS, ("ended",), ("time",)})
+"""Where any filter names times: those of items, also by the other name of `created_at`, and those of steps."""
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _MICROSECOND: Final = datetime.timedelta(microseconds=1)
 _DAY: Final = datetime.timedelta(days=1)
