@@ -87,8 +87,9 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         max_bytes, max_seconds: continue in another file (run_0001.mcap, run_0002.mcap, … after run.mcap) when the
             file has this many bytes, or was open this long, and no episode is running: an episode is always in one
             file. `path` is the current file, `paths` are all of them. Mode "a" continues the last one.
-        name: what the run is called, such as "ppo-seed3"; new files in a directory are named by it. This, `metadata`,
-            `tags` and `split` are ignored where a recording is continued: it keeps the run it has.
+        name: what the run is called, such as "ppo-seed3"; new files in a directory are named by it. A recording that is
+            continued with the same `name`, `metadata`, `tags` and `split`, or none of them, goes on with its run; with
+            others, the new episodes are of a new run.
         metadata: what was tried, such as {"algo": "ppo", "lr": 3e-4}.
         tags: words for the run.
         split: "train", "eval" or another word.
