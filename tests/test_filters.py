@@ -619,6 +619,7 @@ class TestTimes:
             (F("ended").contains("2026"), "'ended' is a time, which contains no text: expected one of = !="),
             (F("end.x") == 1, "filter key 'end.x': end is a text and has no parts"),
             (F("published_in") == 3, "'published_in' is a text: expected such a value, found 3"),
+            (F("steps.x") > 1, "filter key 'steps.x': steps is a whole number and has no parts"),
             (F("metadata") != 1, "'metadata' holds several values .* name one, such as metadata.score"),
             (F("run") == "ppo", "'run' holds several values .* name one, such as run.name"),
             (F("lr") > 1, r"unknown key 'lr' \(your own: metadata.lr, run.metadata.lr\); the keys are"),

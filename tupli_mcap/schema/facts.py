@@ -158,7 +158,8 @@ def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -
         return _in_time(filter, join_key(path), now)
     kinds = _kinds_of(model, name)
     if inside and kinds:
-        raise FilterError(f"filter key {filter.key!r}: {name} is {_one_of(kinds)} and has no parts")
+        written = split_key(filter.key or "")[0]
+        raise FilterError(f"filter key {filter.key!r}: {written} is {_one_of(kinds)} and has no parts")
     if not inside:
         _check_values(filter, name, kinds)
     return filter.model_copy(update={"key": join_key(path)})
