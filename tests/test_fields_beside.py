@@ -97,10 +97,11 @@ def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None
         dataset.transitions(fields=["inform"])
 
 
-def test_a_filter_on_an_info_that_no_step_has(tmp_path: Path, dataset: tupli_mcap.Dataset) -> None:
-    found = TupliDataset(tmp_path).with_tuple_filter("info.forse > 2 and step > 1")
+@pytest.mark.parametrize("name", ["info", "infos"])
+def test_a_filter_on_an_info_that_no_step_has(tmp_path: Path, dataset: tupli_mcap.Dataset, name: str) -> None:
+    found = TupliDataset(tmp_path).with_tuple_filter(f"{name}.forse > 2 and step > 1")
     with pytest.warns(
-        UserWarning, match=r"no step has info.forse \(did you mean 'force'\?\); infos have force, "
+        UserWarning, match=rf"no step has {name}.forse \(did you mean 'force'\?\); infos have force, "
     ) as said:
         assert len(found) == 0
     assert said[0].filename == __file__  # the line of the caller
@@ -142,7 +143,8 @@ def test_times_are_a_field(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
     np.testing.assert_array_equal(dataset.transitions(2, fields=["times"])[:].times, times)
     both = TupliDataset(tmp_path)
     assert len(both.with_tuple_filter(f"time >= {times[4]} and info.step > 4")) == 3
-    assert len(both.with_tuple_filter("time > '1h ago'")) == len(times)
+    assert len(both.with_tuple_filter(f"times >= {times[4]} and infos.step > 4")) == 3
+    assert len(both.with_tuple_filter("time > '1h ago' and times > '1h ago'")) == len(times)
     assert len(both.with_tuple_filter("time <= 'yesterday'")) == 0
     now = datetime.datetime.now(datetime.UTC)
     assert len(

@@ -624,6 +624,14 @@ class TestTimes:
             (F("run") == "ppo", "'run' holds several values .* name one, such as run.name"),
             (F("lr") > 1, r"unknown key 'lr' \(your own: metadata.lr, run.metadata.lr\); the keys are"),
             (F("name") == "ppo", r"unknown key 'name' \(did you mean 'run.name'\?\); the keys are"),
+            (
+                F("info.force") > 1,
+                "unknown key 'info.force': it is of steps, which TupliDataset.with_tuple_filter chooses; the keys",
+            ),
+            (
+                F("reward") > 1,
+                r"unknown key 'reward' \(did you mean 'return'\?\): it is of steps, which Tupli",
+            ),
             (F("tag") == "ppo", r"unknown key 'tag' \(did you mean 'run.tags'\?\); the keys are"),
         ],
         ids=repr,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
@@ -39,6 +39,9 @@ _LIKE: Final = {
     "time": "ended",
     "tag": "run.tags",
 }
+_OF_STEPS: Final = frozenset(
+    "state states action actions reward rewards info infos time times next_state next_states".split()
+)
 _INSIDE: Final = ("run.name", "run.tags", "run.split", "run.environment", "run.started", "metadata.success")
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
@@ -84,7 +87,9 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         nested = [there for there in _INSIDE if there.split(".")[0] in known]
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
         hint = did_you_mean(like, [*known, *_MEANT.values(), *nested])
-        if not hint and "run" in known:
+        if name in _OF_STEPS and "run" in known:
+            hint += ": it is of steps, which TupliDataset.with_tuple_filter chooses"
+        elif not hint and "run" in known:
             hint = f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
         raise FilterError(f"unknown key {key!r}{hint}; the keys are {', '.join(known)}")
     return (name, *inside)
@@ -142,11 +147,12 @@ def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
         yield from comparisons(item)
 
 
-def with_times(filter: BaseFilter, key: str) -> BaseFilter:
-    """The filter with times at `key` ("yesterday", a date) as nanoseconds; raises FilterError if a value is no time."""
+def with_times(filter: BaseFilter, keys: Collection[str]) -> BaseFilter:
+    """The filter with times at `keys` ("yesterday", a date) as nanoseconds; raises FilterError if a value is no time."""
     if filter.type in COMBINING:
-        return filter.model_copy(update={"filters": tuple(with_times(part, key) for part in filter.filters)})
-    return filter if filter.key != key else _in_time(filter, key, datetime.datetime.now(datetime.UTC))
+        return filter.model_copy(update={"filters": tuple(with_times(part, keys) for part in filter.filters)})
+    key = filter.key or ""
+    return _in_time(filter, key, datetime.datetime.now(datetime.UTC)) if key in keys else filter
 
 
 def _bound(filter: BaseFilter, model: type[BaseModel], now: datetime.datetime) -> BaseFilter:

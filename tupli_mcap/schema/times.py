@@ -22,7 +22,7 @@ EXPECTED: Final = (
 )
 TIME_PATHS: Final = (("created_at",), ("run", "started"), ("run", "ended"))
 """Where stored items have times."""
-COMPARED_PATHS: Final = frozenset({*TIME_PATHS, ("ended",), ("time",)})
+COMPARED_PATHS: Final = frozenset({*TIME_PATHS, ("ended",), ("time",), ("times",)})
 """Where any filter names times: those of items, also by the other name of `created_at`, and those of steps."""
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _MICROSECOND: Final = datetime.timedelta(microseconds=1)

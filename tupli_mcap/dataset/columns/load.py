@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIVE, OTHER_NAMES, OTHER_STEP_NAMES
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE, OTHER_NAMES, OTHER_STEP_NAMES
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
@@ -282,10 +282,12 @@ STEP_KEYS: Mapping[str, str] = {
     "info": "infos",
     "step": "steps",
     "time": "times",
+    **{field: field for field in FIELDS if field != "frames"},
     **OTHER_NAMES,
     **OTHER_STEP_NAMES,
 }
 """Name in an expression -> column; `step` counts from 0 within its episode."""
+_TIME_KEYS = [key for key, field in STEP_KEYS.items() if field == "times"]
 
 TupleFilter = BaseFilter | Callable[[RLTuple], bool]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
@@ -309,7 +311,7 @@ class TupleSelector:
                 )
         self.filters = filters
         self.fields = tuple(sorted(needed))
-        self._tests = [with_times(one, "time") if isinstance(one, BaseFilter) else one for one in filters]
+        self._tests = [with_times(one, _TIME_KEYS) if isinstance(one, BaseFilter) else one for one in filters]
 
     def __and__(self, other: TupleSelector) -> TupleSelector:
         return TupleSelector(*self.filters, *other.filters)
@@ -333,7 +335,7 @@ def _warn_of_unseen(filters: Sequence[TupleFilter], keys: Collection[str]) -> No
     expressions = (one for one in filters if isinstance(one, BaseFilter))
     for comparison in itertools.chain.from_iterable(map(comparisons, expressions)):
         name, *inside = path_of(comparison)
-        if name == "info" and inside and inside[0] not in keys:
+        if STEP_KEYS[name] == "infos" and inside and inside[0] not in keys:
             known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
             warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
 
