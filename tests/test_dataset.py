@@ -282,7 +282,7 @@ def test_what_does_not_fit_into_one_array_is_named(
     b = make(tmp_path / "b.mcap", [states] * 2, other)
     dataset = TupliDataset.from_files([a, b])
     assert len(dataset.preview()) == 2, "listing needs no common space"
-    with pytest.raises(SpaceError, match=f"state.*a.mcap.*{words}.*b.mcap.*with_benchmark_filter"):
+    with pytest.raises(SpaceError, match=f"state.*a.mcap.*{words}.*b.mcap.*by a filter of run.env"):
         dataset.load()
 
 
@@ -824,7 +824,7 @@ def test_a_storage_by_benchmark(lab: FileStorage) -> None:
     assert carts.with_benchmark_filter(F("metadata.name") == "MountainCar-v0").preview() == []
     assert named.observations.shape == (250, 2)
     assert dataset.with_benchmark_filter(F("metadata.name") == "nobody").preview() == []
-    with pytest.raises(SpaceError, match="with_benchmark_filter"):
+    with pytest.raises(SpaceError, match="by a filter of run.environment or benchmark_id"):
         dataset.load()
 
 

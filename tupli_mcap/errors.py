@@ -64,8 +64,9 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
     **dict.fromkeys(("length", "num_steps", "n_tuples", "n_steps"), _LENGTH),
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
+    **dict.fromkeys(("with_episode_filter", "with_benchmark_filter"), ("filter",)),
 }
-"""Other libraries' names of columns and of the number of steps, and ours: the error names the first that there is."""
+"""Other names of columns, of the number of steps and of `filter`, and ours: the error names the first that there is."""
 
 _OURS: Final = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__, functools.__file__)  # no caller's
 
@@ -197,8 +198,10 @@ class SaysWhatIsMeant:
             if name in known:  # a property that raised AttributeError
                 return object.__getattribute__(self, name)
             meant = "" if name.startswith("_") else did_you_mean(name, [n for n in known if n[0] != "_"])
-            if name in _OTHERWISE and "read" in known:  # columns exist only in the result of `read`
-                meant = f" (read() gives its columns: read().{_OTHERWISE[name][0]})"
+            ours = _OTHERWISE.get(name, ())
+            if ours and "read" in known and not set(ours) & {*known}:
+                # columns exist only in the result of `read`
+                meant = f" (read() gives its columns: read().{ours[0]})"
             # without `obj=`: with it, Python would add a hint of its own
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}{meant}", name=name

@@ -58,7 +58,7 @@ def _describe(leaf: Leaf, layout: StepLayout) -> str:
 def _differ(path: str, a: str, first: str, b: str, other: str) -> SpaceError:
     return SpaceError(
         f"{path}: expected {a} as in {first}, found {b} in {other}, which cannot be put into one array; "
-        "choose recordings of one kind, with_benchmark_filter(...) for example"
+        "choose recordings of one kind by a filter of run.environment or benchmark_id, for example"
     )
 
 

@@ -40,7 +40,7 @@ _LIKE: Final = {
     "tag": "run.tags",
 }
 _OF_STEPS: Final = frozenset(
-    "state states action actions reward rewards info infos time times next_state next_states".split()
+    ("state", "states", "action", "actions", "reward", "rewards", "info", "infos", "time", "times")
 )
 _INSIDE: Final = ("run.name", "run.tags", "run.split", "run.environment", "run.started", "metadata.success")
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
@@ -148,7 +148,7 @@ def comparisons(filter: BaseFilter) -> Iterable[BaseFilter]:
 
 
 def with_times(filter: BaseFilter, keys: Collection[str]) -> BaseFilter:
-    """The filter with times at `keys` ("yesterday", a date) as nanoseconds; raises FilterError if a value is no time."""
+    """The filter with times at `keys` ("yesterday", a date) as nanoseconds. FilterError if a value is no time."""
     if filter.type in COMBINING:
         return filter.model_copy(update={"filters": tuple(with_times(part, keys) for part in filter.filters)})
     key = filter.key or ""
