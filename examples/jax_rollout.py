@@ -48,7 +48,8 @@ tupli_mcap.write_rollout(
     observation_space=spaces.Box(-8, 8, (3,)),
     action_space=spaces.Box(-2, 2, (1,)),
     labels={"states": ["cos", "sin", "velocity"], "actions": ["torque"]},
-    run={"name": "random torques", "metadata": {"seed": 0}},
+    name="random torques",
+    metadata={"seed": 0},
 )
 
 dataset = tupli_mcap.open("jax_rollout.mcap")

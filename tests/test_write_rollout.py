@@ -212,7 +212,7 @@ def test_lists_are_episodes(tmp_path: Path) -> None:
     rewards = [rng.normal(size=n) for n in lengths]
     write_rollout(
         tmp_path / "r.mcap", states, actions, rewards, [True, False, False], timeouts=[False, False, np.eye(7)[6]],
-        infos=[{"x": np.arange(n)} for n in lengths], metadata=[{"k": n} for n in lengths],
+        infos=[{"x": np.arange(n)} for n in lengths], episode_metadata=[{"k": n} for n in lengths],
     )  # fmt: skip
     data = tupli_mcap.open(tmp_path / "r.mcap")
     assert [e.end for e in data] == ["terminal", "interrupted", "timeout"]
@@ -333,10 +333,20 @@ def test_an_end_where_a_reset_should_be_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_has_known_parts(tmp_path: Path) -> None:
+def test_the_run_is_told_as_to_the_other_recorders(tmp_path: Path) -> None:
+    told: Any = {"name": "ppo", "metadata": {"lr": 0.1}, "tags": ["old"], "split": "eval"}
+    arrays = [np.zeros((2, 2))], [np.zeros(2)], [np.zeros(2)]
+    path = write_rollout(tmp_path, *arrays, episode_metadata=[{"task": 1}], **told, capture="none")
+    assert path.parent == tmp_path and path.name.startswith("ppo")
+    (episode,) = tupli_mcap.open(path)
+    assert episode.metadata == {"task": 1}
+    assert {key: getattr(episode.run, key) for key in told} == {**told, "tags": ("old",)}
+    assert not episode.run.command
+    assert write_rollout(tmp_path / "r.mcap", *arrays) == tmp_path / "r.mcap"
+
+
+def test_infos_seeds_and_metadata_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     arrays = np.zeros((2, 2)), np.zeros(2), np.zeros(2)
-    with pytest.raises(RecordingError, match=r"found 'nmae' \(did you mean 'name'\?\)"):
-        write_rollout(tmp_path / "r.mcap", *arrays, run={"nmae": "x"})
     with pytest.raises(StepError, match="infos: expected arrays by name, or a dict for each step, found"):
         write_rollout(tmp_path / "r.mcap", *arrays, infos=[{"x": 1}, None])
     with pytest.raises(
@@ -348,7 +358,7 @@ def test_a_run_has_known_parts(tmp_path: Path) -> None:
     with pytest.raises(StepError, match="seeds: expected a list of one for each of 1 episodes, found 3"):
         write_rollout(tmp_path / "r.mcap", *([array] for array in arrays), seeds=3)
     with pytest.raises(RecordingError, match=r"\['metadata'\]\['code'\] is a .*module, .*; convert it"):
-        write_rollout(tmp_path / "r.mcap", *arrays, run={"metadata": {"code": np}})
+        write_rollout(tmp_path / "r.mcap", *arrays, metadata={"code": np})
     assert not (tmp_path / "r.mcap").exists()
 
 

@@ -6,20 +6,20 @@ import itertools
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from tupli_mcap.arrays import Array, arrays_at, map_arrays
-from tupli_mcap.errors import RecordingError, StepError, did_you_mean
-from tupli_mcap.recording.write.options import Mode
+from tupli_mcap.errors import StepError
+from tupli_mcap.recording.write.options import Capture, Mode
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
-_RUN: Final = ("name", "metadata", "tags", "split", "capture")
 _CHUNK: Final = 256 * 1024
 _TOGETHER: Final = 1 << 13  # steps that are written at once; a killed process loses their final states
 # Up to this many streams, chunks are as large as those of one: they all have room in the journal.
@@ -58,7 +58,7 @@ def write_rollout(
     next_states: Any = None,
     final_states: Any = None,
     infos: Any = None,
-    metadata: Any = None,
+    episode_metadata: Any = None,
     seeds: Any = None,
     autoreset: Autoreset | str | None = None,
     observation_space: gym.Space[Any] | None = None,
@@ -69,14 +69,18 @@ def write_rollout(
     compression: str = "zstd",
     mode: Mode = "x",
     benchmark_id: str = "",
-    run: Mapping[str, Any] | None = None,
+    name: str | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    tags: Sequence[str] = (),
+    split: str = "",
+    capture: Capture = "all",
     observations: Any = None,
     terminations: Any = None,
     truncations: Any = None,
     next_observations: Any = None,
     final_observations: Any = None,
-) -> None:
-    """Writes a recording from arrays that hold whole rollouts.
+) -> Path:
+    """Writes a recording from arrays that hold whole rollouts, and returns its path.
 
         write_rollout("run.mcap", observations, actions, rewards, terminations, truncations, autoreset="next-step")
         write_rollout("demos.mcap", states=[s0, s1], actions=[a0, a1], rewards=[r0, r1], terminals=[True, False])
@@ -86,6 +90,7 @@ def write_rollout(
     a stream of episodes of its own. In lists, each entry is an episode: [T of this one, …].
 
     Args:
+        path: the recording, or a directory, in which a new file is named by `name` and time.
         states: what the actions were chosen on. If there is one more than there are steps (T + 1), it is the state
             after the last one, unless `next_states` or `final_states` say it; if that step ended an episode and
             `autoreset` is "same-step" or "disabled", it is the first one of the next episode, and no final state.
@@ -97,7 +102,7 @@ def write_rollout(
             `numpy.argwhere(terminals | timeouts)`; in lists, one for each episode, None if it is not known.
         infos: name -> array, along the same axes as the rewards; or a dict for each step, in a list of T, or in T lists
             of N; in lists of episodes, either of these for each episode.
-        metadata: of every episode; in lists, one for each or one for all.
+        episode_metadata: of every episode; in lists, one for each or one for all.
         seeds: that of the reset before the first step, for sub-environments a list of N; in lists, one for each
             episode. None: not known.
         autoreset: what the row after an end is, if arrays continue after one. "next-step": a reset; its action and
@@ -106,8 +111,9 @@ def write_rollout(
         observation_space, action_space: by default Boxes of the arrays' dtypes and shapes, without bounds; of
             flags (bool), MultiBinary or Discrete(2), whose values are integers.
         reward_space: for rewards that are arrays.
-        run: name, metadata, tags, split and capture of the run, as `tupli_mcap.RecordEpisodes` takes them.
         labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
+        name, metadata, tags, split, capture: of the run, as `tupli_mcap.RecordEpisodes` takes them; what belongs to an
+            episode is `episode_metadata`.
         observations, terminations, truncations, next_observations, final_observations: Gymnasium's names of states,
             terminals, timeouts, next_states, final_states.
 
@@ -123,29 +129,22 @@ def write_rollout(
         _one_of("timeouts", timeouts, "truncations", truncations),
         _one_of("next_states", next_states, "next_observations", next_observations),
         _one_of("final_states", final_states, "final_observations", final_observations),
-        infos, metadata, seeds,
+        infos, episode_metadata, seeds,
     )  # fmt: skip
     parts, first, lead, count = _rollout_of(given, autoreset, reward_space)
     observations = observation_space or _space(first.states, lead, "states")
     with EpisodeWriter(
         path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
-        benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), **_checked_run(run or {}),
+        benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), name=name, metadata=metadata,
+        tags=tags, split=split, capture=capture,
     ) as writer:  # fmt: skip
         for part in parts:
             try:
                 _write(writer, part)
             except StepError as err:
                 raise StepError(f"{part.name}{err}") from err
-
-
-def _checked_run(run: Mapping[str, Any]) -> Mapping[str, Any]:
-    for key in run:
-        if key not in _RUN:
-            raise RecordingError(
-                f"run: expected {', '.join(_RUN)}, found {key!r:.80}{did_you_mean(key, _RUN)}"
-            )
-    return run
+    return writer.path
 
 
 def _rollout_of(
@@ -158,7 +157,9 @@ def _rollout_of(
             raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
     if isinstance(given.rewards, list | tuple) and given.rewards and _array(given.rewards[0]).ndim:
         return _episodes(given), _episode(given, 0), 1, None
-    given = _Given._make([*(map_arrays(one, _array) for one in given[:-2]), given.metadata, given.seeds])
+    given = _Given._make(
+        [*(map_arrays(one, _array) for one in given[:-2]), given.episode_metadata, given.seeds]
+    )
     lead = _lead(given.rewards, reward_space)
     count = given.rewards.shape[1] if lead == 2 else None
     return _streams(given, lead, _mode(autoreset)), given, lead, count
@@ -175,7 +176,7 @@ class _Given(NamedTuple):
     next_states: Any
     final_states: Any
     infos: Any
-    metadata: Any
+    episode_metadata: Any
     seeds: Any
 
 
@@ -213,7 +214,7 @@ def _episodes(given: _Given) -> Iterator[_Part]:
         flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
         yield _Part(
             0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, one.infos,
-            one.metadata or {}, one.seeds, name=f"episode {i}: ",
+            one.episode_metadata or {}, one.seeds, name=f"episode {i}: ",
         )  # fmt: skip
 
 
@@ -221,13 +222,13 @@ def _episode(given: _Given, i: int) -> _Given:
     """The i-th entry of all given lists."""
     count, entries = len(given.rewards), []
     for name, value in given._asdict().items():
-        if value is None or (name == "metadata" and isinstance(value, Mapping)):
+        if value is None or (name == "episode_metadata" and isinstance(value, Mapping)):
             entries.append(value)
             continue
         if isinstance(value, Mapping) or not hasattr(value, "__len__") or len(value) != count:
             found = len(value) if isinstance(value, Sequence) else shorten(value)
             raise StepError(f"{name}: expected a list of one for each of {count} episodes, found {found}")
-        entries.append(value[i] if name in ("metadata", "seeds") else map_arrays(value[i], _array))
+        entries.append(value[i] if name in ("episode_metadata", "seeds") else map_arrays(value[i], _array))
     return _Given(*entries)
 
 
@@ -298,7 +299,7 @@ def _parts(
     begins, ends = spans
     alone, known = ~finals.done[ends, *column], finals.known(ends, column)
     env = column[0] if column else 0
-    if given.infos is not None or given.metadata:
+    if given.infos is not None or given.episode_metadata:
         alone[:] = True
     alone[0] |= given.seeds[env] is not None
     turns = (np.diff(begins // _TOGETHER) != 0) | (known[1:] != known[:-1])
@@ -315,7 +316,7 @@ def _parts(
         )
         yield _Part(
             env, states, actions, rewards, terminals, timeouts, finals.at(last, column), infos,
-            given.metadata or {}, None if first else given.seeds[env], whole,
+            given.episode_metadata or {}, None if first else given.seeds[env], whole,
         )  # fmt: skip
 
 
