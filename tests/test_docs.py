@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import builtins
 import functools
+import inspect
 import json
 import re
 import shlex
 import symtable
 import sys
 import tomllib
+import types
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -100,6 +102,30 @@ def docstring_blocks() -> Iterator[tuple[str, str]]:
             for label, one in [(name, value), *((f"{name}.{key}", member) for key, member in members)]:
                 if code := api.code_in(getattr(one, "__doc__", None) or ""):
                     yield label, code
+
+
+def test_public_names_have_docstrings() -> None:
+    """Methods and properties too, own or inherited; functions name all arguments that are given by keyword."""
+    assert list(undocumented()) == []
+
+
+def undocumented() -> Iterator[str]:
+    for module in api.MODULES:
+        for name, value in api.public_names(module):
+            if not getattr(value, "__module__", "").startswith("tupli_mcap"):
+                continue
+            if isinstance(value, type):
+                ours = [one for one in value.__mro__ if one.__module__.startswith("tupli_mcap")]
+                members = {key: one for base in reversed(ours) for key, one in vars(base).items()}
+                for key, member in members.items():
+                    is_code = isinstance(member, property | classmethod | staticmethod | types.FunctionType)
+                    if is_code and not key.startswith("_") and not inspect.getdoc(getattr(value, key)):
+                        yield f"{name}.{key}"
+            elif isinstance(value, types.FunctionType):
+                for parameter in inspect.signature(value).parameters.values():
+                    told = re.search(rf"\b{parameter.name}\b", value.__doc__ or "")
+                    if parameter.kind is parameter.KEYWORD_ONLY and not told:
+                        yield f"{name}: {parameter.name}"
 
 
 @pytest.mark.parametrize(("name", "code"), docstring_blocks(), ids=lambda value: value.split("\n")[0])

@@ -59,7 +59,15 @@ def merge_recordings(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> MergeReport:
-    """`tupli_mcap.recording.merge_recordings` without the episodes that a storage has deleted."""
+    """`tupli_mcap.recording.merge_recordings` without the episodes that a storage has deleted.
+
+    Args:
+        sources: paths of the recordings.
+        target: path of the new one.
+        compression: "zstd", "lz4" or "none".
+        overwrite: replace a target that exists.
+        dry_run: only check and report.
+    """
     return merge.merge_recordings(
         sources, target, compression=compression, overwrite=overwrite, dry_run=dry_run, positions=candidates
     )
@@ -74,7 +82,16 @@ def split_recording(
     compression: str = "zstd",
     dry_run: bool = False,
 ) -> list[Part]:
-    """`tupli_mcap.recording.split_recording` without the episodes that a storage has deleted."""
+    """`tupli_mcap.recording.split_recording` without the episodes that a storage has deleted.
+
+    Args:
+        source: path of the recording.
+        target: path of the first file; target_0001, … are beside it.
+        episodes: number of episodes in each file.
+        max_bytes: or the size of each file, which has at least one episode.
+        compression: "zstd", "lz4" or "none".
+        dry_run: only report.
+    """
     return split.split_recording(
         source, target, episodes=episodes, max_bytes=max_bytes, compression=compression, dry_run=dry_run,
         positions=candidates,
@@ -93,6 +110,13 @@ def recover_recording(
 
     `restore_episodes` brings them back there, as in the source. Raises StorageError, too, if the notes beside the new
     file cannot be written.
+
+    Args:
+        source: path of the damaged recording, which is only read.
+        target: path of the new one; by default `<name>.recovered.mcap` beside the source.
+        overwrite: replace a target that exists.
+        dry_run: only report.
+        compression: "zstd", "lz4" or "none".
     """
     from tupli_mcap.storage.sidecar import Notes, Sidecar
 
@@ -317,6 +341,7 @@ def restore_episodes(
     Args:
         places: the paths of recordings, directories and storages.
         episodes: their numbers, such as `[3, 7]` or "3,7-9"; by default, or if "all", all that are deleted.
+        dry_run: only return the ids.
 
     Raises:
         RecordingError: there is no such path, or a path has no such deleted episode; then none is restored.

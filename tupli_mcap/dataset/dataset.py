@@ -325,6 +325,7 @@ class Dataset(RandomAccess):
 
     @property
     def steps(self) -> Steps:
+        """All steps by number, from 0, episode after episode; windows and samplers read them."""
         if self._steps is None:
             self._steps = RecordedSteps(
                 ListedEpisodes.each(self.headers), lambda name: nullcontext(self._open(name))

@@ -182,6 +182,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     @property
     def steps(self) -> Steps:
+        """The steps that the filters choose by number, from 0; windows and samplers read them."""
         return self._query.steps()
 
     @property

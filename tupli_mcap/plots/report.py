@@ -183,7 +183,7 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """The path of a report that may be written.
 
     Raises:
-        RecordingError: another extension, no such directory, or the file is there already.
+        RecordingError: another extension, no such directory, or the file is there already (without `overwrite`).
     """
     goal = Path(path)
     if goal.suffix.lower() not in FORMATS:

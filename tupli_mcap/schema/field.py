@@ -24,6 +24,9 @@ class F:
     """A key to compare: `F("metadata.score") > 3` is `FilterGT(key="metadata.score", value=3)`.
 
     Each of several arguments is one segment, taken literally: `F("metadata", "v1.0")`.
+
+    Attributes:
+        key: the dotted key.
     """
 
     __slots__ = ("key",)

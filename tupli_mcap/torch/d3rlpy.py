@@ -97,12 +97,14 @@ class RecordedEpisode:
         return self._buffer.rewards[self._rows]
 
     def size(self) -> int:
+        """The number of steps."""
         return len(self._rows)
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def compute_return(self) -> float:
+        """The sum of the rewards."""
         return float(np.sum(self.rewards))
 
     @property
@@ -115,11 +117,13 @@ class RecordedEpisode:
         return Episode(self.observations, self.actions, self.rewards, self.terminated)
 
     def serialize(self) -> dict[str, Any]:
+        """The columns of the episode, as d3rlpy's `Episode` gives them."""
         found: dict[str, Any] = self.whole().serialize()
         return found
 
     @classmethod
     def deserialize(cls, serializedData: dict[str, Any]) -> Episode:  # noqa: N803  # d3rlpy's name
+        """A d3rlpy `Episode` in memory, from what `serialize` returned."""
         return Episode.deserialize(serializedData)
 
 
@@ -167,10 +171,12 @@ class RecordedBuffer:
 
     @property
     def episodes(self) -> Sequence[RecordedEpisode]:
+        """The episodes that have a transition; each is made on access."""
         return _Episodes(self)
 
     @property
     def transition_count(self) -> int:
+        """The number of transitions of all episodes."""
         return int(self.transition_ends[-1]) if len(self.transition_ends) else 0
 
     def __len__(self) -> int:
@@ -230,6 +236,7 @@ class RecordedReplayBuffer(ReplayBuffer):  # type: ignore[misc]  # untyped
         super().__init__(buffer, **{**given, **options})
 
     def sample_transition(self) -> Transition:
+        """A transition, drawn at random."""
         if type(self._transition_picker) is not BasicTransitionPicker:
             return super().sample_transition()
         return self._buffer.transitions(np.array([np.random.randint(self.transition_count)]))[0]

@@ -78,6 +78,7 @@ def show(
     """Open the native viewer on episodes, chosen as for `save`. It stays open; returns its process id.
 
     Args:
+        filter, form: as for `save`.
         connect: send to this running viewer instead: `rerun+http://HOST:PORT/proxy`. Then returns None.
         note: as for `save`.
 
@@ -106,6 +107,7 @@ def display(
     Without `rerun-notebook`, the cell shows facts about the episodes, and what to install.
 
     Args:
+        filter, form: as for `save`.
         width, height: size of the viewer (pixels); by default, as wide as the cell.
 
     Raises:
@@ -124,7 +126,11 @@ def serve(
     tell: Callable[[str], None] = print,
     note: Callable[[str], None] | None = None,
 ) -> None:
-    """Serve the web viewer and the episodes on 127.0.0.1 until Ctrl-C. `tell` gets the URL; `note` as in `save`.
+    """Serve the web viewer and the episodes on 127.0.0.1 until Ctrl-C.
+
+    Args:
+        sources, episodes, filter, form, note: as for `save`.
+        tell: called with the URL.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -141,7 +147,8 @@ def blueprint(
     filter: Any = None,
     form: Form = "joined",
 ) -> Any:
-    """The blueprint that `save` would write, a `rerun.blueprint.Blueprint`."""
+    """The blueprint that `save` would write for these `sources`, `episodes`, `filter` and `form`, a
+    `rerun.blueprint.Blueprint`."""
     with _planned(sources, episodes, filter, form) as plans:
         return next(plans).blueprint
 

@@ -327,6 +327,11 @@ class EpisodeWriter(Recorder):
             self._writer.sync_step()
 
     def close(self) -> None:
+        """Ends running episodes as interrupted, and finishes the recording. Calling it twice is fine.
+
+        Raises:
+            RecordingError: the disk refuses; everything that was recorded is safe.
+        """
         _close(self._work, self._discarded, self._compression)
         self._finalizer.detach()
 

@@ -157,6 +157,7 @@ class Sampler:
         return self.draw(self.batch - 1)
 
     def give_back(self, batches: Sequence[Array]) -> None:
+        """Takes back batches that were drawn and not used: they come first again."""
         self._unused = [*batches, *self._unused]
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
@@ -172,6 +173,7 @@ class Sampler:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from a state. SamplingError if it is the state of something else, or of other items."""
         check_state(state, self.state_dict())
         seed, batch = checked_seed(state["seed"]), checked_count(state["batch"], 0, "a batch")
         unused = self._checked_unused(state["unused"])

@@ -30,7 +30,9 @@ class Numbers(Protocol):
 
     def __iter__(self) -> Iterator[Array]: ...
 
-    def give_back(self, batches: Sequence[Array]) -> None: ...
+    def give_back(self, batches: Sequence[Array]) -> None:
+        """Takes back batches that were drawn and not used: they come first again."""
+        ...
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
         """The position, as plain numbers, strings, bytes and lists. `unused` are the last batches, to give again."""
@@ -119,10 +121,12 @@ class Order:
         return (order[first : first + self.batch_size] for first in range(0, self._n, self.batch_size))
 
     def give_back(self, batches: Sequence[Array]) -> None:
+        """Takes back batches that were drawn and not used: they come first again."""
         state = self.state_dict(batches)
         self.epoch, self.batch = state["epoch"], state["batch"]
 
     def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+        """The position, as plain numbers and strings. `unused` are the last batches, to give again."""
         epoch, batch = self.epoch, self.batch
         if unused and not batch:
             epoch, batch = epoch - 1, len(self)
@@ -138,6 +142,7 @@ class Order:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on from a state. SamplingError if it is the state of something else, or of other items."""
         check_state(state, self.state_dict())
         seed, epoch = checked_seed(state["seed"]), checked_count(state["epoch"], 0, "an epoch")
         self.batch = checked_count(state["batch"], 0, "a batch", len(self))

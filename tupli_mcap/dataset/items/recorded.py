@@ -124,6 +124,7 @@ class RecordedSteps:
         return int(sum(sizes)) // max(1, len(units.chunk_of))
 
     def limit(self, cache_bytes: int, threads: int) -> None:
+        """As `Steps.limit`."""
         self.cache_bytes, self.threads = cache_bytes, threads
         self._cache.clear()
         for rows in self._rows:
@@ -131,6 +132,7 @@ class RecordedSteps:
         self._share_budget()
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
+        """As `Steps.read`; only the chunks of these rows are decompressed."""
         n = len(self)
         if len(rows) and (rows.min() < 0 or rows.max() >= n):
             wrong = rows[(rows < 0) | (rows >= n)][0]
@@ -141,6 +143,7 @@ class RecordedSteps:
         )
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        """As `Steps.read_runs`."""
         if self._wanted is not None:  # the next wanted step is not always in the next row
             return self.read(fields, rows_of_runs(starts, length))
         return self._columns(
@@ -230,7 +233,8 @@ class RecordedSteps:
 def steps_of(
     recording: Recording, *, cache_bytes: int = CACHE_BYTES, threads: int = THREADS
 ) -> RecordedSteps:
-    """All steps of one recording, for example for `Windows(steps_of(recording), 32)`.
+    """All steps of one recording, for example for `Windows(steps_of(recording), 32)`; `cache_bytes` and `threads` as
+    for `RecordedSteps.limit`.
 
     Raises:
         RecordingError: it has no step yet.

@@ -91,6 +91,7 @@ class MemorySteps:
         return len(self._rest)
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
+        """As `Steps.read`."""
         fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read(missing, rows) if missing else {}
@@ -100,6 +101,7 @@ class MemorySteps:
         }
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
+        """As `Steps.read_runs`."""
         fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read_runs(missing, starts, length) if missing else {}
@@ -109,9 +111,11 @@ class MemorySteps:
         }
 
     def blocks(self, rows: Array) -> Array:
+        """As `Steps.blocks`; of memory, any rows near each other."""
         return rows // _BLOCK
 
     def limit(self, cache_bytes: int, threads: int) -> None:
+        """As `Steps.limit`, of the steps that are not in memory."""
         self._rest.limit(cache_bytes, threads)
 
     def __reduce__(self) -> tuple[Callable[[Steps], Steps], tuple[Steps]]:

@@ -40,7 +40,7 @@ def annotate_episodes(
     """Gives episodes (their numbers; all by default) values that take precedence over the recorded metadata.
 
     A value of None removes a key. The annotation keeps the user's name and the time. A signature is removed, since it
-    no longer fits. The file is replaced in one rename.
+    no longer fits. The file is replaced in one rename; `dry_run` only checks.
 
     Returns:
         The numbers of the episodes.
@@ -72,7 +72,7 @@ def annotate_episodes(
 
 
 def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> Annotation:
-    """Removes the last annotation, and returns it.
+    """Removes the last annotation, and returns it; `dry_run` only returns it.
 
     Raises:
         RecordingError: there is no annotation. Other errors are those of `annotate_episodes`.
@@ -96,8 +96,13 @@ def edit_run(
 ) -> Run:
     """Changes the given parts of a recording's run, and returns the new run.
 
-    `metadata` are added to the run's own; a value of None removes a key. The recording keeps its UUID, and the earlier
-    version of the run for `undo_edit`.
+    The recording keeps its UUID, and the earlier version of the run for `undo_edit`.
+
+    Args:
+        path: the recording.
+        name, tags, split: replace those of the run; None keeps them.
+        metadata: are added to the run's own; a value of None removes a key.
+        dry_run: only check, and return the run.
 
     Raises:
         RecordingError: as `annotate_episodes`; or the recording was made of several runs.
@@ -118,7 +123,7 @@ def edit_run(
 
 
 def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
-    """Undoes the last `edit_run`, and returns the earlier run.
+    """Undoes the last `edit_run`, and returns the earlier run; `dry_run` only returns it.
 
     Raises:
         RecordingError: as `edit_run`; or nothing was edited.

@@ -98,6 +98,11 @@ def merge_recordings(
     environment is that of the first recording; labels on which recordings differ are left out.
 
     Args:
+        sources: paths of the recordings.
+        target: path of the new one.
+        compression: "zstd", "lz4" or "none".
+        overwrite: replace a target that exists.
+        dry_run: only check and report.
         positions: returns the positions of the episodes to merge; by default of all.
 
     Raises:

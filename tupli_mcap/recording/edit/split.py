@@ -50,6 +50,8 @@ def split_recording(
         target: path of the first file.
         episodes: number of episodes in each file.
         max_bytes: size of each file, assuming that all steps take the same number of bytes; at least one episode.
+        compression: "zstd", "lz4" or "none".
+        dry_run: only report.
         positions: returns the positions of the episodes to write; by default of all.
 
     Raises:

@@ -63,7 +63,12 @@ def write_recording(
 ) -> None:
     """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
 
-    `frames`: whether some of them have frames.
+    Args:
+        path: the recording.
+        episodes: are written one after the other.
+        observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
+        benchmark_id, attachments, mode, compression: as `tupli_mcap.RecordEpisodes` takes them.
+        frames: whether some of them have frames.
 
     Raises:
         StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag

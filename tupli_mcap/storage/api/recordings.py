@@ -30,6 +30,14 @@ class Recordings:
     _session: Session
 
     def open_recording(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
+        """The recording that an `EpisodeHeader.recording` names, read from the server; the caller closes it.
+
+        `episodes` are the numbers of those that will be read (None: all); the recording may lack the others.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            StorageError: the server cannot be reached.
+        """
         if not isinstance(recording, str):
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"

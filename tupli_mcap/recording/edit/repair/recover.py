@@ -137,6 +137,7 @@ def recover_recording(
         target: `<name>.recovered.mcap` beside the source by default.
         overwrite: whether an existing target may be replaced (in one rename).
         dry_run: only reports.
+        compression: "zstd", "lz4" or "none".
 
     Raises:
         RecordingError: the source cannot be opened, a writer works on it, or the target exists or cannot be written.
@@ -204,7 +205,8 @@ def _signature_fits(path: Path) -> bool:
 def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> RecoveryReport:
     """Finishes a recording that its writer did not finish, in place, as a writer that appends would.
 
-    A finished recording stays as it is. So does one that lost something: use `recover_recording` for it.
+    A finished recording stays as it is. So does one that lost something: use `recover_recording` for it. `dry_run`
+    only reports.
 
     Raises:
         RecordingError: something in it is lost or damaged, a writer works on it, or it cannot be written.
