@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -93,6 +94,12 @@ class TestTuples:
         step = RLTuple(state=state, action=1, reward=0.5)
         assert step.state is state
         assert (step.info, step.terminal, step.timeout) == ({}, False, False)
+
+    def test_gymnasiums_names_are_other_names_of_the_same_values(self) -> None:
+        step = RLTuple(state=7, action=1, reward=0.5, terminal=True)
+        assert (step.observation, step.terminated, step.truncated) == (7, True, False)
+        assert list(step.model_dump()) == ["state", "action", "reward", "info", "terminal", "timeout"]
+        assert pickle.loads(pickle.dumps(step)) == RLTuple.model_validate_json(step.model_dump_json()) == step
 
     @pytest.mark.parametrize(
         "make",

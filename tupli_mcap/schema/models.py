@@ -122,6 +122,21 @@ class RLTuple(BaseModel):
 
     __str__ = __repr__
 
+    @property
+    def observation(self) -> Any:
+        """`state`."""
+        return self.state
+
+    @property
+    def terminated(self) -> bool:
+        """`terminal`."""
+        return self.terminal
+
+    @property
+    def truncated(self) -> bool:
+        """`timeout`."""
+        return self.timeout
+
     @classmethod
     def from_env_step(
         cls,
