@@ -527,7 +527,8 @@ def test_a_recording_does_what_a_dataset_does(runs: Path) -> None:
         )
         assert np.array_equal(recording.transitions(2, 0.9)[4].states, dataset.transitions(2, 0.9)[4].states)
         assert recording.stats()["rewards"].count == dataset.n_steps
-        assert recording._repr_html_() == recording.dataset._repr_html_()
+        of_dataset = recording.dataset._repr_html_()
+        assert recording._repr_html_() == of_dataset.replace("<p>Dataset of", "<p>Recording of") != of_dataset
     with (runs / "a.mcap").open("rb") as file, Recording(file) as recording:
         assert recording[3] == dataset[3] and "12 episodes" in recording._repr_html_()
         with pytest.raises(TupliError, match="open it by its path or URL"):

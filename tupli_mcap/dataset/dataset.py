@@ -540,7 +540,10 @@ class Dataset(RandomAccess):
         return repr(self)
 
     def _repr_html_(self) -> str:
-        return display.html("Dataset", display.Facts(repr(self._source), self.headers, None, {}))
+        return self._html("Dataset")
+
+    def _html(self, name: str) -> str:
+        return display.html(name, display.Facts(repr(self._source), self.headers, None, {}))
 
 
 def _places(chosen: object, count: int) -> list[int]:

@@ -416,7 +416,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return len(self.index)
 
     def _repr_html_(self) -> str:
-        return html.escape(repr(self)) if self.address is None else self.dataset._repr_html_()
+        return html.escape(repr(self)) if self.address is None else self.dataset._html("Recording")
 
     def __repr__(self) -> str:
         state = "" if self.complete else ", recovered"
