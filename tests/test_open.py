@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.cli.app import app
+from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -91,7 +93,8 @@ def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("nowhere.mcap", "there is no file"),
+        ("nowhere.mcap", "there is no file 'nowhere.mcap'"),
+        ("nowhere/", "there is no file or directory 'nowhere/'"),
         ("nowhere*.mcap", "no file matches"),
         (3, "expected a path, a pattern"),
         ([3], "expected paths, patterns"),
@@ -355,6 +358,8 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
             episode.recording.read(fields=[wrong])
         with pytest.raises(TupliError, match="expected fields from"):
             dataset.windows(4, fields=[wrong])
+    with pytest.raises(TupliError, match="expected fields from rewards, .*, found 'terminations'$"):
+        dataset.map(lambda e: e.terminals, "x.mcap", fields=["terminations"])
     with pytest.raises(TupliError, match="did you mean .rewards."):
         dataset.read("rewrads")
 
@@ -454,6 +459,13 @@ def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:
     table = tupli_mcap.open(tmp_path).to_pandas("episodes")
     assert table["run.metadata.n"].dropna().tolist() == [2**60 + 1]
     assert table["run.metadata.n"].isna().tolist() == [False, True]
+
+
+@pytest.mark.parametrize("missing", ["pandas", "pyarrow"])
+def test_the_extra_of_arrow_is_named(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(MissingExtraError, match=r"needs pandas and pyarrow: pip install .*\[arrow\]"):
+        dataset.to_arrow()
 
 
 def test_arrow(dataset: Dataset) -> None:

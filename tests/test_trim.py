@@ -206,7 +206,7 @@ def test_command(tmp_path: Path) -> None:
     assert "exists" in CliRunner().invoke(app, words).output
     assert CliRunner().invoke(app, [*words, "--force"]).exit_code == 0
     assert (
-        "steps of episode 0 that stay"
+        "expected a step of episode 0 to stay, found none of its"
         in CliRunner().invoke(app, [*words[:3], "900:", *words[4:], "--force"]).output
     )
     for wrong in ("2", "a:b", "1:2:3"):

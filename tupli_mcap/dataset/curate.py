@@ -203,8 +203,8 @@ def trim_dataset(
             lengths[-1] = len(range(*steps.indices(header.n_tuples)))
         if not lengths[-1]:
             raise RecordingError(
-                f"{header.recording}: expected steps of episode {header.episode} that stay, found {header.n_tuples} in "
-                "all; choose other steps, or other episodes"
+                f"{header.recording}: expected a step of episode {header.episode} to stay, found none of its "
+                f"{header.n_tuples}; choose other steps, or other episodes"
             )
     report = TrimReport(target, len(lengths), sum(lengths), dataset.n_steps - sum(lengths))
     if dry_run:

@@ -295,7 +295,8 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
         return [str(path)]
     files = [str(file) for file in files_matching(path)]
     if not files:
-        what = "no file matches" if glob.has_magic(name) else "there is no file"
+        what = "there is no file" if path.suffix else "there is no file or directory"
+        what = "no file matches" if glob.has_magic(name) else what
         raise RecordingError(f"{what} {name!r}; give the path of a recording (.mcap)")
     return files
 

@@ -47,12 +47,13 @@ def _columns(dataset: Dataset, level: Level) -> dict[str, Any]:
 
 def arrow(dataset: Dataset, level: Level) -> pa.Table:
     """See `Dataset.to_arrow`."""
-    columns = _columns(dataset, level)
-    frame = import_pandas().DataFrame(columns)
     try:
+        import pandas
         import pyarrow
     except ImportError as err:
-        raise missing_extra("an Arrow table needs pyarrow", "arrow") from err
+        raise missing_extra("an Arrow table needs pandas and pyarrow", "arrow") from err
+    columns = _columns(dataset, level)
+    frame = pandas.DataFrame(columns)
     typed = {}
     for name, column in columns.items():
         dtype = frame[name].dtype

@@ -42,10 +42,10 @@ def field_names(
         names = [OTHER_NAMES.get(name, name) for name in given]
     except TypeError as err:
         raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
-    for name in names:
+    for written, name in zip(given, names, strict=True):
         if name not in known:
             raise error(
-                f"expected fields from {', '.join(known)}, found {name!r:.80}{did_you_mean(name, known)}"
+                f"expected fields from {', '.join(known)}, found {written!r:.80}{did_you_mean(name, known)}"
             )
     return list(dict.fromkeys(names))
 
