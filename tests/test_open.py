@@ -79,6 +79,11 @@ def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
     assert ids(tupli_mcap.open(str(runs / "*.mcap"))) == everything
     assert ids(tupli_mcap.open([runs / "a.mcap", str(runs / "[bc].mcap")])) == everything
     assert ids(tupli_mcap.open([runs])) == everything
+    assert ids(tupli_mcap.open([FileStorage(runs), runs / "a.mcap"])) == everything
+    with pytest.raises(
+        TupliError, match=r"found <Dataset .*; open a server by itself, and join datasets with \+"
+    ):
+        tupli_mcap.open([tupli_mcap.open(runs)])
     assert ids(tupli_mcap.open(FileStorage(runs))) == everything
     assert ids(tupli_mcap.open(runs / "a.mcap")) == everything[:12]
     with Recording(runs / "a.mcap") as recording:

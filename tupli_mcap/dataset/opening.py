@@ -18,7 +18,7 @@ Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Datas
 
 def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
     """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
-    a server: "http://lab:8080"), or a list of them.
+    a server: "http://lab:8080"), or a list of them, without servers and datasets, which `+` joins.
 
     An episode that is in two of the files counts once, with a warning: that of the file with more episodes, if they are
     copies of one recording that differ. A recording that was made of others has episodes of its own, which count beside
@@ -64,6 +64,10 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
 
 def _files_in(source: Openable) -> Sequence[str]:
     """The recordings of one source."""
+    if isinstance(source, TupliStorage):
+        from tupli_mcap.storage import FileStorage
+
+        source = source.root if isinstance(source, FileStorage) else source
     if isinstance(source, Recording):
         return [place_of(source)]
     if isinstance(source, str | os.PathLike):
@@ -73,5 +77,6 @@ def _files_in(source: Openable) -> Sequence[str]:
             return [str(path) for path in find_recordings(folder)]
         return FilesSource(source).names
     raise DatasetError(
-        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; open a storage by itself"
+        f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; "
+        "open a server by itself, and join datasets with +"
     )
