@@ -50,7 +50,6 @@ def trim_recording(
         steps: by number of the episode, the steps that stay; other episodes stay whole.
         episodes: numbers of the episodes to keep (all by default).
         overwrite: replace a target that exists.
-        dry_run: only check and report.
 
     Raises:
         RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
