@@ -766,6 +766,14 @@ class TestLook:
         assert ",".join(run("ls", cartpole, "--columns", names, "--json").json[0]) == names
         assert told["steps"] == 200
 
+    def test_named_columns_stay_without_values(self, cartpole: Path, here: Path) -> None:
+        names = ["run", "settings", "tags", "split", "run.metadata.lr"]
+        title, _ = ok("ls", cartpole, "--columns", ",".join(names)).splitlines()
+        assert title.lower().split() == names
+        title, *_ = ok("episodes", cartpole, "--columns", "seed,created_by,run.split").splitlines()
+        assert title.lower().split() == ["seed", "created_by", "run.split"]
+        assert "SPLIT" not in ok("ls", cartpole)
+
     def test_doctor_of_some_episodes(self, cartpole: Path, here: Path) -> None:
         with Recording(cartpole) as recording:
             lengths = recording.index["length"]

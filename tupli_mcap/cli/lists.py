@@ -149,11 +149,7 @@ def ls(
     if as_json:
         print_json(_json_of_runs(listed, columns))
     elif good or not listed:
-        _print_runs(
-            good,
-            _chosen_columns(columns, good),
-            "no recordings" if wanted is None else "no recording matches",
-        )
+        _print_runs(good, columns, "no recordings" if wanted is None else "no recording matches")
     bad = [item for item in listed if item.error is not None]
     for item in bad:
         fail(item.error or "")
@@ -276,15 +272,16 @@ def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list
     ]
 
 
-def _print_runs(items: Sequence[ListedRecording], chosen: Sequence[_Listed], empty: str) -> None:
+def _print_runs(items: Sequence[ListedRecording], names: str | None, empty: str) -> None:
     from tupli_mcap.recording.describe.description import nan_text
 
+    chosen = _chosen_columns(names, items)
     columns, cells = [one.column for one in chosen], [one.cells(items) for one in chosen]
     notes = [nan_text(r.return_nan, r.episodes) for r in items]
     if any(notes) and _COLUMNS["return"] in chosen:
         columns.append(Column("NOTE ON RETURN", shrink="end"))
         cells.append(notes)
-    print_table(columns, list(zip(*cells, strict=True)), empty=empty)
+    print_table(columns, list(zip(*cells, strict=True)), empty=empty, named=names is not None)
 
 
 def episodes(
@@ -381,6 +378,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
         [Column(key.upper(), "right" if is_numeric else "left", shrink="end") for key, is_numeric in aligned],
         [["" if value is None else short_value(value) for value in row] for row in rows],
         empty="no episodes",
+        named=True,
     )
 
 

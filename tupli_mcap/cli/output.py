@@ -30,16 +30,18 @@ class Column(NamedTuple):
     shrink: Literal["start", "end"] | None = None
 
 
-def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], *, empty: str) -> None:
-    """Print rows under titles, or the sentence `empty` if there are none."""
+def print_table(
+    columns: Sequence[Column], rows: Iterable[Sequence[str]], *, empty: str, named: bool = False
+) -> None:
+    """Print rows under titles, or the sentence `empty` if there are none. A column without any value is left out,
+    unless the user `named` the columns."""
     from rich.cells import cell_len
 
     cells = [[visible(cell) for cell in row] for row in rows]
     if not cells:
         say(empty)
         return
-    # A column without any value is not shown.
-    shown = [i for i in range(len(columns)) if any(row[i] for row in cells)]
+    shown = [i for i in range(len(columns)) if named or any(row[i] for row in cells)]
     columns = [columns[i] for i in shown]
     cells = [[row[i] for i in shown] for row in cells]
     widths = [
