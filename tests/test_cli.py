@@ -774,6 +774,13 @@ class TestLook:
         assert title.lower().split() == ["seed", "created_by", "run.split"]
         assert "SPLIT" not in ok("ls", cartpole)
 
+    def test_ls_takes_the_other_names_of_columns(self, cartpole: Path, here: Path) -> None:
+        ok("record", "CartPole-v1", "-o", "short.mcap", "--steps", 5)
+        for key, other in (("steps", "n_tuples"), ("return", "episode_return")):
+            listed = run("ls", cartpole, "short.mcap", "--columns", other, "--sort", f"-{other}", "--json").json
+            named = run("ls", cartpole, "short.mcap", "--columns", key, "--sort", f"-{key}", "--json").json
+            assert [row[other] for row in listed] == [row[key] for row in named]
+
     def test_doctor_of_some_episodes(self, cartpole: Path, here: Path) -> None:
         with Recording(cartpole) as recording:
             lengths = recording.index["length"]

@@ -217,15 +217,18 @@ def _sorted(
 
 
 def _column(name: str) -> _Listed:
+    from tupli_mcap.schema.facts import LISTED_AS
+
     if name.startswith(_SETTING):
         value = partial(_setting, name.removeprefix(_SETTING).split("."))
         return _listed_by(value, Column(name), _text)
-    if name.lower() not in _COLUMNS:
+    key = LISTED_AS.get(name.lower(), name.lower())
+    if key not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
         raise typer.BadParameter(
             f"there is no column {name!r}{similar}; columns are {', '.join(_COLUMNS)}, {_SETTING}KEY"
         )
-    return _COLUMNS[name.lower()]
+    return _COLUMNS[key]
 
 
 def _text(value: Any) -> str:
