@@ -144,7 +144,14 @@ def test_info_says_the_digests_of_the_sources_and_alike_trims_once(tmp_path: Pat
     assert said is not None
     told = " ".join(CliRunner().invoke(app, ["info", str(new)]).output.split())
     digest = said["sources"][0]["sha256"][:12]
-    assert f"r.mcap (sha256 {digest}) by trim to steps [2, 9] of episodes 0, 1, 2, 3" in told
+    assert f"r.mcap (sha256 {digest}) by trim to steps 2:9 of episodes 0, 1, 2, 3" in told
+
+
+def test_info_says_how_many_trims_it_does_not_show(tmp_path: Path) -> None:
+    ds = tupli_mcap.open(record(tmp_path / "r.mcap"))
+    new = ds.trim(lambda e: slice(0, 9 - e.number), tmp_path / "n.mcap")
+    told = " ".join(CliRunner().invoke(app, ["info", str(new)]).output.split())
+    assert "by trim to steps 0:9 of episode 0; 0:8 of episode 1; 0:7 of episode 2; others of 1 more" in told
 
 
 def test_refuses_to_leave_nothing(tmp_path: Path) -> None:

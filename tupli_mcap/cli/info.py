@@ -254,21 +254,26 @@ def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
 
 def _made_of_text(made_of: dict[str, Any]) -> str:
     facts = [f"{made_of.get(key)!s:.200}" for key in ("query", "function") if made_of.get(key)]
-    steps = made_of.get("steps")
-    if isinstance(steps, dict):  # of a trim
-        alike: dict[str, list[str]] = {}
-        for episode, kept in steps.items():
-            alike.setdefault(f"{kept!s:.40}", []).append(f"{episode!s:.20}")
-        facts += [
-            f"to steps {kept} of episode{'s'[: len(those) > 1]} {_some(those)}"
-            for kept, those in list(alike.items())[:3]
-        ]
+    if isinstance(steps := made_of.get("steps"), dict):  # of a trim
+        facts.append(f"to steps {_trims_text(steps)}")
     names = [
         f"{one.get('name', '')} (sha256 {one.get('sha256', '')!s:.12})" if isinstance(one, dict) else ""
         for one in made_of["sources"]
     ]
     listed = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
     return f"{listed} by {made_of.get('how', '')!s:.40}{''.join(f' {fact}' for fact in facts)}"
+
+
+def _trims_text(trims: dict[str, Any]) -> str:
+    """Which steps of which episodes a trim kept: `10:36 of episode 0; 10:46 of episodes 1, 2`."""
+    alike: dict[str, list[str]] = {}
+    for episode, kept in trims.items():
+        span = ":".join(map(str, kept)) if isinstance(kept, list) else str(kept)
+        alike.setdefault(span[:40], []).append(f"{episode!s:.20}")
+    shown = list(alike.items())[:3]
+    texts = [f"{span} of {'episode' if len(those) == 1 else 'episodes'} {_some(those)}" for span, those in shown]
+    others = len(trims) - sum(len(those) for _, those in shown)
+    return "; ".join([*texts, *([f"others of {number(others)} more"] if others else [])])
 
 
 def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
