@@ -439,9 +439,23 @@ class TestRecord:
         result = run("record", "CartPole-v1", *args)
         paths = [Path("a.mcap"), *(Path(f"a_{i:04}.mcap") for i in range(1, files))]
         episodes = sum(item["episodes"] for item in run("ls", *paths, "--json").json)
-        held = "a.mcap holds" if files == 1 else "a.mcap to a_0002.mcap hold"
+        held = "a.mcap holds" if files == 1 else f"{here / 'a.mcap'} to a_0002.mcap hold"
         assert (result.code, result.out) == (130, "")
         assert result.err == f"interrupted; {held} {episodes:,} episodes, 20,000 steps\n"
+
+    def test_ctrl_c_names_the_file_in_a_directory(self, here: Path) -> None:
+        Path("into_directory.py").write_text(
+            "left = [0] * 30\n"
+            "def act(state):\n"
+            "    if not left: raise KeyboardInterrupt\n"
+            "    return left.pop()\n"
+        )
+        ok("record", "CartPole-v1", "-o", "runs/", "--steps", 50)
+        earlier = {*Path("runs").iterdir()}
+        result = run("record", "CartPole-v1", "-o", "runs/", "--policy", "into_directory:act")
+        (path,) = {*Path("runs").iterdir()} - earlier
+        held = f"{len(Recording(path))} episodes, 30 steps"
+        assert (result.code, result.err) == (130, f"interrupted; {path} holds {held}\n")
 
     def test_ctrl_c_before_anything_is_recorded(self, here: Path) -> None:
         Path("early.py").write_text("def act(state):\n    raise KeyboardInterrupt\n")

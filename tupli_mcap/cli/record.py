@@ -16,7 +16,7 @@ from tupli_mcap.cli.terminal import say, step_progress
 from tupli_mcap.errors import TupliError, bytes_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from tupli_mcap.wrappers.rollout import RolloutSummary
 
@@ -152,7 +152,7 @@ def record(
         sys.path.append("")  # last, so that a file in this directory replaces no installed module
     function = None if policy is None else load_policy(policy)
     with (
-        _saying_what_is_safe(Path(output), max_bytes or max_seconds, replaces=mode == "w"),
+        _saying_what_is_safe(Path(output), replaces=mode == "w"),
         step_progress(steps if steps or episodes else STEPS) as progress,
     ):
         summary = record_rollouts(
@@ -182,26 +182,22 @@ def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
 
 
 @contextlib.contextmanager
-def _saying_what_is_safe(output: Path, limit: float | None, *, replaces: bool) -> Iterator[None]:
-    """Adds to a KeyboardInterrupt how much is recorded; with a `limit`, over all files of the series."""
+def _saying_what_is_safe(output: Path, *, replaces: bool) -> Iterator[None]:
+    """Makes of a KeyboardInterrupt with the files so far, as `record_rollouts` raises it, one that says how much they
+    hold."""
     before = output.stat().st_ino if replaces and output.exists() else None
     try:
         yield
     except KeyboardInterrupt as err:
-        held = _held(output, limit)
+        held = _held([path for path in err.args if isinstance(path, Path) and path.exists()])
         if before is not None and output.exists() and output.stat().st_ino == before:
             held = f"{held}; this is the earlier file, which was not replaced"
         raise KeyboardInterrupt(held) from err
 
 
-def _held(output: Path, limit: float | None) -> str:
+def _held(paths: Sequence[Path]) -> str:
     from tupli_mcap.recording import Recording
-    from tupli_mcap.recording.write.rotation import series
 
-    if output.is_dir():
-        return f"tupli-mcap ls {output} lists what was recorded"
-    first, others = (output, {}) if limit is None else series(output)
-    paths = [path for path in (first, *others.values()) if path.exists()]
     episodes = steps = 0
     try:
         for path in paths:

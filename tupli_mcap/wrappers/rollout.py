@@ -75,6 +75,7 @@ def record_rollouts(
         RecordingError: the environment cannot be made, the policy or the environment failed (what was
             recorded before is in the file), or the file cannot be written.
         SpaceError: a space that cannot be recorded.
+        KeyboardInterrupt: as usual; once it records, with the files so far as arguments.
     """
     limit = _Limit(steps, episodes)
     if limit.steps < 1 or limit.episodes < 1 or num_envs < 1:
@@ -89,8 +90,11 @@ def record_rollouts(
         is_vector = isinstance(made, gym.vector.VectorEnv)
         wrapped: Any = (RecordVectorEpisodes if is_vector else RecordEpisodes)(made, path, **options)
         known = wrapped._writer.index.count
-        with _closing(wrapped, asked.mode):
-            done = (_run_vector if is_vector else _run)(wrapped, limit, seed, policy, report)
+        try:
+            with _closing(wrapped, asked.mode):
+                done = (_run_vector if is_vector else _run)(wrapped, limit, seed, policy, report)
+        except KeyboardInterrupt as err:
+            raise KeyboardInterrupt(*wrapped.paths) from err
     return _summary(wrapped.paths, known, done, time.perf_counter() - began)
 
 
