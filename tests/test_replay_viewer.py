@@ -128,6 +128,19 @@ def test_success_and_the_name_of_the_run_are_told(tmp_path: Path) -> None:
     assert "**Episode 1**: 1 step, return 0, terminal, no success" in card
 
 
+def test_the_title_names_the_runs(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.mcap" for name in "abcde"]
+    for path in paths:
+        with RecordEpisodes(Goes(), path, name=f"run {path.stem}") as env:
+            env.reset()
+            env.step(0)
+    titles = []
+    for count in (1, 2, 5):
+        found = Rrd(viewer.save(paths[:count], tmp_path / f"{count}.rrd"))
+        titles += found.rows("/__properties", "RecordingInfo:name")
+    assert titles == [["run a"], ["run a, run b"], ["run a, run b, run c and 2 more"]]
+
+
 class Goes(gym.Env[Any, Any]):
     """Episodes of a step, whose infos may say whether it succeeded."""
 

@@ -205,7 +205,9 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
         text = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
         text += "".join(_told_in_turn(parts)) if total <= _FEW else ""
     scene.rows = first
-    return Plan(run_title(chosen[0].recording), chosen[0].recording.uuid, parts, text)
+    titles = list(dict.fromkeys(run_title(item.recording) for item in chosen))
+    name = ", ".join(titles[:_EACH]) + (f" and {len(titles) - _EACH:,} more" if len(titles) > _EACH else "")
+    return Plan(name, chosen[0].recording.uuid, parts, text)
 
 
 def _told_in_turn(parts: Sequence[Part]) -> Iterator[str]:
