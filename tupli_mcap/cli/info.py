@@ -271,7 +271,9 @@ def _trims_text(trims: dict[str, Any]) -> str:
         span = ":".join(map(str, kept)) if isinstance(kept, list) else str(kept)
         alike.setdefault(span[:40], []).append(f"{episode!s:.20}")
     shown = list(alike.items())[:3]
-    texts = [f"{span} of {'episode' if len(those) == 1 else 'episodes'} {_some(those)}" for span, those in shown]
+    texts = [
+        f"{span} of {'episode' if len(those) == 1 else 'episodes'} {_some(those)}" for span, those in shown
+    ]
     others = len(trims) - sum(len(those) for _, those in shown)
     return "; ".join([*texts, *([f"others of {number(others)} more"] if others else [])])
 
