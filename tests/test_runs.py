@@ -875,6 +875,19 @@ class TestCommands:
         command("tag", f"{runs}/deep/b.mcap", "--undo")
         assert not any(e.metadata for e in tupli_mcap.open(runs))
 
+    def test_edit_in_a_directory(self, tmp_path: Path) -> None:
+        paths = [
+            record(tmp_path / "runs" / f"{name}.mcap", count) for name, count in (("a", 1), ("deep/b", 3))
+        ]
+        command("edit", str(tmp_path / "runs"), str(paths[0]), "--split", "eval")
+        command("edit", str(tmp_path / "runs"), "--filter", "episode >= 1", "--tag", "long")
+        said = [(run.split, run.tags) for path in paths for run in Recording(path).runs]
+        assert said == [("eval", ()), ("eval", ("long",))]
+        command("edit", str(paths[0]), "--undo")  # which was edited once, although it was named twice
+        assert [run.split for run in Recording(paths[0]).runs] == [""]
+        for words, code in ((["--filter", "episode > 9", "--tag", "x"], 1), (["--undo"], 2)):
+            assert CliRunner().invoke(app, ["edit", str(tmp_path / "runs"), *words]).exit_code == code
+
     @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
     @pytest.mark.parametrize("words", ["tag --episodes all good=true", "edit --name x"])
     def test_all_recordings_are_changed_or_none(

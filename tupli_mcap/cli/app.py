@@ -292,7 +292,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     ),
     "edit": (
         "edit run.mcap --name ppo-seed3 --set lr=0.0003 --tag baseline",
-        "edit runs/*.mcap --split eval",
+        "edit runs/ --filter 'run.name ~ \"ppo\"' --tag baseline",
         "edit run.mcap --undo",
     ),
     "info": ("info run.mcap", "info runs/", "info run.mcap --filter 'return > 100'"),

@@ -132,11 +132,9 @@ def tag(
     it and when. Its steps are not touched. A signature is dropped. If one recording cannot be
     changed, none is.
     """
-    from tupli_mcap.dataset.which import numbers_in
-    from tupli_mcap.recording import annotate_episodes, undo_annotation
+    from tupli_mcap.recording import undo_annotation
     from tupli_mcap.recording.about.success import KEYS, success_of
     from tupli_mcap.recording.edit.annotate import change_all
-    from tupli_mcap.storage.listing import find_recordings
 
     given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
     paths = [local_path(text) for text in given]
@@ -152,33 +150,62 @@ def tag(
         raise typer.BadParameter(
             "say which episodes: --episodes 3,7, --filter 'return < 10' or --episodes all"
         )
-    if undo and any(path.is_dir() for path in paths):  # their last notes may have nothing in common
-        raise typer.BadParameter("name the recordings whose last note --undo takes back, not their directory")
-    files = [str(file) for path in paths for file in find_recordings(path)]
     done: list[dict[str, Any]] = []
     if undo:
+        files = _named_alone(paths, "note")
         lasts = change_all(files, lambda file, dry: undo_annotation(file, dry_run=dry), dry_run=dry_run)
         for file, last in zip(files, lasts, strict=True):
-            done.append({"path": file, "episodes": last.episodes, "values": last.values})
+            done.append({"path": str(file), "episodes": last.episodes, "values": last.values})
     else:
-        gathered = Gathered()
-        named = numbers_in(paths, episodes, filter_of(filter_text), gathered)
-        chosen = {file: numbers for (file, _), numbers in named.items()}
-        change_all(
-            chosen,
-            lambda file, dry: annotate_episodes(file, values, chosen[file], dry_run=dry),
-            dry_run=dry_run,
-            gathered=gathered,
-        )
-        if not chosen:
-            why = "" if filter_text is None else f" that matches {filter_text}"
-            raise RecordingError(f"there is no episode{why} in {', '.join(map(str, paths))}")
-        done = [{"path": file, "episodes": numbers, "values": values} for file, numbers in chosen.items()]
+        noted = _note(paths, episodes, filter_text, values, dry_run=dry_run)
+        done = [{"path": file, "episodes": numbers, "values": values} for file, numbers in noted.items()]
     if as_json:
         print_json([{"dry_run": dry_run, "undone": undo, **one} for one in done])
         return
     for one in done:
         _tell_note(one, undo=undo, dry_run=dry_run)
+
+
+def _note(
+    places: Sequence[Path],
+    episodes: str | None,
+    filter_text: str | None,
+    values: dict[str, Any],
+    *,
+    dry_run: bool,
+) -> dict[str, list[int]]:
+    """Notes values of the chosen episodes; returns the numbers of these by recording."""
+    from tupli_mcap.dataset.which import numbers_in
+    from tupli_mcap.recording import annotate_episodes
+    from tupli_mcap.recording.edit.annotate import change_all
+
+    gathered = Gathered()
+    named = numbers_in(places, episodes, filter_of(filter_text), gathered)
+    chosen = {file: numbers for (file, _), numbers in named.items()}
+    change_all(
+        chosen,
+        lambda file, dry: annotate_episodes(file, values, chosen[file], dry_run=dry),
+        dry_run=dry_run,
+        gathered=gathered,
+    )
+    if not chosen:
+        raise _nothing_in(places, "episode", filter_text)
+    return chosen
+
+
+def _nothing_in(places: Sequence[Path], what: str, filter_text: str | None) -> RecordingError:
+    why = "" if filter_text is None else f" that matches {filter_text}"
+    return RecordingError(f"there is no {what}{why} in {', '.join(map(str, places))}")
+
+
+def _named_alone(places: Sequence[Path], change: str) -> Sequence[Path]:
+    """Recordings of which `--undo` may take back the last change. BadParameter for a directory: the last changes of its
+    recordings may have nothing in common."""
+    if any(place.is_dir() for place in places):
+        raise typer.BadParameter(
+            f"name the recordings whose last {change} --undo takes back, not their directory"
+        )
+    return places
 
 
 def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
@@ -194,7 +221,11 @@ def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
 
 
 def edit(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE", help="Recordings.", parser=local_path)],
+    places: Annotated[
+        list[Path],
+        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", parser=local_path),
+    ],
+    filter_text: FilterText = None,
     name: Annotated[str | None, typer.Option(help="The new name of the run.")] = None,
     settings: Annotated[
         list[str] | None,
@@ -213,15 +244,16 @@ def edit(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Change the name, metadata, tags or split of a run.
+    """Change the name, metadata, tags or split of runs.
 
-    The recording keeps its id, and its steps are not touched. A signature is dropped. If one
-    recording cannot be changed, none is.
+    The recordings keep their ids, and their steps are not touched. A signature is dropped. If
+    one recording cannot be changed, none is. With --filter, only the recordings are changed
+    that have an episode which matches.
     """
     from tupli_mcap.recording import edit_run, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
 
-    meant = [str(file) for file in files if "=" in str(file) and not file.exists()]
+    meant = [str(place) for place in places if "=" in str(place) and not place.exists()]
     if meant:
         raise typer.BadParameter(
             f"{meant[0]} is no recording; to change metadata of the run, give --set {meant[0]}"
@@ -230,27 +262,44 @@ def edit(
         raise typer.BadParameter(
             "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
         )
-    metadata = dict(pair_of(text) for text in settings or ())
+    metadata, gathered = dict(pair_of(text) for text in settings or ()), Gathered()
+    files = _files_in(_named_alone(places, "edit") if undo else places, filter_text, gathered)
 
-    def change(file: Path, dry: bool) -> Run:
+    def change(file: str, dry: bool) -> Run:
         if undo:
             return undo_edit(file, dry_run=dry)
         return edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry)
 
-    runs = change_all(files, change, dry_run=dry_run)
+    runs = change_all(files, change, dry_run=dry_run, gathered=gathered)
+    if not files:
+        raise _nothing_in(places, "recording" if filter_text is None else "episode", filter_text)
     if as_json:
         edited = zip(files, runs, strict=True)
         print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
         return
     for file, run in zip(files, runs, strict=True):
-        facts = {
-            "would change" if dry_run else "recording": str(file),
-            "run": run.name,
-            "split": run.split,
-            "tags": ", ".join(run.tags),
-            "settings": pairs_of(run.metadata),
-        }
-        print_facts([(key, text) for key, text in facts.items() if text])
+        _tell_run(file, run, dry_run=dry_run)
+
+
+def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
+    facts = {
+        "would change" if dry_run else "recording": file,
+        "run": run.name,
+        "split": run.split,
+        "tags": ", ".join(run.tags),
+        "settings": pairs_of(run.metadata),
+    }
+    print_facts([(key, text) for key, text in facts.items() if text])
+
+
+def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathered) -> list[str]:
+    """The recordings of paths, or those that have an episode which matches; see `numbers_in`."""
+    from tupli_mcap.dataset.which import numbers_in
+    from tupli_mcap.storage.listing import find_recordings
+
+    if filter_text is not None:
+        return [file for file, _ in numbers_in(places, None, filter_of(filter_text), gathered)]
+    return list(dict.fromkeys(str(file) for place in places for file in find_recordings(place)))
 
 
 def filter_(
