@@ -30,7 +30,9 @@ from __future__ import annotations
 import base64
 import contextlib
 import html
+import itertools
 import json
+import re
 import socket
 import statistics
 import time
@@ -432,6 +434,37 @@ class TestInjection:
             headers = {"Content-Type": "application/json"}
             answer = lab.eve.call("POST", f"/v1/{kind}/list", content=body, headers=headers)
             assert answer.status_code in (200, 400), (kind, answer.text)
+
+    def test_of_values_that_json_lacks_in_every_body(self, lab: Lab) -> None:
+        """Strangers and users are told what is wrong, and are not sent their bodies back."""
+        document = httpx.get(f"{lab.url}/openapi.json", timeout=120).json()
+        text = '"\\ud800 a long text"'
+        bodies = ("NaN", text, f'{{"zz": NaN, "password": {text}}}', f'[{{"user": NaN, "roles": [{text}]}}]')
+        headers = {"Content-Type": "application/json"}
+        asked = [(path, method) for path, of in document["paths"].items() for method in of if method != "get"]
+        for (path, method), person, body in itertools.product(asked, (Person(lab.url), lab.eve), bodies):
+            answer = person.call(method, re.sub("{.*}", "x", path), content=body, headers=headers)
+            assert answer.status_code < 500 and "long text" not in answer.text, (path, body, answer.text)
+        told = lab.eve.call("POST", "/access/users/token", content="NaN", headers=headers)
+        assert told.status_code == 422
+        assert told.json()["detail"][0].keys() == {"type", "loc", "msg"}
+
+    def test_of_lone_surrogates_in_names_and_passwords(self, lab: Lab) -> None:
+        headers = {"Content-Type": "application/json"}
+
+        def ask(method: str, path: str, told: object) -> httpx.Response:
+            return lab.admin.call(method, path, content=json.dumps(told), headers=headers)
+
+        new = {"username": "surrogate", "password": "\ud800 is my password"}
+        for refused in (
+            ask("POST", "/v1/users", new),
+            ask("POST", "/access/users/create", new),
+            ask("PUT", "/v1/users/eve/password", {"password": new["password"]}),
+            ask("PUT", "/access/users/change-password", {**new, "username": "eve"}),
+        ):
+            assert refused.status_code == 400 and "found a lone surrogate" in refused.json()["detail"]
+        given = ask("PUT", "/v1/groups/global/members", [{"user": "eve", "roles": ["\ud800"]}])
+        assert (given.status_code, given.json()["detail"]) == (404, "Role \ud800 not found")
 
     def test_of_names_of_users_and_groups(self, lab: Lab) -> None:
         for text in TEXTS:

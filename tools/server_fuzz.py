@@ -4,8 +4,8 @@
 
 Schemathesis makes the requests from the document; tests/page_fuzz.py draws requests to pages and their forms. Half of
 them use names and ids of existing items instead of made-up ones, so that they get further than "there is no such
-thing". A random user sends each request; with `--role`, a user of that role sends all, or one of each role in turn.
-Findings are:
+thing". A part of these hold NaN, an infinity or a lone surrogate. A random user sends each request; with `--role`, a
+user of that role sends all, or one of each role in turn. Findings are:
 
 - a failure of the server: a status of 500 or more, except a full quota (507);
 - an answer that the document does not describe: its status, its media type or its JSON;
@@ -21,6 +21,7 @@ import base64
 import contextlib
 import json
 import logging
+import math
 import random
 import sys
 import tempfile
@@ -68,6 +69,8 @@ _FILTERS = [
     {"type": "IN", "key": "created_by", "value": ["admin", "user7"]},
     {"type": "NOT", "filters": [{"type": "LT", "key": "return", "value": 2.5}]},
 ]
+_ODD = (math.nan, math.inf, "\ud800 is my password", {"\ud800": math.nan})
+_ODD_SHARE = 0.1  # of the bodies with existing names
 _TEXTS = ["steps >= 0", "metadata.score == 1", 'created_by in ["admin"]']
 
 
@@ -195,6 +198,17 @@ class Known:
         if case.path == "/v1/uploads/{upload_id}":
             case.headers["Upload-Offset"] = "0"
         case.body = self._within(case.body)
+        if case.media_type == "application/json" and self._rng.random() < _ODD_SHARE:
+            case.body = json.dumps(self._odd(case.body), default=str).encode()
+
+    def _odd(self, value: Any) -> Any:
+        """A body with a value that JSON lacks, or that UTF-8 cannot hold, in a random place."""
+        if not isinstance(value, dict | list) or not value or self._rng.random() < 0.2:
+            return self._rng.choice(_ODD)
+        chosen = self._rng.choice(list(value) if isinstance(value, dict) else range(len(value)))
+        pairs = value.items() if isinstance(value, dict) else enumerate(value)
+        made = {key: self._odd(each) if key == chosen else each for key, each in pairs}
+        return made if isinstance(value, dict) else list(made.values())
 
     def _known(self, name: str, value: Any, place: str) -> Any:
         known = self._names.get(f"{place} {name}", self._names.get(name))

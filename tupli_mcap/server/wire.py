@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, Request, Response
-from fastapi.exception_handlers import request_validation_exception_handler
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
@@ -182,28 +182,35 @@ def told(err: TupliError) -> tuple[int, str]:
     return status, _FAILED.get(status, str(err))
 
 
+class _Refusal(JSONResponse):
+    """An error as JSON in ASCII, because it may quote a text that UTF-8 cannot hold: one with a lone surrogate."""
+
+    def render(self, content: object) -> bytes:
+        return json.dumps(content).encode()
+
+
 def tell_errors(app: FastAPI) -> None:
     """Makes the application answer errors of this package, and invalid requests."""
 
     @app.exception_handler(RequestValidationError)
-    async def _tell_defect(request: Request, err: RequestValidationError) -> JSONResponse:
+    async def _tell_defect(request: Request, err: RequestValidationError) -> _Refusal:
+        defects = [{name: each[name] for name in ("type", "loc", "msg")} for each in err.errors()]
         if not request.url.path.startswith("/v1/"):  # PyTupli's client expects this form
-            return await request_validation_exception_handler(request, err)
-        first = err.errors()[0]
-        where = ".".join(str(part) for part in first["loc"][1:])
-        detail = f"expected another request: {where or 'its body'}: {first['msg']}"
-        return JSONResponse({"detail": detail, "error": "StorageError"}, 400)
+            return _Refusal({"detail": defects}, 422)
+        where = ".".join(str(part) for part in defects[0]["loc"][1:])
+        detail = f"expected another request: {where or 'its body'}: {defects[0]['msg']}"
+        return _Refusal({"detail": detail, "error": "StorageError"}, 400)
 
     @app.exception_handler(HTTPException)
-    async def _tell_refusal(request: Request, err: HTTPException) -> JSONResponse:
+    async def _tell_refusal(request: Request, err: HTTPException) -> _Refusal:
         kind = "NotFoundError" if err.status_code in (404, 412) else "StorageError"
-        return JSONResponse({"detail": err.detail, "error": kind}, err.status_code, err.headers)
+        return _Refusal({"detail": err.detail, "error": kind}, err.status_code, err.headers)
 
     @app.exception_handler(TupliError)
-    def _tell(request: Request, err: TupliError) -> JSONResponse:
+    def _tell(request: Request, err: TupliError) -> _Refusal:
         status, text = told(err)
         headers = {"WWW-Authenticate": "Bearer"} if status == 401 else {}
         if isinstance(err, TooManyError):
             headers["Retry-After"] = str(math.ceil(err.seconds))
         kind = next(c.__name__ for c in type(err).__mro__ if c.__module__ == "tupli_mcap.errors")
-        return JSONResponse({"detail": text, "error": kind}, status, headers)
+        return _Refusal({"detail": text, "error": kind}, status, headers)

@@ -150,13 +150,18 @@ def _with_memberships(
 
 def hash_password(password: str, shortest: int) -> str:
     """The hash of a new password. Takes a while, for which others would wait in a writing transaction. StorageError if
-    the password has fewer than `shortest` characters, or too many."""
+    the password has fewer than `shortest` characters, or too many, or one that UTF-8 cannot hold."""
     if not isinstance(password, str) or not shortest <= len(password) <= _MOST_PASSWORD:
         found = f"{len(password)} characters" if isinstance(password, str) else "no text"
         raise StorageError(
             f"expected a password of {shortest} to {_MOST_PASSWORD} characters, found {found}; choose another"
         )
-    return _HASHES.hash(password)
+    try:
+        return _HASHES.hash(password)
+    except UnicodeEncodeError as err:
+        raise StorageError(
+            "expected a password in UTF-8, found a lone surrogate in it; choose another"
+        ) from err
 
 
 def _revoke(connection: Connection, name: str) -> None:
