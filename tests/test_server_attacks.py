@@ -32,6 +32,7 @@ import contextlib
 import html
 import itertools
 import json
+import logging
 import re
 import socket
 import statistics
@@ -59,7 +60,9 @@ from tupli_mcap import EpisodeWriter, Recording
 from tupli_mcap.recording import rewrite_recording
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.traffic import logs
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = [
@@ -496,6 +499,34 @@ def test_log_lines_and_terminals(tmp_path: Path) -> None:
     assert len([line for line in lines if line["event"] == "request"]) >= 8
     assert all(line.get("address", "127.0.0.1") == "127.0.0.1" and line.get("user") is None for line in lines)
     assert not set("\x1b\x9b\x07\u202e") & set(server.log_file.read_text())
+
+
+def test_a_failure_in_the_log_holds_nothing_of_the_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(connection: object, name: str, password: str) -> bool:
+        try:
+            raise ValueError(f"{name} {password}")
+        except ValueError as err:
+            err.add_note(password)
+            raise RuntimeError(password) from err
+
+    for logger in (logging.getLogger(), logs.LOG):
+        monkeypatch.setattr(logger, "handlers", logger.handlers)
+        monkeypatch.setattr(logger, "level", logger.level)
+    monkeypatch.setattr(accounts, "verify_password", broken)
+    with serving(Settings(tmp_path / "served")) as url:
+        logs.set_up()
+        told = {"username": "MYNAME", "password": "MYSECRET" + "A" * 100_000}
+        assert Person(url).call("POST", "/v1/tokens", told).status_code == 500
+    logging.captureWarnings(False)
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    (failed,) = [line for line in lines if line["event"] == "failed"]
+    assert "MYNAME" not in str(lines) and "MYSECRET" not in str(lines) and len(str(lines)) < 50_000
+    assert failed["route"] == "/v1/tokens"
+    trace = failed["exception"]
+    assert re.search(r"library\.py:\d+, in sign_in: .*\n.*test_server_attacks\.py:\d+, in broken", trace)
+    assert "builtins.ValueError\nwhich led to:\n" in trace and trace.endswith("builtins.RuntimeError")
 
 
 class TestPages:

@@ -176,9 +176,11 @@ def _as_json(value: Any) -> Any:
 
 def told(err: TupliError) -> tuple[int, str]:
     """The status and the message of an error. Failures of the server are logged."""
-    status = next((_STATUS[kind] for kind in type(err).__mro__ if kind in _STATUS), 500)
-    if status >= 500 and status != _STATUS[FullError]:
-        LOG.error("refused", extra={"status": status}, exc_info=err)
+    kind = next((kind for kind in type(err).__mro__ if kind in _STATUS), None)
+    status = 500 if kind is None else _STATUS[kind]
+    if status >= 500 and kind is not FullError:
+        why = {} if kind is None else {"error": str(err)}  # about the server; others may quote the request
+        LOG.error("refused", extra={"status": status, **why}, exc_info=err)
     return status, _FAILED.get(status, str(err))
 
 
