@@ -229,6 +229,36 @@ def test_users_groups_and_publication(pytupli: ModuleType, admin: Any, kept: Key
     admin.delete_user("ann")
 
 
+def test_who_deletes_again_what_they_have_deleted(pytupli: ModuleType, admin: Any, kept: Keyring) -> None:
+    """It is gone, for its owner; others are not told whether it was ever there."""
+    tokens = dict(kept.kept)
+    for name in ("ann", "bob"):
+        kept.kept = dict(tokens)
+        admin.signup(name, name)
+    admin.login("ann", "ann")
+    told = {"hash": "h", "serialized": '{"py/object": "x"}', "metadata": {"name": "cart"}}
+    benchmark = admin.store_benchmark(pytupli.BenchmarkQuery(**told))
+    artifact = admin.store_artifact(b"wind", pytupli.ArtifactMetadata(name="wind"))
+    row = pytupli.RLTuple(state=[0.0], action=1, reward=1.0, info={}, terminal=True, timeout=False)
+    episode = admin.record_episode(pytupli.Episode(benchmark_id=benchmark.id, metadata={}, tuples=[row]))
+    deleting = (
+        (admin.delete_episode, episode.id),
+        (admin.delete_artifact, artifact.id),
+        (admin.delete_benchmark, benchmark.id),
+    )
+    for delete, uri in deleting:
+        delete(uri)
+        delete(uri)
+        for unknown in ("%", "", uri[:5]):
+            with pytest.raises(pytupli.TupliStorageError, match="API request failed: 403"):
+                delete(unknown)
+    assert admin.list_episodes() == []
+    admin.login("bob", "bob")
+    for delete, uri in deleting:
+        with pytest.raises(pytupli.TupliStorageError, match="API request failed: 403"):
+            delete(uri)
+
+
 def test_an_expired_access_token_is_renewed(admin: Any, kept: Keyring) -> None:
     kept.kept["pytupli", "access_token"] = "expired"
     assert [user.username for user in admin.list_users()] == ["admin"]

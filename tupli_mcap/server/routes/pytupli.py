@@ -15,7 +15,7 @@ from fastapi import APIRouter, Body, Depends, File, Form, Request, Response
 from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import TypeAdapter, ValidationError
-from sqlalchemy import select
+from sqlalchemy import Select, select
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, NotFoundError
@@ -44,11 +44,11 @@ from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
-from tupli_mcap.server.tables import AUDIT
+from tupli_mcap.server.tables import AUDIT, CLAIM
 from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
-from tupli_mcap.storage.base import no_such
+from tupli_mcap.storage.base import is_episode_id, no_such
 from tupli_mcap.storage.catalog.order import After
-from tupli_mcap.storage.texts import first_defect
+from tupli_mcap.storage.texts import escape_text, first_defect
 
 router = APIRouter(tags=["PyTupli's routes"])
 _DENIED = "You do not have sufficient permissions for this operation."
@@ -87,15 +87,19 @@ def _hidden(caller: Caller, text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deleting(library: Library, caller: Caller, kind: str, uri: str) -> Iterator[None]:
-    """Deleting a missing item is no error for an admin, nor for the user who deleted it. All others get DeniedError."""
+    """Deleting a missing item is no error for an admin, nor for the user who deleted it, or who has stored the recording
+    of an episode. All others get DeniedError."""
     try:
         yield
     except NotFoundError:
-        done = select(AUDIT.c.number).where(
+        done: Select[Any] = select(AUDIT.c.number).where(
             AUDIT.c.user == caller.name,
-            AUDIT.c.action.startswith(f"delete_{kind}"),
-            AUDIT.c.target.contains(uri),
+            AUDIT.c.action == f"delete_{kind}",
+            AUDIT.c.target.startswith(f"{escape_text(uri)} of ", autoescape=True),
         )
+        if is_episode_id(uri):
+            uuid = uri.rpartition("-")[0]
+            done = select(CLAIM.c.rank).where(CLAIM.c.uuid == uuid, CLAIM.c.created_by == caller.name)
         with library.database.reading() as connection:
             known = connection.execute(done.limit(1)).first()
         if known is None and not caller.may(Right.ROLE_MANAGEMENT):
