@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -257,6 +258,24 @@ def test_who_deletes_again_what_they_have_deleted(pytupli: ModuleType, admin: An
     for delete, uri in deleting:
         with pytest.raises(pytupli.TupliStorageError, match="API request failed: 403"):
             delete(uri)
+
+
+NO_FILTERS = ({"type": "EQ"}, {"type": "EQ", "value": 3}, {"type": "XX"}, {"type": "EQ", "key": None, "value": None},
+    {"type": "EQ", "key": "id"}, {"type": "GT", "key": "n_tuples", "value": None}, {"type": "NOT"}, {"filters": 3},
+    {"type": "OR", "filters": [{"type": "EQ"}]}, {"filters": [3]}, {"key": "id", "value": "x"})  # fmt: skip
+
+
+def test_a_filter_that_is_none_selects_nothing(pytupli: ModuleType, admin: Any, url: str) -> None:
+    told = {"hash": "h", "serialized": '{"py/object": "x"}', "metadata": {"name": "cart"}}
+    kept = admin.store_benchmark(pytupli.BenchmarkQuery(**told))
+    for everything in (None, pytupli.FilterAND(filters=[]), pytupli.FilterOR(filters=[])):
+        assert [item.id for item in admin.list_benchmarks(everything)] == [kept.id]
+        assert admin.list_episodes(everything) == admin.list_artifacts(everything) == []
+    for kind, no_filter in itertools.product(("benchmarks", "artifacts", "episodes"), NO_FILTERS):
+        answer = httpx.post(f"{url}/{kind}/list", json=no_filter)
+        assert (answer.status_code, answer.json()["error"]) == (400, "FilterError"), (no_filter, answer.text)
+    for kind in ("benchmarks", "artifacts", "episodes"):
+        assert httpx.post(f"{url}/{kind}/list").json() == []  # of a guest, and without a body
 
 
 def test_an_expired_access_token_is_renewed(admin: Any, kept: Keyring) -> None:

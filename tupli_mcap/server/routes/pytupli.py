@@ -413,18 +413,18 @@ def delete_episode(library: Served, caller: Changing, episode_id: str) -> None:
 
 
 def _filter(told: dict[str, Any] | None) -> BaseFilter | None:
-    """A filter of PyTupli's: without parts it is true of everything, and fields that it does not know do not count."""
-    if not told or (told.get("key") is None and not told.get("filters")):
-        return None
+    """A filter of PyTupli's: a combination without parts is true of everything, and fields that it does not know do not
+    count."""
     try:
-        return _FILTER.validate_python(_known(told, 0))
+        found = _FILTER.validate_python(_known(told or {}, 0))
     except ValidationError as err:
         raise FilterError(f"expected a filter: {first_defect(err)}") from err
+    return None if found.key is None and not found.filters else found
 
 
 def _known(told: Any, depth: int) -> dict[str, Any]:
-    if not isinstance(told, dict) or depth > 32:
-        raise FilterError("expected a filter: an object with type, and key and value, or filters")
-    parts = told.get("filters") or []
-    found = {"type": told.get("type", "OR"), "filters": [_known(part, depth + 1) for part in parts]}
-    return found if told.get("key") is None else {**found, "key": told["key"], "value": told.get("value")}
+    parts = (told.get("filters") or []) if isinstance(told, dict) else None
+    if not isinstance(parts, list) or depth > 32:
+        raise FilterError("expected a filter: an object with type, and key and value, or a list of filters")
+    compared = {name: told[name] for name in ("key", "value") if told.get(name) is not None}
+    return {"type": told.get("type", "OR"), "filters": [_known(part, depth + 1) for part in parts], **compared}
