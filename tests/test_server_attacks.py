@@ -54,7 +54,7 @@ from gymnasium import spaces
 from pages import EVIL, robot
 from persons import Person, announced, cart_benchmark
 from served import served
-from serving import ENGINES, REAL_HASHES, serving, settings_of
+from serving import ENGINES, PASSWORD, REAL_HASHES, serving, settings_of
 
 from tupli_mcap import EpisodeWriter, Recording
 from tupli_mcap.recording import rewrite_recording
@@ -242,6 +242,38 @@ class TestRights:
         people(mia, "new")
         mia.ask("PUT", "/v1/users/new/password", {"password": "other password"})
         mia.ask("DELETE", "/v1/users/new")
+
+    def test_the_last_admin_stays(self, tmp_path: Path) -> None:
+        """On every way, until there is another one."""
+        with serving(Settings(tmp_path / "served")) as url:
+            admin = Person(url, "admin")
+            people(admin, "zoe")
+            told = {"group_name": "global", "members": [{"user": "admin"}]}
+            ways = (
+                ("DELETE", "/v1/users/admin", None),
+                ("DELETE", "/access/users/delete?username=admin", None),
+                ("DELETE", "/v1/groups/global/members/admin", None),
+                ("POST", "/access/groups/remove-members", told),
+            )
+            for way in ways:
+                refused = admin.call(*way)
+                assert refused.status_code == 403 and "the only admin" in refused.json()["detail"], way
+            with httpx.Client(base_url=url, headers={"Accept": "text/html"}) as client:
+                client.post("/sign-in", data={"username": "admin", "password": PASSWORD})
+                found = re.search('name="code" value="([0-9a-f]+)"', client.get("/account").text)
+                assert found is not None
+                for path, sent in (
+                    ("/users/delete", {"username": "admin"}),
+                    ("/group/members/delete", {"name": "global", "user": "admin"}),
+                ):
+                    page = client.post(path, data={"code": found[1], **sent})
+                    assert page.status_code == 403 and "the only admin" in page.text
+            assert admin.ask("GET", "/v1/me")["memberships"]["global"][-1] == "admin"
+            admin.ask("PUT", "/v1/groups/global/members", [{"user": "zoe", "roles": ["admin"]}])
+            admin.ask(*ways[2])
+            zoe = Person(url, "zoe")
+            zoe.ask(*ways[0])
+            assert zoe.call("DELETE", "/v1/users/zoe").status_code == 403
 
     def test_who_manages_groups_does_not_lock_the_admin_out(self, lab: Lab, managers: Any) -> None:
         _, gus = managers

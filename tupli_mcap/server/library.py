@@ -356,7 +356,7 @@ class Library:
 
     def delete_user(self, caller: Caller, name: str) -> None:
         """Deletes a user, and what only they could see; nothing happens if there is no such user. DeniedError if it is
-        another user, and the caller lacks the right to delete users, or a right of theirs."""
+        another user, and the caller lacks the right to delete users, or a right of theirs, and for the only admin."""
         caller.demand(Right.USER_DELETE, name)
         with self.database.writing() as connection:
             accounts.demand_over(connection, caller, name)

@@ -22,6 +22,8 @@ from tupli_mcap.storage.texts import escape_text
 _Item = TypeVar("_Item", bound=DBItem)
 GLOBAL: Final = "global"
 """The group of all signed-in users."""
+ADMIN: Final = "admin"
+"""The role that has all rights."""
 GUEST: Final = "$$GUEST$$"
 """The name of a caller who is not signed in; no user can have it."""
 
@@ -44,7 +46,7 @@ _USERS: Final = frozenset({Right.USER_CREATE, Right.USER_READ, Right.USER_UPDATE
 _GROUPS: Final = frozenset({Right.GROUP_CREATE, Right.GROUP_READ, Right.GROUP_UPDATE, Right.GROUP_DELETE})
 
 DEFAULT_ROLES: Final[Mapping[str, frozenset[Right]]] = {
-    "admin": frozenset(Right),
+    ADMIN: frozenset(Right),
     "content_admin": _content("create", "read", "delete"),
     "user_admin": _USERS,
     "group_admin": _GROUPS | {Right.USER_READ},

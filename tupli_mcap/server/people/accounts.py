@@ -16,7 +16,7 @@ from sqlalchemy import Connection, Select, delete, insert, select, update
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audit, demand_few
-from tupli_mcap.server.people.access import DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
+from tupli_mcap.server.people.access import ADMIN, DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
 from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
 
 # The minimum that OWASP recommends: a sign-in takes 19 MiB, and one core.
@@ -87,7 +87,8 @@ def change_password(connection: Connection, name: str, hashed: str) -> None:
 
 def delete_user(connection: Connection, name: str) -> bool:
     """Deletes a user with all tokens and memberships; returns whether there was one. The name cannot be used again:
-    another user of this name would own what this user stored."""
+    another user of this name would own what this user stored. DeniedError for the only admin."""
+    _demand_other_admin(connection, name)
     gone = connection.execute(delete(USER).where(USER.c.name == name)).rowcount
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.user == name))
     _revoke(connection, name)
@@ -101,6 +102,15 @@ def demand_over(connection: Connection, caller: Caller, name: str) -> None:
     if other is not None and name != caller.name:
         for right in sorted(other.rights[GLOBAL]):
             caller.demand(right)
+
+
+def _demand_other_admin(connection: Connection, name: str) -> None:
+    """Raises DeniedError if a user is the only admin: without one, nobody could make another."""
+    admins = select(MEMBERSHIP.c.user).where(MEMBERSHIP.c.team == GLOBAL, MEMBERSHIP.c.role == ADMIN)
+    if connection.execute(admins).scalars().all() == [name]:
+        raise DeniedError(
+            f"{name} is the only admin of this server; first give another user the role {ADMIN} in the group {GLOBAL}"
+        )
 
 
 def list_users(connection: Connection, caller: Caller) -> dict[str, dict[str, list[str]]]:
@@ -281,13 +291,15 @@ def _demand_few(found: int) -> None:
 
 
 def remove_members(connection: Connection, caller: Caller, group: str, users: Sequence[str]) -> None:
-    """Takes users out of a group; nothing happens to those who are not in it. Raises as `add_members` does."""
+    """Takes users out of a group; nothing happens to those who are not in it. Raises as `add_members` does, and
+    DeniedError for the only admin, in `global`."""
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
     _demand_few(len(users))
     for user in users:
         if group == GLOBAL:
             demand_over(connection, caller, user)
+            _demand_other_admin(connection, user)
         gone = delete(MEMBERSHIP).where(MEMBERSHIP.c.team == group, MEMBERSHIP.c.user == user)
         connection.execute(gone)
         audit(connection, caller.name, "remove_member", f"{group}: {user}")

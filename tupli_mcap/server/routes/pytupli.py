@@ -427,4 +427,8 @@ def _known(told: Any, depth: int) -> dict[str, Any]:
     if not isinstance(parts, list) or depth > 32:
         raise FilterError("expected a filter: an object with type, and key and value, or a list of filters")
     compared = {name: told[name] for name in ("key", "value") if told.get(name) is not None}
-    return {"type": told.get("type", "OR"), "filters": [_known(part, depth + 1) for part in parts], **compared}
+    return {
+        "type": told.get("type", "OR"),
+        "filters": [_known(part, depth + 1) for part in parts],
+        **compared,
+    }
