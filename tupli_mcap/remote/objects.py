@@ -66,6 +66,7 @@ class RemoteObject(Protocol):
         ...
 
 
+_no_suffixes: set[str] = set()  # the servers that have refused a range of last bytes
 _process: int | None = None  # the process that has read from servers
 
 
@@ -180,13 +181,19 @@ class _StoredObject:
     def tail(self, length: int) -> End:
         from obstore.exceptions import NotSupportedError
 
+        server = urlsplit(self._url).netloc
+        if server in _no_suffixes:
+            return self._tail_by_size(length)
         try:
             found = self._ask({"range": {"suffix": length}})
         except (RefusedError, NotSupportedError, RecordingError) as err:
             # Servers that know no suffixes fail, or say that there is no such file, or that it may not be read.
             if isinstance(err, BrokenOffError) and not isinstance(err, FailedError):
                 raise
-            return self._tail_by_size(length)
+            end = self._tail_by_size(length)
+            if end.size:  # of an empty object, every range is refused
+                _no_suffixes.add(server)
+            return end
         return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
     def _tail_by_size(self, length: int) -> End:
