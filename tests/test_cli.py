@@ -791,7 +791,9 @@ class TestLook:
     def test_ls_takes_the_other_names_of_columns(self, cartpole: Path, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "short.mcap", "--steps", 5)
         for key, other in (("steps", "n_tuples"), ("return", "episode_return")):
-            listed = run("ls", cartpole, "short.mcap", "--columns", other, "--sort", f"-{other}", "--json").json
+            listed = run(
+                "ls", cartpole, "short.mcap", "--columns", other, "--sort", f"-{other}", "--json"
+            ).json
             named = run("ls", cartpole, "short.mcap", "--columns", key, "--sort", f"-{key}", "--json").json
             assert [row[other] for row in listed] == [row[key] for row in named]
 

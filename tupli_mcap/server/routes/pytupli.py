@@ -87,8 +87,8 @@ def _hidden(caller: Caller, text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deleting(library: Library, caller: Caller, kind: str, uri: str) -> Iterator[None]:
-    """Deleting a missing item is no error for an admin, nor for the user who deleted it, or who has stored the recording
-    of an episode. All others get DeniedError."""
+    """Deleting a missing item is no error for an admin, nor for the user who deleted it, or who has stored the
+    recording of an episode. All others get DeniedError."""
     try:
         yield
     except NotFoundError:
