@@ -11,6 +11,7 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 from between import Between
+from served import COMMAND
 from waiting import wait_for
 
 from tupli_mcap import TupliEnvWrapper, files
@@ -230,6 +231,19 @@ def test_a_program_that_ends_while_the_server_is_away_says_what_waits(
     assert "Traceback" not in errors
     proxy.come_back()
     assert waiting(admin) == 1
+
+
+def test_a_command_that_ends_while_the_server_is_away_says_what_waits_in_one_line(
+    proxy: Between, admin: TupliAPIClient
+) -> None:
+    kill(records(proxy.url))
+    proxy.go_away()
+    done = subprocess.run(
+        [COMMAND, "list-tokens", "--url", proxy.url], stderr=subprocess.PIPE, text=True, check=False
+    )
+    error, warning = done.stderr.splitlines()
+    assert done.returncode == 1 and error.startswith("error: ") and "does not answer" in error
+    assert warning.startswith("warning: what was recorded waits in ")
 
 
 def test_damaged_recordings_are_saved_as_far_as_they_can_be(proxy: Between, admin: TupliAPIClient) -> None:

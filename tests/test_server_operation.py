@@ -110,3 +110,4 @@ def test_an_address_that_is_taken(tmp_path: Path) -> None:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert f"error: cannot listen at 127.0.0.1, port {server.port}: Address already in use" in done.stderr
+    assert done.stderr.endswith("; choose another address or port\n") and done.stderr.count("choose") == 1

@@ -6,6 +6,7 @@ are imported here; each command imports what it calls, so that help and completi
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -394,6 +395,9 @@ def main() -> None:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the shell (`>&-`)
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123 - open until the end
+    shown = contextlib.ExitStack()
+    shown.enter_context(warnings_in_one_line())
+    atexit.register(shown.close)  # after what is sent at exit, which may warn
     try:
         app()
     except KeyboardInterrupt:  # before a command began

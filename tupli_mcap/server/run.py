@@ -15,7 +15,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.supervisors import Multiprocess
 
-from tupli_mcap.errors import StorageError, os_reason
+from tupli_mcap.errors import StorageError
 from tupli_mcap.server.app import create_app
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
@@ -109,5 +109,6 @@ def _bound(listening: Listening) -> socket.socket:
         return socket.create_server((listening.host, listening.port), family=family, backlog=2048)
     except OSError as err:
         raise StorageError(
-            f"cannot listen at {listening.host}, port {listening.port}: {os_reason(err)}; choose another one"
+            f"cannot listen at {listening.host}, port {listening.port}: {err.strerror or err}; "
+            "choose another address or port"
         ) from err
