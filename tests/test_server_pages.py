@@ -97,6 +97,16 @@ def episodes_of(client: httpx.Client, **params: Any) -> list[dict[str, Any]]:
     return found
 
 
+def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:
+    for path in ("/nope", "/episodes/nope"):
+        page = httpx.get(server + path, headers={"Accept": "text/html"})
+        assert page.status_code == 404 and "<h1>Not here</h1>" in page.text, page.text
+        told = httpx.get(server + path, params={"format": "json"})
+        assert (told.status_code, told.json()) == (404, {"error": "Not Found"})
+    for path in ("/nope", "/v1/nope"):  # of a program
+        assert httpx.get(server + path).json() == {"detail": "Not Found", "error": "NotFoundError"}
+
+
 class TestSigningIn:
     def test_who_is_not_signed_in_is_sent_there_and_back(self, server: str) -> None:
         with browser(server) as guest:

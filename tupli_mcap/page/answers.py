@@ -99,7 +99,7 @@ def page(
     **drawn: Any,
 ) -> Response:
     """A page: `facts` as JSON if the query has `format=json`, else the template filled with `facts` and `drawn`."""
-    if request.query_params.get("format") == "json":
+    if _wants_json(request):
         return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
     drawn |= {"request": request, "shelf": shelf, "facts": facts}
     drawn |= {"here": request.url.path, "params": request.query_params}
@@ -141,10 +141,19 @@ def _templates() -> Environment:
     return made
 
 
+def _wants_json(request: Request) -> bool:
+    return request.query_params.get("format") == "json"
+
+
+def wants_page(request: Request) -> bool:
+    """Whether a request, perhaps of no route, is for a page: from a browser, or for the JSON of a page."""
+    return _wants_json(request) or "text/html" in request.headers.get("accept", "")
+
+
 def error_page(request: Request, err: Exception) -> Response:
     """The page for an error; for `SignInNeededError`, a redirection to the sign-in page. `request.state.shelf` is the
     shelf, once it is known."""
-    as_json = request.query_params.get("format") == "json"
+    as_json = _wants_json(request)
     if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
         here = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return _with_headers(RedirectResponse(address("sign-in", next=here), 303))

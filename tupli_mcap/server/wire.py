@@ -25,6 +25,7 @@ from tupli_mcap.errors import (
     StorageError,
     TupliError,
 )
+from tupli_mcap.page.answers import error_page, wants_page
 from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import ArtifactMetadata, BaseFilter
 from tupli_mcap.server.blobs import LostError
@@ -204,7 +205,9 @@ def tell_errors(app: FastAPI) -> None:
         return _Refusal({"detail": detail, "error": "StorageError"}, 400)
 
     @app.exception_handler(HTTPException)
-    async def _tell_refusal(request: Request, err: HTTPException) -> _Refusal:
+    async def _tell_refusal(request: Request, err: HTTPException) -> Response:
+        if not request.url.path.startswith("/v1/") and wants_page(request):
+            return error_page(request, err)
         kind = "NotFoundError" if err.status_code in (404, 412) else "StorageError"
         return _Refusal({"detail": err.detail, "error": kind}, err.status_code, err.headers)
 
