@@ -206,6 +206,14 @@ def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:
         assert np.array_equal(recording.read().states, Recording(large).read().states)
 
 
+def test_a_folder_of_a_bucket(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "ENDPOINT": server.url("")}.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    for folder in ("s3://lab/runs", "s3://lab/runs/"):
+        with pytest.raises(RecordingError, match=rf"{folder} does not exist.*, give s3://lab/runs/\*\.mcap$"):
+            Recording(folder)
+
+
 def test_azure_which_has_no_suffixes(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"ACCOUNT_NAME": "lab", "ACCOUNT_KEY": "c2VjcmV0", "ENDPOINT": server.url("")}.items():
         monkeypatch.setenv(f"AZURE_STORAGE_{name}", value)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote.names import shown
+from tupli_mcap.remote.names import is_web, shown
 
 SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
 AUTHORITY: Final = "put the certificate of an authority of your own (PEM) into SSL_CERT_FILE"
@@ -54,7 +54,7 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
     except told.PreconditionError as err:
         raise RefusedError from err
     except (told.NotFoundError, FileNotFoundError):
-        raise RecordingError(f"{shown(url)} does not exist; check the address") from None
+        raise missing(url) from None
     except (told.PermissionDeniedError, told.UnauthenticatedError):
         raise RecordingError(
             f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
@@ -76,6 +76,14 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
             ) from None
         failed = FailedError if _STATUS.search(said) else BrokenOffError
         raise failed(f"{shown(url)} cannot be read: {why(str(err))}") from None
+
+
+def missing(url: str) -> RecordingError:
+    """The error for a URL of no file. In a bucket, it may be that of a folder."""
+    advice = "check the address"
+    if not is_web(url) and not url.endswith(".mcap"):
+        advice += f"; for the recordings in a folder, give {shown(url).rstrip('/')}/*.mcap"
+    return RecordingError(f"{shown(url)} does not exist; {advice}")
 
 
 def why(told: str) -> str:

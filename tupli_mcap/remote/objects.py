@@ -13,7 +13,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import RecordingError, missing_extra
-from tupli_mcap.remote.failures import SECONDS_VARIABLE, BrokenOffError, FailedError, RefusedError, asked
+from tupli_mcap.remote.failures import (
+    SECONDS_VARIABLE,
+    BrokenOffError,
+    FailedError,
+    RefusedError,
+    asked,
+    missing,
+)
 from tupli_mcap.remote.names import is_web, shown
 
 _T = TypeVar("_T")
@@ -325,6 +332,6 @@ class _FsspecObject:
         try:
             return ask()
         except FileNotFoundError:
-            raise RecordingError(f"{shown(self._url)} does not exist; check the address") from None
+            raise missing(self._url) from None
         except Exception as err:  # noqa: BLE001 - each of its file systems raises errors of its own
             raise RecordingError(f"{shown(self._url)} cannot be read: {shown(str(err)):.300}") from None
