@@ -20,6 +20,7 @@ import pytest
 from command_line import run
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
+from matplotlib.colors import to_hex
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -44,6 +45,7 @@ from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
 from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
+from tupli_mcap.plots.style import BLUE
 from tupli_mcap.recording import edit_run
 from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.recording.describe.series import sketch
@@ -751,6 +753,17 @@ def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
     assert mean.get_xdata()[-1] == 120  # the steps of the shortest
     assert mean.get_ydata()[-1] == pytest.approx(np.mean([4, 14 / 3, 16 / 3]))
     check_formats(made, tmp_path, page=False)
+
+
+def test_histograms_of_a_group_have_its_colour(tmp_path: Path) -> None:
+    for seed in range(3):
+        scored(tmp_path / f"{seed}.mcap", [2 + seed, 4, 6], seed=seed, name=f"dqn-seed{seed}")
+    made = report(tmp_path)
+    assert len(made.groups) == 1
+    for title in ("return", "length (steps)"):
+        (axes,) = [axes for axes in made.figure.axes if axes.get_xlabel() == title]
+        assert {to_hex(patch.get_facecolor()).upper() for patch in axes.patches} == {BLUE}
+        assert panel(made, title).lines[-1].get_color() == BLUE
 
 
 @pytest.mark.parametrize(

@@ -71,10 +71,14 @@ def _window(count: int) -> int:
     return max(1, min(_MOST_WINDOW, count // 10))
 
 
+def _filled_runs(groups: Sequence[Group]) -> list[PlottedRun]:
+    """The runs that have episodes. The marks of a single one say how its episodes ended; else colours say the group."""
+    return [run for group in groups for run in group.runs if len(run.rows)]
+
+
 def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axes: Any) -> None:
     axes.set_title(cut(title, 60))
-    runs = [run for group in groups for run in group.runs if len(run.rows)]
-    label = axis.label
+    runs, label = _filled_runs(groups), axis.label
     if len(runs) == 1:
         _draw_one(*axis.course(runs[0], name), name, axes)
     else:
@@ -153,7 +157,7 @@ def _draw_distribution(groups: Sequence[Group], column: str, name: str, axes: An
     columns = [group.numbers(column) for group in groups]
     pooled = np.concatenate(columns)
     edges, beyond = bin_edges(pooled, _BINS)
-    if len(groups) == 1:
+    if len(_filled_runs(groups)) == 1:
         axes.set_ylabel("episodes", color=style.GREY)
         axes.locator_params(axis="y", integer=True)
         finite = np.isfinite(pooled)
