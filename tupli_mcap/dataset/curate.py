@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.sources import DatasetError, Source
+from tupli_mcap.dataset.sources import DatasetError, Episodes, Source
 from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.container import Container
@@ -37,7 +37,6 @@ from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.storage import FileStorage, TupliStorage
 
 
@@ -138,7 +137,7 @@ def recover_recording(
 
 
 def filter_dataset(
-    dataset: Dataset,
+    dataset: Episodes,
     target: str | os.PathLike[str],
     filter: BaseFilter | str,
     *,
@@ -166,7 +165,7 @@ def filter_dataset(
 
 
 def trim(
-    dataset: Dataset, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
+    dataset: Episodes, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
 ) -> Path:
     """See `Dataset.trim`."""
     _check_new(dataset, target, overwrite=overwrite)
@@ -180,7 +179,7 @@ def trim(
 
 
 def trim_dataset(
-    dataset: Dataset,
+    dataset: Episodes,
     steps: slice,
     chosen: Collection[str],
     target: str | os.PathLike[str],
@@ -213,7 +212,7 @@ def trim_dataset(
     return report._replace(size=_save_trimmed(dataset, kept, target).stat().st_size)
 
 
-def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
+def _save_trimmed(dataset: Episodes, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
     """Writes the episodes of a dataset; `kept`: by recording and number, the steps that stay."""
     excerpts = _excerpts(dataset)
     if len(excerpts) == 1:
@@ -230,7 +229,7 @@ def _save_trimmed(dataset: Dataset, kept: Mapping[str, Mapping[int, slice]], tar
     return target
 
 
-def _excerpts(dataset: Dataset) -> list[Excerpt]:
+def _excerpts(dataset: Episodes) -> list[Excerpt]:
     """The episodes of a dataset, by recording. NotFoundError if a recording has not all of them any more."""
     found = []
     for name, headers in by_recording(dataset.headers).items():
@@ -249,7 +248,7 @@ def file_path(place: str | os.PathLike[str]) -> Path:
     return Path(place)
 
 
-def _check_new(dataset: Dataset, target: Path, *, overwrite: bool) -> None:
+def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
     """Raises DatasetError if there is no episode, one occurs twice, or the target exists: one of the sources, or not to
     be replaced."""
     if not dataset._chosen:
@@ -269,7 +268,7 @@ def _check_new(dataset: Dataset, target: Path, *, overwrite: bool) -> None:
         raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
 
 
-def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:
+def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:
     """See `Dataset.save`. `query`: the text of the dataset's filter, if the user gave one."""
     target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
@@ -290,7 +289,7 @@ def save(dataset: Dataset, place: str | os.PathLike[str], *, overwrite: bool, qu
 
 
 def relabel(
-    dataset: Dataset,
+    dataset: Episodes,
     function: Callable[[Episode], Any],
     target: Path,
     fields: Sequence[str],

@@ -401,7 +401,7 @@ class Dataset(RandomAccess):
         """
         names = field_names(fields, STATISTICAL, DatasetError)
         if missing := [name for name in names if name not in self._stats]:
-            self._stats |= statistics_of(self, missing)
+            self._stats |= statistics_of(self.steps, missing)
         return {leaf: found for name in names for leaf, found in self._stats[name].items()}
 
     # ---- out

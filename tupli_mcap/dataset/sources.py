@@ -8,16 +8,17 @@ import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.remote import is_url, matching, shown_name
 from tupli_mcap.schema import (
     BaseFilter,
@@ -68,6 +69,30 @@ class Source(Protocol):
         """The storage that changes the recording that a header names, and the name that the storage has for it.
         RecordingError if nothing can change it."""
         ...
+
+
+class Episodes(Protocol):
+    """What the modules that `Dataset` uses ask of it, where it is documented."""
+
+    _filter: BaseFilter | None
+
+    @property
+    def headers(self) -> Sequence[EpisodeHeader]: ...
+    @property
+    def n_steps(self) -> int: ...
+    @property
+    def lengths(self) -> Array: ...
+    @property
+    def returns(self) -> Array: ...
+    @property
+    def example(self) -> Recording | None: ...
+    @property
+    def _chosen(self) -> Mapping[str, Sequence[int]]: ...
+    def _open(self, name: str) -> Recording: ...
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[Episode]: ...
+    def filter(self, test: BaseFilter | str) -> Self: ...
+    def read(self, fields: Sequence[str]) -> Columns: ...
 
 
 class StorageSource:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple, overload
+from typing import NamedTuple, overload
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -24,9 +24,6 @@ from tupli_mcap.messages.topics import Topics, camera_names
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.recording.contents import Contents
 
-if TYPE_CHECKING:
-    from tupli_mcap.recording.recording import Recording
-
 _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
 
@@ -45,7 +42,7 @@ class Cameras:
 
     def __init__(self, contents: Contents, store: ChunkStore, vector: bool, num_envs: int, name: str) -> None:
         self._store = store
-        self._where = name
+        self.where = name
         topics = {channel.topic: channel for channel in contents.channels.values()}
         self.names = camera_names(topics)
         self._channels: dict[tuple[str, int], tuple[int, int]] = {}
@@ -59,11 +56,11 @@ class Cameras:
 
     def _checked(self, channel: Channel | None, topic: str, schemas: dict[int, Schema], kind: int) -> int:
         if channel is None:
-            raise FormatError(f"{self._where}: expected a channel {topic}, found none")
+            raise FormatError(f"{self.where}: expected a channel {topic}, found none")
         schema = schemas.get(channel.schema_id)
         name, text = _SHAPES[kind]
         if schema is None or (schema.name, schema.data) != (name, text.encode()):
-            raise FormatError(f"{self._where}: the schema of {topic} is not {name}")
+            raise FormatError(f"{self.where}: the schema of {topic} is not {name}")
         return channel.id
 
     def channels(self, camera: str, env: int) -> tuple[int, int]:
@@ -72,7 +69,7 @@ class Cameras:
         if (camera, env) not in self._channels:
             known = ", ".join(self.names) or "none: `tupli-mcap render` makes frames of a recording"
             raise RecordingError(
-                f"{self._where}: expected one of its cameras, found {camera!r:.60}; it has {known}"
+                f"{self.where}: expected one of its cameras, found {camera!r:.60}; it has {known}"
             )
         return self._channels[camera, env]
 
@@ -90,7 +87,7 @@ class Cameras:
         (body,) = self._store.bodies(channel, row, 1)
         frame, frame_id = decode_frame(body)
         if frame_id != camera:
-            raise FormatError(f"{self._where}: expected a frame of camera {camera!r}, found {frame_id!r:.60}")
+            raise FormatError(f"{self.where}: expected a frame of camera {camera!r}, found {frame_id!r:.60}")
         return frame
 
     def _table(self, camera: str, env: int) -> _Table:
@@ -119,9 +116,9 @@ class Frames(Sequence[Picture]):
     """
 
     def __init__(
-        self, recording: Recording, camera: str, env: int, rows: Array, steps: Array, times: Array
+        self, cameras: Cameras, camera: str, env: int, rows: Array, steps: Array, times: Array
     ) -> None:
-        self._recording = recording
+        self._cameras = cameras
         self._env = env
         self._rows = rows
         self.camera = camera
@@ -144,15 +141,15 @@ class Frames(Sequence[Picture]):
         """
         if isinstance(i, slice):
             parts = (self._rows[i], self.steps[i], self.times[i])
-            return Frames(self._recording, self.camera, self._env, *parts)
+            return Frames(self._cameras, self.camera, self._env, *parts)
         data = self.encoded(i).data
-        return decode_picture(data, f"{self._recording.name}: frame of step {self.steps[i]}")
+        return decode_picture(data, f"{self._cameras.where}: frame of step {self.steps[i]}")
 
     def encoded(self, i: int) -> EncodedFrame:
         """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
         if not -len(self) <= i < len(self):
             raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")
-        return self._recording.file.cameras.frame(self.camera, self._env, int(self._rows[i]))
+        return self._cameras.frame(self.camera, self._env, int(self._rows[i]))
 
     def of_step(self, step: int) -> Picture:
         """The frame of the state after `step` steps; raises RecordingError if it was not recorded."""
@@ -164,7 +161,7 @@ class Frames(Sequence[Picture]):
                 if told
                 else "it has none: record with frames=True, or tupli-mcap render makes them"
             )
-            raise RecordingError(f"{self._recording.name}: the episode has no frame of step {step}; {has}")
+            raise RecordingError(f"{self._cameras.where}: the episode has no frame of step {step}; {has}")
         return self[int(found[0])]
 
     def __repr__(self) -> str:

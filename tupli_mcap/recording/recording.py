@@ -74,6 +74,10 @@ class Recording(DescribedRecording, DatasetVerbs):
     def __iter__(self) -> Iterator[Episode]:
         return iter(self.episodes)
 
+    def __add__(self, other: Recording | Dataset) -> Dataset:
+        """The episodes of both, those of this recording first."""
+        return self.dataset + other
+
     def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
         """Gives episodes (their numbers; None: all) metadata that take precedence over the recorded ones.
 
@@ -226,9 +230,9 @@ class Recording(DescribedRecording, DatasetVerbs):
             camera = "render" if "render" in self.cameras or not self.cameras else self.cameras[0]
             if not self.cameras:
                 none = np.empty(0, np.int64)
-                return Frames(self, camera, env, none, none, none)
+                return Frames(self._cameras, camera, env, none, none, none)
         rows = self._cameras.rows(camera, env, int(row["episode"]), int(row["length"]))
-        return Frames(self, camera, env, *rows)
+        return Frames(self._cameras, camera, env, *rows)
 
     # ---- columns
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.dataset import Test
     from tupli_mcap.dataset.items import Transitions, Windows
     from tupli_mcap.recording.episode import Episode
-    from tupli_mcap.recording.recording import Recording
 
 
 class DatasetVerbs(SaysWhatIsMeant):
@@ -107,7 +106,3 @@ class DatasetVerbs(SaysWhatIsMeant):
     ) -> Path:
         """Writes the episodes to a new recording, each with only some consecutive steps."""
         return self.dataset.trim(steps, target, overwrite=overwrite)
-
-    def __add__(self, other: Recording | Dataset) -> Dataset:
-        """The episodes of both, those of this recording first."""
-        return self.dataset + other

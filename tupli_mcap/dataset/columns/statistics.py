@@ -5,18 +5,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import ElementStatistics
-
-if TYPE_CHECKING:
-    from tupli_mcap.dataset.dataset import Dataset
 
 STATISTICAL = ("states", "actions", "rewards", "next_states")
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
@@ -52,9 +49,8 @@ def _brief(values: Array) -> str:
     return " ".join(text.split())
 
 
-def statistics_of(dataset: Dataset, fields: Sequence[str]) -> dict[str, dict[str, FieldStatistics]]:
+def statistics_of(steps: Steps, fields: Sequence[str]) -> dict[str, dict[str, FieldStatistics]]:
     """The statistics of each leaf, by field. See `Dataset.stats`."""
-    steps = dataset.steps
     if steps.layout is None or not len(steps):
         raise DatasetError("expected steps to take statistics of, found none")
     steps.read(

@@ -12,7 +12,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.columns.load import steps_within
-from tupli_mcap.dataset.sources import DatasetError
+from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.spaces.labels import common_labels, distinct, element_names, short_path
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from tupli_mcap.dataset.dataset import Dataset
     from tupli_mcap.messages.step import StepLayout
     from tupli_mcap.spaces.labels import Labels
 
@@ -30,12 +29,12 @@ _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is
 _REAL = (int, float, np.integer, np.floating)
 
 
-def dataframe(dataset: Dataset, level: Level) -> pd.DataFrame:
+def dataframe(dataset: Episodes, level: Level) -> pd.DataFrame:
     """See `Dataset.to_pandas`."""
     return import_pandas().DataFrame(_columns(dataset, level))
 
 
-def _columns(dataset: Dataset, level: Level) -> dict[str, Any]:
+def _columns(dataset: Episodes, level: Level) -> dict[str, Any]:
     """Columns that pandas takes; lists and masked arrays say what is missing, where a DataFrame has NaN."""
     pandas = import_pandas()
     if level == "episodes":
@@ -45,7 +44,7 @@ def _columns(dataset: Dataset, level: Level) -> dict[str, Any]:
     return _step_columns(dataset, pandas)
 
 
-def arrow(dataset: Dataset, level: Level) -> pa.Table:
+def arrow(dataset: Episodes, level: Level) -> pa.Table:
     """See `Dataset.to_arrow`."""
     try:
         import pandas
@@ -87,7 +86,7 @@ def _arrow_column(values: Sequence[Any], pyarrow: Any, *, is_pandas: bool) -> An
         return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
 
-def _episode_columns(dataset: Dataset) -> dict[str, Any]:
+def _episode_columns(dataset: Episodes) -> dict[str, Any]:
     headers = dataset.headers
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
@@ -168,7 +167,7 @@ def _texts(values: Sequence[Any]) -> Any:
     return values
 
 
-def _step_columns(dataset: Dataset, pandas: Any) -> dict[str, Any]:
+def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     found = dataset.read((*FIVE, "times", "infos"))
     lengths = found.episode_lengths
     of_episode = np.repeat(np.arange(len(lengths)), lengths)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.order import check_state, checked_seed, seeded
-from tupli_mcap.dataset.items.steps import SamplingError, checked_count, checked_numbers
+from tupli_mcap.dataset.items.steps import Numbered, SamplingError, checked_count, checked_numbers
 from tupli_mcap.schema import BaseFilter, F
-
-if TYPE_CHECKING:
-    from tupli_mcap.dataset.items.items import Items
 
 Weights = Array | Sequence[float] | F | BaseFilter
 _DRAWS = 0  # the stream of random numbers; an `Order` has another
@@ -37,7 +34,7 @@ class Sampler:
 
     def __init__(
         self,
-        items: Items[Any],
+        items: Numbered,
         batch_size: int,
         *,
         by: Literal["steps", "episodes"] = "steps",

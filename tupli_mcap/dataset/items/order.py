@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES
 from tupli_mcap.dataset.items.shuffle import Blocks, Part, ShuffledBatches, mixing
-from tupli_mcap.dataset.items.steps import SamplingError, checked_count
-
-if TYPE_CHECKING:
-    from tupli_mcap.dataset.items.items import Items
+from tupli_mcap.dataset.items.steps import Numbered, SamplingError, checked_count
 
 Shuffle = Literal["exact", "blocks"]
 _EPOCHS = 1  # the stream of random numbers; a `Sampler` has another
@@ -59,7 +56,7 @@ class Order:
 
     def __init__(
         self,
-        items: Items[Any],
+        items: Numbered,
         batch_size: int,
         *,
         shuffle: Shuffle | Literal[False] = False,

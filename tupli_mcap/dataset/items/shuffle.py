@@ -12,14 +12,12 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
-
-if TYPE_CHECKING:
-    from tupli_mcap.dataset.items.items import Items
+from tupli_mcap.dataset.items.steps import Numbered
 
 _CHUNK_BYTES = 256 << 10  # assumed if the size of chunks is not known
 
@@ -59,7 +57,7 @@ class Blocks:
         return found
 
 
-def _blocks_of(items: Items[Any], least: int) -> Blocks:
+def _blocks_of(items: Numbered, least: int) -> Blocks:
     """The blocks of items, and neighbours joined as long as there are fewer than `least` items in them together."""
     begins, lengths, kind = items.block_runs()
     stops = begins + lengths
@@ -72,7 +70,7 @@ def _blocks_of(items: Items[Any], least: int) -> Blocks:
     return Blocks(begins, stops, np.append(firsts[kept], len(begins)))
 
 
-def mixing(items: Items[Any], cache_bytes: int) -> tuple[int, Blocks]:
+def mixing(items: Numbered, cache_bytes: int) -> tuple[int, Blocks]:
     """The number of blocks that are mixed at a time, and the blocks, each of one or several chunks. Mixed blocks fit
     into half of the cache, and are large enough that few items extend into the next block, which would be read
     twice."""

@@ -11,6 +11,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.schema import BaseFilter, F
 
 FIELDS = (*FIVE, "next_states", "times")
 _MAX_ITEM = 1 << 30  # bytes of an item of an array
@@ -70,6 +71,18 @@ class Steps(Protocol):
     def limit(self, cache_bytes: int, threads: int) -> None:
         """Empties what is kept of steps that were read, and sets its budget and the number of threads that read."""
         ...
+
+
+class Numbered(Protocol):
+    """What an order or a sampler asks of `Items`, where it is documented."""
+
+    source: Steps
+    identity: str
+
+    def __len__(self) -> int: ...
+    def counts(self) -> Array: ...
+    def episode_values(self, expression: F | BaseFilter) -> Array: ...
+    def block_runs(self) -> tuple[Array, Array, Array]: ...
 
 
 class MemorySteps:

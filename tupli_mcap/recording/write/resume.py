@@ -6,11 +6,11 @@ import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal, sync_file
+from tupli_mcap.journal.file import journal_info, journal_path, recorded_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary, read_attachment
 from tupli_mcap.mcap.source import PathSource, Source
@@ -25,57 +25,74 @@ from tupli_mcap.recording.opened import read_contents
 from tupli_mcap.recording.recover.evidence import head, metadata_at
 from tupli_mcap.recording.recover.from_journal import belongs, misplaced_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.place import Place
 
-if TYPE_CHECKING:
-    from tupli_mcap.recording.write.writer import RecordingWriter
+
+class Resumed(NamedTuple):
+    """What a writer goes on with.
+
+    Attributes:
+        num_envs: None if the file has no step, and so no layout.
+        arriving: attachments that are added, or replaced, with the first step.
+    """
+
+    contents: Contents
+    episodes: IndexBuilder
+    layout: StepLayout | None
+    num_envs: int | None
+    is_vector: bool
+    arriving: dict[str, tuple[str, bytes]]
 
 
-def resume(writer: RecordingWriter) -> None:
-    """Takes over the file of `writer` (already locked): a finished one, or one whose writer was killed.
-
-    Everything that is cut is derivable from the chunks, so a crash in between loses nothing.
+def resume(
+    path: Path, options: RecordOptions, format_version: str, place: Place, container: Container
+) -> Resumed:
+    """Reads what a file (already locked) holds: a finished one, or one whose writer was killed. Sets `place` and
+    `container` to go on behind it.
 
     Raises:
         FormatError: the file is no recording.
         RecordingError: it belongs to another benchmark.
     """
-    source = PathSource(writer.path)
-    try:
+    with contextlib.closing(PathSource(path)) as source:
         check_magic(source)
         if not has_summary(source):
-            _check_journal(writer.path, head(source))
+            _check_journal(path, head(source))
         contents = read_contents(source)
-        asked, found = writer.options.benchmark_id, contents.metadata.get("benchmark_id", "")
+        asked, found = options.benchmark_id, contents.metadata.get("benchmark_id", "")
         if asked and asked != found:
             raise RecordingError(
-                f"{writer.path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
+                f"{path} holds episodes of benchmark {found or 'none'!r}, not {asked!r}; record to another file"
             )
         if SIGNATURE_NAME in contents.attachments:
             raise RecordingError(
-                f"{writer.path} is signed, and appending would make its signature invalid; record to another file"
+                f"{path} is signed, and appending would make its signature invalid; record to another file"
             )
-        _check_nothing_behind(writer, contents, source)
-        _check_aligned(writer, contents)
-        _restore(writer, contents, source)
-        runs = _more_runs(writer, contents, source)
-    finally:
-        source.close()
-    writer.container.position = contents.data_end
+        _check_nothing_behind(path, contents, source)
+        _check_aligned(path, contents)
+        _restore_place(place, path, options, contents)
+        restore_container(container, contents, source)
+        container.position = contents.data_end
+        episodes, given = IndexBuilder(contents.index), options.attachments or {}
+        runs = _more_runs(given, contents, source, episodes.count)
     known = set(contents.attachments)
     # The two halves of an environment: one that was lost is not made up for by half of another environment.
     parts = {DOCUMENT_NAME, PICKLE_NAME}
     known |= parts if known & parts else set()
-    given = writer.options.attachments or {}
-    writer.arriving = {name: a for name, a in given.items() if name not in known} | runs
-    if contents.complete:
-        return
-    writer.cut()
-    for channel in contents.undefined:  # the file was shorter after a power loss
-        writer.container.write(writer.container.definitions(channel))
-    for rows in contents.tail:
-        writer.container.add_chunk(rows)
-    if contents.tail:  # the journal they come from may have been on the disk, and will be replaced
-        sync_file(writer.lock.fd, str(writer.path))
+    arriving = {name: a for name, a in given.items() if name not in known} | runs
+    steps = step_channels(container.channels, source.name)
+    if not steps:
+        if contents.metadata["format_version"] < format_version:
+            raise RecordingError(
+                f"{path} was begun in format version {contents.metadata['format_version']}, holds no step, and "
+                f"cannot hold what needs version {format_version}; record to another file"
+            )
+        return Resumed(contents, episodes, None, None, False, arriving)
+    layout = StepLayout.from_metadata(steps[0].metadata)
+    container.codecs = image_codecs(layout, container.channels)
+    is_vector = Topics.of_step(steps[0].topic).is_vector
+    return Resumed(contents, episodes, layout, len(steps), is_vector, arriving)
 
 
 def _check_journal(path: Path, metadata: Mapping[str, str]) -> None:
@@ -108,7 +125,7 @@ def _is_same(path: Path, metadata: Mapping[str, str]) -> bool:
     return False
 
 
-def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: Source) -> None:
+def _check_nothing_behind(path: Path, contents: Contents, source: Source) -> None:
     """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
     if contents.complete or source.size == contents.data_end:
         return
@@ -122,13 +139,13 @@ def _check_nothing_behind(writer: RecordingWriter, contents: Contents, source: S
         found = sum(stop - first for first, stop in evidence.ranges(channel))
         if found > kept:
             raise RecordingError(
-                f"{writer.path} is damaged at offset {contents.data_end}: appending would lose {found - kept} "
-                f'message(s) of {contents.channels[channel].topic} behind it; "tupli-mcap recover {writer.path}" '
+                f"{path} is damaged at offset {contents.data_end}: appending would lose {found - kept} "
+                f'message(s) of {contents.channels[channel].topic} behind it; "tupli-mcap recover {path}" '
                 "writes all that is whole to a new file, which can be appended to"
             )
 
 
-def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
+def _check_aligned(path: Path, contents: Contents) -> None:
     """New rows must go on where the old ones end.
 
     A power loss, or a lost journal, may leave steps without images, or frames without the steps that they show.
@@ -148,58 +165,41 @@ def _check_aligned(writer: RecordingWriter, contents: Contents) -> None:
         found, expected = (counts.get(topics.get(each, 0), 0) for each in (pictures, rows))
         if found != expected:
             raise RecordingError(
-                f"{writer.path} lost its end: expected {expected} pictures in {pictures}, found {found}; "
-                f'"tupli-mcap recover {writer.path}" writes what is whole to a new file, which can be appended to'
+                f"{path} lost its end: expected {expected} pictures in {pictures}, found {found}; "
+                f'"tupli-mcap recover {path}" writes what is whole to a new file, which can be appended to'
             )
 
 
-def _more_runs(writer: RecordingWriter, contents: Contents, source: Source) -> dict[str, tuple[str, bytes]]:
-    """`run.json` with the run that begins now; empty if it goes on with the last one, or the file has none, or a
-    damaged one."""
-    given, recorded = (writer.options.attachments or {}).get(RUN_NAME), contents.attachments.get(RUN_NAME)
+def _more_runs(
+    attachments: Mapping[str, tuple[str, bytes]], contents: Contents, source: Source, episodes: int
+) -> dict[str, tuple[str, bytes]]:
+    """`run.json` with the run that begins now, behind some episodes; empty if it goes on with the last one, or the file
+    has none, or a damaged one."""
+    given, recorded = attachments.get(RUN_NAME), contents.attachments.get(RUN_NAME)
     if given is None or recorded is None:
         return {}
     try:
-        earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{writer.path}: {RUN_NAME}")
+        earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{source.name}: {RUN_NAME}")
     except FormatError:
         return {}
     run = RecordedRuns.from_json(given[1], RUN_NAME).runs[-1]
-    runs = earlier.followed_by(run, writer.index.count)
+    runs = earlier.followed_by(run, episodes)
     return {} if runs is earlier else {RUN_NAME: (RUN_MEDIA_TYPE, runs.to_json())}
 
 
-def _keep_journal_place(writer: RecordingWriter, contents: Contents) -> None:
+def _restore_place(place: Place, path: Path, options: RecordOptions, contents: Contents) -> None:
     """The file says where its journal is; a reader would look for it there."""
-    recorded = contents.metadata.get("journal")
-    given = writer.options.journal_dir
+    place.uuid = contents.metadata["uuid"]
+    place.rewritten = contents.metadata.get("rewritten", "")
+    place.replaced = contents.metadata.get("replaced", "")
+    recorded, given = contents.metadata.get("journal"), options.journal_dir
     if given is not None and (recorded is None or Path(given).resolve() != Path(recorded).parent):
         raise RecordingError(
-            f"{writer.path}: its journal belongs {'beside it' if recorded is None else f'at {recorded}'}, not into "
+            f"{path}: its journal belongs {'beside it' if recorded is None else f'at {recorded}'}, not into "
             f"{given}; leave journal_dir out when appending"
         )
     if recorded is not None:
-        writer.place.journal = recorded_journal(writer.path, contents.metadata)
-
-
-def _restore(writer: RecordingWriter, contents: Contents, source: Source) -> None:
-    writer.place.uuid = contents.metadata["uuid"]
-    writer.place.rewritten = contents.metadata.get("rewritten", "")
-    writer.place.replaced = contents.metadata.get("replaced", "")
-    _keep_journal_place(writer, contents)
-    restore_container(writer.container, contents, source)
-    writer.index = IndexBuilder(contents.index)
-    writer.next_episode = contents.next_episode
-    steps = step_channels(writer.container.channels, source.name)
-    if steps:
-        writer.layout = StepLayout.from_metadata(steps[0].metadata)
-        writer.container.codecs = image_codecs(writer.layout, writer.container.channels)
-        writer.recorded_envs = len(steps)
-        writer.recorded_vector = Topics.of_step(steps[0].topic).is_vector
-    elif contents.metadata["format_version"] < writer.format_version:
-        raise RecordingError(
-            f"{writer.path} was begun in format version {contents.metadata['format_version']}, holds no step, and "
-            f"cannot hold what needs version {writer.format_version}; record to another file"
-        )
+        place.journal = recorded_journal(path, contents.metadata)
 
 
 def restore_container(container: Container, contents: Contents, source: Source) -> None:

@@ -109,11 +109,7 @@ class RecordingWriter:
         self.container = Container(self.lock.fd, str(self.path), self.options.compression)
         self._chunks = ChunkWriter(self.path, self.container, self.lock, self._settle_chunks)
         if self.options.mode == "a" and self.path.stat().st_size:
-            from tupli_mcap.recording.write.resume import resume
-
-            self._is_cut = False
-            resume(self)
-            self.place.go_on()
+            self._resume()
             return
         self.place.begin(replaces=self.options.mode == "w")
         try:
@@ -141,6 +137,25 @@ class RecordingWriter:
             self.container.add_attachment(name, media_type, data, now)
         if not self.lock.replaces:
             self.lock.publish()
+
+    def _resume(self) -> None:
+        from tupli_mcap.recording.write.resume import resume
+
+        self._is_cut = False
+        found = resume(self.path, self.options, self.format_version, self.place, self.container)
+        contents, self.index, self.layout, self.recorded_envs, self.recorded_vector, self.arriving = found
+        self.next_episode = contents.next_episode
+        if (
+            not contents.complete
+        ):  # what is cut is derivable from the chunks: a crash in between loses nothing
+            self.cut()
+            for channel in contents.undefined:  # the file was shorter after a power loss
+                self.container.write(self.container.definitions(channel))
+            for rows in contents.tail:
+                self.container.add_chunk(rows)
+            if contents.tail:  # the journal they come from may have been on the disk, and will be replaced
+                sync_file(self.lock.fd, str(self.path))
+        self.place.go_on()
 
     # ---- the first step
 

@@ -16,7 +16,7 @@ from tupli_mcap.recording.write.options import CAMERA
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, BenchmarkMetadata, EpisodeHeader, FilterEQ, bound
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, anew, each_opened
+from tupli_mcap.storage.base import LOCAL_USER, TupliStorage, anew, each_opened
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     artifacts_of,
@@ -33,13 +33,12 @@ from tupli_mcap.storage.sidecar import Notes
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
-    from tupli_mcap.storage.files import FileStorage
 
 Attachments = dict[str, tuple[str, bytes]]
 
 
 def write_bundle(
-    storage: FileStorage,
+    storage: TupliStorage,
     benchmark_id: str,
     target: Path,
     filter: BaseFilter | str | None = None,
@@ -69,7 +68,7 @@ def write_bundle(
     return target
 
 
-def export_episodes(storage: FileStorage, target: Path, filter: BaseFilter | str | None = None) -> Path:
+def export_episodes(storage: TupliStorage, target: Path, filter: BaseFilter | str | None = None) -> Path:
     """Write the episodes that match a filter into the new recording `target`, without artifacts.
 
     Raises:
@@ -90,7 +89,7 @@ def export_episodes(storage: FileStorage, target: Path, filter: BaseFilter | str
 
 
 def bundle_recording(
-    path: Path, target: Path, storage: FileStorage | None = None, sign: SigningKey | None = None
+    path: Path, target: Path, storage: TupliStorage | None = None, sign: SigningKey | None = None
 ) -> Path:
     """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
 
@@ -147,7 +146,7 @@ def _own_benchmark(recording: Recording, path: Path) -> tuple[str, Attachments]:
     return uri, {DOCUMENT_NAME: ("application/json", document)}
 
 
-def _attachments(storage: FileStorage, benchmark_id: str) -> Attachments:
+def _attachments(storage: TupliStorage, benchmark_id: str) -> Attachments:
     benchmark = storage.load_benchmark(benchmark_id)
     try:
         content = unpack(benchmark.serialized)
@@ -170,7 +169,7 @@ def _refuse_existing(target: Path) -> None:
 
 
 def _write_episodes(
-    storage: FileStorage,
+    storage: TupliStorage,
     benchmark_id: str,
     headers: Sequence[EpisodeHeader],
     target: Path,
@@ -225,7 +224,7 @@ def _carried(recording: Recording) -> Attachments:
     }
 
 
-def _episodes(storage: FileStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
+def _episodes(storage: TupliStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
     """The episodes of several recordings as values, one recording open at a time."""
     for _, episode in each_opened(headers, storage.open_recording):
         steps = list(episode)
