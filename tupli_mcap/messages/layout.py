@@ -37,6 +37,11 @@ IMAGE_SCHEMA = (
 )
 
 
+def renumbered(body: bytes | memoryview, episode: int, second: int) -> bytes:
+    """The body of a message that begins with `NUMBERS`, with others."""
+    return NUMBERS.pack(episode, second) + body[NUMBERS.size :]
+
+
 class Field(NamedTuple):
     """A field of constant size: its NumPy dtype, and its offset from the start of the CDR body."""
 

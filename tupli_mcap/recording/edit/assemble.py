@@ -184,6 +184,11 @@ class Assembler:
         self.container.finish()
 
 
+def writable(rows: Array) -> Array:
+    """A copy of rows that may be changed; NumPy's own may lack the padding between fields."""
+    return np.frombuffer(bytearray(rows.tobytes()), rows.dtype)
+
+
 def _in_time(messages: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     """The messages with times raised so that they never decrease."""
     times = itertools.accumulate((time_ns for time_ns, _ in messages), max)

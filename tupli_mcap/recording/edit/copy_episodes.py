@@ -13,11 +13,11 @@ from tupli_mcap.messages.decoder import MessageDecoder
 from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd, EpisodeStart
 from tupli_mcap.messages.frames import EncodedFrame, encode_frame, encode_pair
 from tupli_mcap.messages.infos import InfoCodec
-from tupli_mcap.messages.layout import NUMBERS
+from tupli_mcap.messages.layout import NUMBERS, renumbered
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, INFO, Topics
 from tupli_mcap.recording.about.success import without_success
-from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
+from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import leaf_encoders
 
@@ -195,7 +195,7 @@ class EpisodeCopier:
                 part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
                 renumbered = (self._shift or self._trims) and "episode" in (dtype.names or ())
                 if renumbered or new:
-                    part = np.frombuffer(bytearray(part.tobytes()), dtype)
+                    part = writable(part)
                 if renumbered:
                     self._renumber_rows(part)
                 for name, column in new.items():
@@ -247,7 +247,7 @@ class EpisodeCopier:
     def _renumbered(self, body: bytes) -> bytes:
         number, step = NUMBERS.unpack_from(body)
         trim = self._trims.get(number)
-        return NUMBERS.pack(number + self._shift, step - trim.start if trim else step) + body[8:]
+        return renumbered(body, number + self._shift, step - trim.start if trim else step)
 
     def _episodes(self, rows: Array, firsts: Array) -> list[CopiedEpisode]:
         """The other records of each episode, with its numbers in the target."""

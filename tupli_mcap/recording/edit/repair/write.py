@@ -26,11 +26,11 @@ from tupli_mcap.messages.frames import (
     encode_pair,
 )
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
-from tupli_mcap.messages.layout import NUMBERS
+from tupli_mcap.messages.layout import NUMBERS, renumbered
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, camera_names, parse
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode
+from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import intersection
@@ -173,7 +173,7 @@ class RepairWriter:
             for span in store.spans(channel, store.packed(channel, run.row), run.steps):
                 rows: Array = store.rows(span.chunk, dtype, keep=True)[span.begin : span.end]
                 if numbered and not (episode.head and episode.number == run.episode):
-                    rows = np.frombuffer(bytearray(rows.tobytes()), dtype)
+                    rows = writable(rows)
                     rows["episode"] = episode.number
                     rows["step"] -= run.step
                 yield rows
@@ -185,7 +185,7 @@ class RepairWriter:
             run = episode.run
             messages = store.messages(channel, store.packed(channel, run.row), run.steps)
             for step, (log_time, body) in enumerate(messages):
-                yield log_time, NUMBERS.pack(episode.number, step) + bytes(body[8:])
+                yield log_time, renumbered(body, episode.number, step)
 
     # ---- episodes
 
@@ -227,8 +227,7 @@ class RepairWriter:
     def _final(self, episode: PlannedEpisode, store: PackedStore, old: RecordedChannels) -> bytes:
         if old.final is None or episode.final is None or episode.final < 0:
             return final_state(self._evidence, episode)
-        body = store.message(old.final, episode.final)
-        return NUMBERS.pack(episode.number, episode.run.env) + body[8:]
+        return renumbered(store.message(old.final, episode.final), episode.number, episode.run.env)
 
     def _infos(self, store: PackedStore, channel: int, plan: Plan) -> Iterator[tuple[int, bytes]]:
         """The infos of steps that are kept, with the new numbers of these."""
@@ -236,7 +235,7 @@ class RepairWriter:
         for _, log_time, body in store.all_messages(channel):
             place = pieces.find(*NUMBERS.unpack_from(body))
             if place is not None:
-                yield log_time, NUMBERS.pack(*place) + bytes(body[8:])
+                yield log_time, renumbered(body, *place)
 
 
 # ---- frames: kept where the step is kept, and both picture and row were found
