@@ -18,9 +18,10 @@ from zlib import crc32
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, iter_records
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, crc32_each, iter_records
 
 Sink = Callable[[Rows], None]
 FRONT = struct.Struct("<BQHIQ")  # a record up to publish_time, where a journal has a checksum
@@ -46,6 +47,16 @@ def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
     """The two checksums of the record at `start`."""
     whole, running = _SEAL.unpack_from(view, start + FRONT.size)
     return whole, running
+
+
+def sealed_records(table: Array) -> bytes:
+    """Records of constant size as they are in a log: checksums replace `publish_time`, in `table`, too."""
+    size = table.dtype.itemsize - 8
+    bare = np.empty((len(table), size), np.uint8)
+    whole = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
+    bare[:, : FRONT.size], bare[:, FRONT.size :] = whole[:, : FRONT.size], whole[:, FRONT.size + 8 :]
+    table["#publish_time"] = crc32_each(bare.view(f"V{size}")[:, 0].tolist())
+    return table.tobytes()
 
 
 def group_records(data: memoryview) -> list[Rows]:

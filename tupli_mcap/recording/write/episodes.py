@@ -11,8 +11,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
-from tupli_mcap.journal.logs import FRONT, EventLog, Sink
-from tupli_mcap.mcap.records import BODY, HEADER_FIELDS, crc32_each
+from tupli_mcap.journal.logs import EventLog, Sink, sealed_records
+from tupli_mcap.mcap.records import BODY, HEADER_FIELDS
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
     START_FIELDS,
@@ -188,7 +188,7 @@ class EpisodeLog(EventLog):
         if size > self._capacity:
             self._write()
             return
-        sealed = b"".join(_sealed(table) for table in tables.values())
+        sealed = b"".join(sealed_records(table) for table in tables.values())
         end = self._position + size
         self._records[self._position : end] = sealed
         self._position = self._commit[0] = end
@@ -212,13 +212,3 @@ def _record_of(channel: int, body: bytes, fields: _Fields) -> tuple[bytes, np.dt
     return template, np.dtype(
         {"names": names, "formats": formats, "offsets": offsets, "itemsize": len(template)}
     )
-
-
-def _sealed(table: Array) -> bytes:
-    """Records as they are in a journal, with a checksum in place of `publish_time`."""
-    size = table.dtype.itemsize - 8
-    bare = np.empty((len(table), size), np.uint8)
-    whole = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
-    bare[:, : FRONT.size], bare[:, FRONT.size :] = whole[:, : FRONT.size], whole[:, FRONT.size + 8 :]
-    table["#publish_time"] = crc32_each(bare.view(f"V{size}")[:, 0].tolist())
-    return table.tobytes()
