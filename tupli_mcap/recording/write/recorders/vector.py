@@ -53,7 +53,7 @@ class VectorRecorder:
         derives_episodes: bool = False,
     ) -> None:
         self.derives_episodes = derives_episodes and autoreset.mode == "NextStep" and not autoreset.is_assumed
-        self._derives = False  # True while starts and ends are derived from rows instead of logged
+        self._deriving: VectorRows | None = None  # the rows that starts and ends are derived from
         self._writer = writer
         self._spaces = spaces
         self._n = num_envs
@@ -151,7 +151,7 @@ class VectorRecorder:
             any_done = flags != self._none
             if any_done:
                 terminals, timeouts = self._plain(terminals, timeouts, done, flags)
-            if any_done and infos and self._derives and tells_success(infos):
+            if any_done and infos and self._deriving and tells_success(infos):
                 self.derives_episodes = False  # ends have metadata, which rows do not tell
                 self._write_pending()
             finals = self._finals(done, states, infos) if any_done and (infos or not resets.is_plain) else {}
@@ -180,7 +180,7 @@ class VectorRecorder:
         self, rewards: Array, ended: Array, active: Array | None, infos: Any, *, any_done: bool
     ) -> None:
         """Updates the state of each sub-environment after a batch."""
-        if not self._derives:
+        if not self._deriving:
             totals = (
                 rewards if rewards.ndim == 1 else rewards.reshape(self._n, -1).sum(axis=1, dtype=np.float64)
             )
@@ -194,7 +194,7 @@ class VectorRecorder:
             return
         self._lengths += active
         self._any_ended = any_done and bool(np.count_nonzero(ended))
-        if self._derives:
+        if self._deriving:
             self._begin_derived(~active, infos)
         else:
             self._note_resets(~active, infos)
@@ -234,7 +234,7 @@ class VectorRecorder:
 
     def finish(self, terminals: Any, infos: Mapping[str, Any]) -> None:
         """Ends the episodes that ended in the batch just put; `infos` are that batch's."""
-        if not self._any_ended or self._derives:
+        if not self._any_ended or self._deriving:
             return
         same_step = self._autoreset.mode == "SameStep"
         ends = [(i, TERMINAL if terminals[i] else TIMEOUT) for i in self.ended]
@@ -336,14 +336,14 @@ class VectorRecorder:
     def _start_deriving(self) -> None:
         """From here on episodes are derived, if that is possible; where none is running, the next row is a hole."""
         store, events = self._writer.vector, self._writer.events
-        if not self.derives_episodes or events is None or self._writer.images or self._derives:
+        if not self.derives_episodes or events is None or self._writer.images or self._deriving:
             return
         if not isinstance(store, VectorRows) or not store.can_derive or self._lengths.any():
             return
         store.start_deriving(events, self._episodes)
         self._episodes = [None] * self._n
         self._waiting.clear()
-        self._derives, self._any_waits = True, False
+        self._deriving, self._any_waits = store, False
 
     def _begin_derived(self, holes: Array, infos: Mapping[str, Any]) -> None:
         """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
@@ -360,10 +360,10 @@ class VectorRecorder:
         """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
         late, self._late = self._late, []
         self._end(late)
-        store, events = self._writer.vector, self._writer.events
-        if not self._derives or not isinstance(store, VectorRows) or events is None:
+        store, events = self._deriving, self._writer.events
+        if store is None or events is None:
             return
-        self._derives = False
+        self._deriving = None
         now = time.time_ns()
         for i, (number, total) in enumerate(zip(*store.stop_deriving(self._ended), strict=True)):
             if number >= 0:
@@ -428,7 +428,7 @@ class VectorRecorder:
     @property
     def is_running(self) -> bool:
         """True if a sub-environment is within an episode."""
-        if self._derives:
+        if self._deriving:
             return bool((self._lengths > 0).any() and not self._ended.all())
         return any(episode is not None for episode in self._episodes)
 
