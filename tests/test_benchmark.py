@@ -21,6 +21,7 @@ from gymnasium.envs.classic_control.mountain_car import MountainCarEnv
 from gymnasium.utils.env_checker import check_env
 
 from tupli_mcap import trust
+from tupli_mcap.arrays import Array
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.environment import build
 from tupli_mcap.errors import NotFoundError, StepError, StorageError, TupliError, UntrustedError
@@ -44,7 +45,7 @@ def storage(tmp_path: Path) -> Iterator[FileStorage]:
 class WindyCar(MountainCarEnv):
     """MountainCar against a wind, whose strengths (m/s) come from a table."""
 
-    def __init__(self, wind: np.ndarray[Any, Any] | str) -> None:
+    def __init__(self, wind: Array | str) -> None:
         super().__init__()
         self.data = wind
         self.blow = 0

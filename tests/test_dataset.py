@@ -17,6 +17,7 @@ import pytest
 from environments import Sampler, Scripted, roll, same
 
 from tupli_mcap import progress
+from tupli_mcap.arrays import Array
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.dataset import (
     BaseTupleParser,
@@ -63,7 +64,7 @@ def record(path: Path, env: gym.Env[Any, Any], steps: int, seed: int = 1, **opti
         return roll(recorder, steps, seed)
 
 
-def column(taken: Taken, place: int) -> np.ndarray[Any, Any]:
+def column(taken: Taken, place: int) -> Array:
     return np.array([step[place] for step in taken])
 
 

@@ -27,6 +27,7 @@ from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, Model, Part, load_seeds, 
 from fuzzing.oracle import observe
 
 from tupli_mcap import RecordEpisodes
+from tupli_mcap.arrays import Array
 from tupli_mcap.cli.app import _report, app
 from tupli_mcap.cli.output import begin_json
 from tupli_mcap.dataset import TupliDataset
@@ -57,11 +58,11 @@ def with_episode(**fields: int) -> bytes:
     return file.encode()
 
 
-def with_chunk(change: Callable[[np.ndarray[Any, Any]], Any]) -> bytes:
+def with_chunk(change: Callable[[Array], Any]) -> bytes:
     file = model()
     assert file.index is not None
 
-    def changed(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def changed(rows: Array) -> Array:
         found = change(rows)
         return rows if found is None else found
 
@@ -69,15 +70,15 @@ def with_chunk(change: Callable[[np.ndarray[Any, Any]], Any]) -> bytes:
     return file.encode()
 
 
-def setting(name: str, value: int) -> Callable[[np.ndarray[Any, Any]], None]:
-    def change(rows: np.ndarray[Any, Any]) -> None:
+def setting(name: str, value: int) -> Callable[[Array], None]:
+    def change(rows: Array) -> None:
         rows[name][0] = value
 
     return change
 
 
-def on_the_first(name: str) -> Callable[[np.ndarray[Any, Any]], None]:
-    def change(rows: np.ndarray[Any, Any]) -> None:
+def on_the_first(name: str) -> Callable[[Array], None]:
+    def change(rows: Array) -> None:
         rows[name][1] = rows[name][0]
 
     return change
@@ -206,7 +207,7 @@ def leaves(count: int) -> bytes:
 
 
 def chunks(count: int) -> bytes:
-    def change(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def change(rows: Array) -> Array:
         return np.concatenate([rows, np.repeat(rows[:1], count)])
 
     return with_chunk(change)

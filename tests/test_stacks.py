@@ -19,6 +19,7 @@ from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 
 from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.mcap.records import BODY
@@ -30,7 +31,6 @@ from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
-Array = np.ndarray[Any, Any]
 H, W = 30, 20
 
 

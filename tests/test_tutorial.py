@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from serving import PASSWORD, serving
 from tool_modules import tool
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.dataset import NumpyTupleParser, TupliDataset
 from tupli_mcap.errors import StorageError
@@ -229,7 +229,7 @@ def test_deleting_leaves_nothing_behind(
 class PumpsEnergy:
     """Pushes the way the car is going, the simplest policy that reaches the flag; predicts as d3rlpy does."""
 
-    def predict(self, observations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def predict(self, observations: Array) -> Array:
         return np.where(observations[:, 1] > 0, 2, 0)
 
 

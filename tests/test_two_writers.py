@@ -30,6 +30,7 @@ from tupli_mcap import (
     recover_recording,
     rewrite_recording,
 )
+from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.lock import FileLock, LockedError, is_locked
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 
@@ -40,7 +41,7 @@ def cart_pole(path: str | os.PathLike[str], **kwargs: Any) -> RecordEpisodes:
     return RecordEpisodes(gym.make("CartPole-v1"), path, chunk_size=3000, **kwargs)
 
 
-def killed(path: Path, steps: int = 100, **kwargs: Any) -> np.ndarray[Any, Any]:
+def killed(path: Path, steps: int = 100, **kwargs: Any) -> Array:
     """Leaves a recording of a process that was killed; returns the states in it."""
     pid = os.fork()
     if pid == 0:

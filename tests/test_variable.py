@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as hnp
 from mcap_ros2._dynamic import generate_dynamic
 from sample_spaces import NESTED_GRAPHS, SPACES, space_id
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.messages.variable.widening import variable_dtypes
@@ -431,7 +432,7 @@ def test_decoded_arrays_are_ones_own():
     assert same(decode(field, data), np.ones((2, 2), np.float32))
 
 
-def f8(*shape: int) -> np.ndarray[Any, Any]:
+def f8(*shape: int) -> Array:
     return np.full(shape, 0.1)
 
 

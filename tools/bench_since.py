@@ -22,6 +22,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
+
 ROOT = Path(__file__).resolve().parent.parent
 KINDS = {
     "22 steps": (22, 1),
@@ -118,7 +120,7 @@ def work(kind: str, path: str) -> None:
     os._exit(0)
 
 
-def compare(kind: str, trees: list[Path], rounds: int, directory: Path) -> list[np.ndarray[Any, Any]]:
+def compare(kind: str, trees: list[Path], rounds: int, directory: Path) -> list[Array]:
     """Microseconds a step of each turn: the environment alone, and recorded by each tree."""
     sides = []
     for i, (tree, path) in enumerate([(ROOT, ""), *((tree, f"{k}.mcap") for k, tree in enumerate(trees))]):

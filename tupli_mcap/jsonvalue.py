@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 
 MAX_DEPTH = 64
@@ -90,7 +91,7 @@ def _shallow(value: Any) -> Any:
     return value
 
 
-def array_in(value: Any) -> np.ndarray[Any, Any] | None:
+def array_in(value: Any) -> Array | None:
     """Return the array in a tensor of PyTorch or JAX; None if there is none that NumPy has a dtype for."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value.__array__())

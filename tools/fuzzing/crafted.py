@@ -29,6 +29,7 @@ from fuzzing.model import (
     strings,
 )
 from fuzzing.plain import Mutant
+from tupli_mcap.arrays import Array
 
 __all__ = ["CRAFTED"]
 
@@ -80,7 +81,7 @@ def index_row(rng: random.Random, seed: Seed, _: Sequence[Seed]) -> Mutant:
     return _mutant(model, seed, "index: " + ", ".join(notes))
 
 
-def _set(rows: np.ndarray[Any, Any], i: int, name: str, rng: random.Random) -> None:
+def _set(rows: Array, i: int, name: str, rng: random.Random) -> None:
     if rows.dtype[name].kind == "f":
         rows[name][i] = rng.choice([float("nan"), float("inf"), -0.0, 1e308, 5e-324])
         return
@@ -146,7 +147,7 @@ def chunk_row(rng: random.Random, seed: Seed, _: Sequence[Seed]) -> Mutant:
     names = model.index.chunks.dtype.names[:-1]
     i, name, salt = rng.randrange(len(model.index.chunks)), rng.choice(names), rng.random()
 
-    def change(rows: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def change(rows: Array) -> Array:
         _set(rows, i, name, random.Random(salt))
         return rows
 

@@ -10,12 +10,12 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import lz4.frame
 import numpy as np
 import zstandard
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.mcap.container import CHUNK_ROWS
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.recording.index import EPISODE_ROWS, INDEX_NAME
@@ -97,11 +97,11 @@ class Part:
 class Index:
     """The episode index; `claims` replaces the counts of its header, `sizes` those before its parts."""
 
-    episodes: np.ndarray[Any, Any]
-    chunks: np.ndarray[Any, Any]
+    episodes: Array
+    chunks: Array
     texts: bytes
     claims: dict[int, int] = field(default_factory=dict)
-    change_chunks: Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]] = lambda rows: rows
+    change_chunks: Callable[[Array], Array] = lambda rows: rows
     compress: Callable[[bytes], bytes] = zstandard.ZstdCompressor(level=1).compress
 
     @classmethod
@@ -115,7 +115,7 @@ class Index:
         rows = np.frombuffer(parts[0], EPISODE_ROWS).copy()
         return cls(rows, np.frombuffer(parts[1], CHUNK_ROWS).copy(), parts[2])
 
-    def encode(self, table: np.ndarray[Any, Any]) -> bytes:
+    def encode(self, table: Array) -> bytes:
         chunks = self.change_chunks(table)
         head = [b"TMIDX\0\0\1", len(self.episodes), len(chunks), len(self.texts)]
         for place, value in self.claims.items():
@@ -206,7 +206,7 @@ def footer(start: int, offsets: int, summary: bytes) -> bytes:
     return head + zlib.crc32(head, zlib.crc32(summary)).to_bytes(4, "little") + MAGIC
 
 
-def _place(row: np.ndarray[Any, Any], part: Part, at: int, data: bytes) -> None:
+def _place(row: Array, part: Part, at: int, data: bytes) -> None:
     inner = b"".join(part.inner)
     row["offset"], row["length"] = at, len(data)
     row["uncompressed"] = (len(inner) if part.size is None else part.size) & (2**64 - 1)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
 from tupli_mcap.dataset.items.beside import (
     BESIDE,
@@ -150,7 +151,7 @@ class RandomAccess(SaysWhatIsMeant):
         return items.of_episodes(self._values_now())
 
 
-def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter) -> np.ndarray[Any, Any]:
+def episode_values(headers: Sequence[EpisodeHeader], expression: F | BaseFilter) -> Array:
     """See `RandomAccess.episode_values`.
 
     Raises:

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 
 _LENGTH = Struct("<I")
@@ -48,7 +49,7 @@ def write_array(out: bytearray, origin: int, data: bytes, itemsize: int) -> None
 
 def read_array(
     data: memoryview, offset: int, origin: int, dtype: np.dtype[Any], count: int
-) -> tuple[np.ndarray[Any, Any], int]:
+) -> tuple[Array, int]:
     """Return a new array of `count` elements of a little-endian `dtype`, and the offset after them."""
     if count == 0:
         return np.empty(0, dtype), offset

@@ -23,6 +23,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.encode_values import (
@@ -46,15 +47,15 @@ _MAX_LEAVES = 4096  # each takes time and memory to compile
 class ImageSink(Protocol):
     """Stores images. `check` comes first, so that a refused step writes none of its images."""
 
-    def check(self, value: Any) -> np.ndarray[Any, Any]:
+    def check(self, value: Any) -> Array:
         """The image as it will be stored; raises StepError if it cannot be stored."""
         ...
 
-    def put(self, image: np.ndarray[Any, Any]) -> None:
+    def put(self, image: Array) -> None:
         """Stores the image of the next state, before the step is committed."""
         ...
 
-    def put_first(self, image: np.ndarray[Any, Any]) -> None:
+    def put_first(self, image: Array) -> None:
         """Stores the image of a reset, in place of the running row's."""
         ...
 

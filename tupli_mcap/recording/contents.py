@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import CHUNK_ROWS, REPEATED, Rows
 from tupli_mcap.mcap.records import check_crc
@@ -63,7 +64,7 @@ class Contents:
     channels: dict[int, Channel] = field(default_factory=dict)
     attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
     metadata_indexes: list[MetadataIndex] = field(default_factory=list)
-    table: np.ndarray = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))
+    table: Array = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))
     memory: list[bytes] = field(default_factory=list)
     tail: list[Rows] = field(default_factory=list)
     index: EpisodeIndex = field(

@@ -101,7 +101,7 @@ class IndexBuilder:
         self.metadata += text
         self.count += 1
 
-    def extend(self, episodes: np.ndarray[Any, Any]) -> None:
+    def extend(self, episodes: Array) -> None:
         """Adds episodes (EPISODE_ROWS) without metadata."""
         self.rows += episodes.tobytes()
         self.count += len(episodes)
@@ -141,8 +141,8 @@ def _decompress(
 class EpisodeIndex(NamedTuple):
     """A decoded index: structured arrays `episodes` (EPISODE_ROWS), `chunks` (CHUNK_ROWS), and the metadata texts."""
 
-    episodes: np.ndarray[Any, Any]
-    chunks: np.ndarray[Any, Any]
+    episodes: Array
+    chunks: Array
     metadata: bytes
 
     @classmethod

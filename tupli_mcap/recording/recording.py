@@ -64,8 +64,8 @@ class Recording(DescribedRecording, DatasetVerbs):
     @overload
     def __getitem__(self, chosen: int) -> Episode: ...
     @overload
-    def __getitem__(self, chosen: slice | Sequence[int] | np.ndarray[Any, Any]) -> Dataset: ...
-    def __getitem__(self, chosen: int | slice | Sequence[int] | np.ndarray[Any, Any]) -> Episode | Dataset:
+    def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
+    def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
         """`recording[3]` is an episode; `recording[-5:]`, `recording[[4, 2]]` and `recording[mask]` are datasets."""
         if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
             return self.episodes[int(chosen)]
@@ -125,7 +125,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             seeds[i] = self.episode_start(i).seed_number
         return seeds
 
-    def episode_starts(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> list[EpisodeStart]:
+    def episode_starts(self, episodes: Sequence[int] | Array) -> list[EpisodeStart]:
         """The `/episode_start` messages of some episodes (positions or a mask), read together."""
         rows = self.index[self._positions(episodes)]
         if not len(rows):
@@ -169,7 +169,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         ]
         return self.layout.nest_state(values)
 
-    def final_states(self, episodes: Sequence[int] | np.ndarray[Any, Any]) -> Any:
+    def final_states(self, episodes: Sequence[int] | Array) -> Any:
         """The final states of some episodes (positions or a mask) as columns, nested as the observation space is.
 
         Raises:
@@ -238,7 +238,7 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def read(
         self,
-        episodes: Sequence[int] | np.ndarray[Any, Any] | None = None,
+        episodes: Sequence[int] | Array | None = None,
         fields: Sequence[str] | None = None,
         threads: int | None = None,
         *,

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap.arrays import DType
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns
@@ -175,7 +175,7 @@ class Checker:
             return same_float
         return same
 
-    def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> np.ndarray[Any, Any]:
+    def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> Array:
         """The value as a recorder stores it. StepError if it cannot be recorded."""
         if self._casts:
             array = np.asarray(value)

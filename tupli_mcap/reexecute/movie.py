@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, missing_extra
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.images.pictures import (
@@ -197,7 +198,7 @@ class Indexed:
     """Makes images of at most 256 colours from pictures; exact if a picture has no more colours."""
 
     def __init__(self) -> None:
-        self._places: np.ndarray[Any, Any] | None = None  # of colours in the palette
+        self._places: Array | None = None  # of colours in the palette
 
     def __call__(self, picture: Picture) -> Any:
         """A Pillow image of mode P."""
@@ -223,7 +224,7 @@ class Indexed:
         return image
 
 
-def _codes(colours: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+def _codes(colours: Array) -> Array:
     """Each colour (the last axis) as a number of 24 bits."""
     red, green, blue = (colours[..., i].astype(np.uint32) for i in range(3))
     return red << 16 | green << 8 | blue

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
@@ -166,7 +167,7 @@ def _length(column: Any) -> int:
     return len(column)
 
 
-def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> npt.NDArray[Any] | Sequence[Any]:
+def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> Array | Sequence[Any]:
     """The column of one scalar per step that a path names."""
     column: Any = columns
     for position, segment in enumerate(path):
@@ -187,7 +188,7 @@ def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> npt.ND
     return _inside(key, column, ())
 
 
-def _inside(key: str, column: Any, path: tuple[str, ...]) -> npt.NDArray[Any] | Sequence[Any]:
+def _inside(key: str, column: Any, path: tuple[str, ...]) -> Array | Sequence[Any]:
     if not isinstance(column, np.ndarray):
         return [_step_value(value, path) for value in column] if path else list(column)
     shape = column.shape[1:]
@@ -199,7 +200,7 @@ def _inside(key: str, column: Any, path: tuple[str, ...]) -> npt.NDArray[Any] | 
         if not (segment.isascii() and segment.isdigit() and int(segment) < size):
             raise FilterError(f"filter key {key!r} needs a position from 0 to {size - 1}, found {segment!r}")
     index: tuple[Any, ...] = (slice(None), *(int(segment) for segment in path))
-    leaf: npt.NDArray[Any] = column[index]
+    leaf: Array = column[index]
     return leaf
 
 
@@ -216,7 +217,7 @@ def _step_value(value: Any, path: tuple[str, ...]) -> Any:
 _EVERY_KIND: Final = {"b": "bool", "i": "number", "u": "number", "f": "number", "U": "text"}
 
 
-def _compare_array(operation: str, array: npt.NDArray[Any], wanted: Scalar) -> Mask:
+def _compare_array(operation: str, array: Array, wanted: Scalar) -> Mask:
     """One comparison of an array of shape (n,), with the meaning that `compare` has for scalars."""
     if operation == "NE":
         return ~_compare_array("EQ", array, wanted)
@@ -229,7 +230,7 @@ def _compare_array(operation: str, array: npt.NDArray[Any], wanted: Scalar) -> M
     return _apply(operation, array, wanted.value)
 
 
-def _compare_ints(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
+def _compare_ints(operation: str, array: Array, number: float) -> Mask:
     # NumPy would compare int64 with a float as float64, which cannot tell neighbours beyond 2**53 apart.
     limits = np.iinfo(array.dtype)
     if number > limits.max or number < limits.min:
@@ -242,7 +243,7 @@ def _compare_ints(operation: str, array: npt.NDArray[Any], number: float) -> Mas
     return _apply(operation, array, array.dtype.type(whole))
 
 
-def _compare_floats(operation: str, array: npt.NDArray[Any], number: float) -> Mask:
+def _compare_floats(operation: str, array: Array, number: float) -> Mask:
     # NumPy would round the number to float32 or float16 before it compares.
     array = array.astype(np.float64) if array.dtype.itemsize < 8 else array
     exact = against_floats(operation, number)
@@ -251,7 +252,7 @@ def _compare_floats(operation: str, array: npt.NDArray[Any], number: float) -> M
     return _apply(exact[0], array, np.float64(exact[1]))
 
 
-def _apply(operation: str, array: npt.NDArray[Any], value: Any) -> Mask:
+def _apply(operation: str, array: Array, value: Any) -> Mask:
     functions: dict[str, Callable[[Any, Any], Any]] = {
         "EQ": np.equal,
         "GT": np.greater,

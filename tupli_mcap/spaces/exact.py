@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.arrays import DType
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import StepError, warn
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
 
@@ -65,7 +65,7 @@ def _widen(dtype: DType, value: Any) -> DType:
     return np.dtype(wide.name)
 
 
-def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> np.ndarray[Any, Any]:
+def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> Array:
     """`value` as an array of `dtype` and `shape`, equal to it in every element; bools are 0 or 1, as in messages.
     Raises StepError for another shape, no numbers, or a value that `dtype` cannot hold exactly."""
     if isinstance(value, np.ma.MaskedArray):
@@ -104,7 +104,7 @@ def exact_flag(value: Any, name: str) -> bool:
     raise StepError(f"{name}: expected true or false, found {shorten(value)}")
 
 
-def exact_flags(values: Any, shape: tuple[int, ...], name: str, expected: str) -> np.ndarray[Any, Any]:
+def exact_flags(values: Any, shape: tuple[int, ...], name: str, expected: str) -> Array:
     """Flags of several steps as bools; raises StepError unless they are bools or the numbers 0 and 1, in that shape.
 
     `expected` says so in the error.
@@ -127,7 +127,7 @@ def _always_exact(source: DType, target: DType) -> bool:
     return np.can_cast(source, target, "safe") and source.kind != "f"
 
 
-def _equal(array: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
+def _equal(array: Array, cast: Array) -> bool:
     """Exact element-wise equality (NumPy would round an int64 to compare it with a float64).
 
     A float must also come back from the cast bit for bit: some casts lose -0.0 or the payload of a NaN.

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES
 
@@ -371,7 +372,7 @@ class _Fields:
             raise self.wrong(name, f"a list of at most {_MAX_DIMENSIONS} lengths")
         return tuple(value)
 
-    def array(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+    def array(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
         """An array of `shape`, from one number or from one for each element."""
         value = self.take(name)
         if not isinstance(value, list):
@@ -423,7 +424,7 @@ def _dtype_name(dtype: np.dtype[Any], path: str) -> str:
     return str(dtype.name)
 
 
-def _numbers(array: np.ndarray[Any, Any]) -> Any:
+def _numbers(array: Array) -> Any:
     """One number if all elements are the same bits, else the list of them; the opposite of `_Fields.array`."""
     if array.size and not any(array.strides):  # one element, spread
         array = array[(slice(1),) * array.ndim]

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.recording import EpisodeData, write_recording
@@ -66,7 +67,7 @@ def conform(value: Any, space: gym.Space[Any]) -> Any:
     return dtype.type(array) if isinstance(space, spaces.Discrete) else array  # type: ignore[union-attr]
 
 
-def _same_numbers(given: np.ndarray[Any, Any], cast: np.ndarray[Any, Any]) -> bool:
+def _same_numbers(given: Array, cast: Array) -> bool:
     if given.dtype.kind in "iu" and cast.dtype.kind == "f":
         # NumPy would compare them as floats, which cannot tell neighbours beyond 2**53 apart.
         with np.errstate(invalid="ignore"):
@@ -193,7 +194,7 @@ def _array_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
     raise SpaceError(f"{where}: expected values of one shape, found shapes {sorted(shapes)[:5]}")
 
 
-def _array(value: Any, where: str) -> np.ndarray[Any, Any]:
+def _array(value: Any, where: str) -> Array:
     try:
         array = np.asarray(value)
     except ValueError as err:

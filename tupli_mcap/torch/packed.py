@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch.multiprocessing.reductions import reduce_storage
 
+from tupli_mcap.arrays import Array
+
 _ALIGNED = 64  # bytes
 _NUMBERS = (np.ndarray, np.generic)
 _DYING = 0.5  # seconds after closing its files until a process is surely dead
@@ -70,7 +72,7 @@ def _same(now: tuple[Any, Any], then: tuple[Any, Any]) -> bool:
 
 def packed(columns: dict[str, Any]) -> PackedBatch:
     """Columns of arrays, copied into shared memory."""
-    arrays: list[np.ndarray[Any, Any]] = []
+    arrays: list[Array] = []
     ends = [0]
     places = _placed(columns, arrays, ends)
     storage = torch.UntypedStorage._new_shared(max(1, ends[-1]))  # type: ignore[no-untyped-call]  # as default_collate
@@ -81,7 +83,7 @@ def packed(columns: dict[str, Any]) -> PackedBatch:
     return PackedBatch(buffer, places)
 
 
-def _placed(column: Any, arrays: list[np.ndarray[Any, Any]], ends: list[int]) -> Any:
+def _placed(column: Any, arrays: list[Array], ends: list[int]) -> Any:
     """The places of arrays. (Not an inner function: a recursive one is a cycle, which would keep the arrays alive.)"""
     if isinstance(column, _NUMBERS):
         array = np.asarray(column)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items import SamplingError, Transitions
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import missing_extra
@@ -63,7 +64,7 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         batch = self._read(numbers.reshape(-1))
         return batch.reshape(numbers.shape)
 
-    def _read(self, numbers: np.ndarray[Any, Any]) -> TensorDict:
+    def _read(self, numbers: Array) -> TensorDict:
         columns = tensors(self._transitions[numbers].asdict())
         breaks = torch.from_numpy(np.isin(numbers, self._transitions.source.breaks))
         terminated = columns["terminals"]

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, TupliError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import spread_of
@@ -107,7 +108,7 @@ def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> Rollo
     return RolloutSummary(paths[-1], paths, len(returns), steps, mean, odd, seconds, size)
 
 
-def _returns(path: Path) -> np.ndarray[Any, Any]:
+def _returns(path: Path) -> Array:
     with Recording(path) as recording:
         return np.asarray(recording.index["return"])
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tupli_mcap.arrays import arrays_at
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.dataset.columns.load import Selected
 from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items.steps import map_arrays, pick
@@ -46,7 +46,7 @@ def batches(
     columns: Mapping[str, Any],
     layout: StepLayout | None,
     size: int,
-    order: np.ndarray[Any, Any] | None,
+    order: Array | None,
     parser: type[BaseTupleParser] | None,
 ) -> Iterator[Any]:
     """Batches of `size` steps in the given order of rows: lists of tuples, or the result of `parser`."""

@@ -7,6 +7,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError, missing_extra
 
 FrameFormat = Literal["png", "jpeg"]
@@ -84,7 +85,7 @@ def decode_picture(data: bytes | memoryview, where: str) -> Picture:
         raise FormatError(f"{where}: expected a PNG or a JPEG, found {_unread(data, err)}") from err
 
 
-def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
+def encode_pixels(pixels: Array) -> bytes:
     """uint8 pixels, (height, width, 1 or 3 or 4), as a PNG, which is exact."""
     flat = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels
     out = io.BytesIO()
@@ -92,7 +93,7 @@ def encode_pixels(pixels: np.ndarray[Any, Any]) -> bytes:
     return out.getvalue()
 
 
-def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> np.ndarray[Any, Any]:
+def decode_pixels(data: bytes, shape: tuple[int, int, int], most: int = 1) -> Array:
     """The pixels of a PNG that holds 1 to `most` pictures of shape (height, width, channels), one below the other.
     Raises FormatError if it is no PNG, or has another size, depth or kind, MissingExtraError if Pillow is not
     installed."""

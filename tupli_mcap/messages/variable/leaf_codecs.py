@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.exact import exact_array, shorten
@@ -73,10 +74,10 @@ class Leaf:
 
         return partial(exact_bytes, dtype=dtype, shape=shape) if dtype.kind == "b" else convert
 
-    def from_array(self, array: np.ndarray[Any, Any]) -> Any:
+    def from_array(self, array: Array) -> Any:
         return array[0] if self.scalar else array.reshape(self.shape)
 
-    def split(self, array: np.ndarray[Any, Any], number: int) -> tuple[Any, ...]:
+    def split(self, array: Array, number: int) -> tuple[Any, ...]:
         """The items of a Sequence, whose elements follow each other in `array`."""
         if self.shape == () and not self.scalar:
             return tuple([array[i : i + 1].reshape(()) for i in range(number)])

@@ -52,8 +52,8 @@ class KeptChunk:
 
     def __init__(self, data: Any) -> None:
         self.data = data
-        self.rows: np.ndarray[Any, Any] | None = None  # their headers checked
-        self.records: np.ndarray[Any, Any] | None = None  # where each begins and ends
+        self.rows: Array | None = None  # their headers checked
+        self.records: Array | None = None  # where each begins and ends
 
 
 class ChunkCache:
@@ -138,9 +138,7 @@ class ChunkStore:
     (if the source can be copied) has an empty one.
     """
 
-    def __init__(
-        self, source: Source, table: np.ndarray[Any, Any], memory: Memory, cache: int | ChunkCache
-    ) -> None:
+    def __init__(self, source: Source, table: Array, memory: Memory, cache: int | ChunkCache) -> None:
         self._source = source
         self.table = table
         self._memory = memory
@@ -152,7 +150,7 @@ class ChunkStore:
         # By step channel, the rows that the episode index names. Unless it is None, the rows of all channels are
         # compared with it and with the chunk table before they are returned.
         self.claims: Mapping[int, StepClaims] | None = None
-        self._by_channel: dict[int, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = {}
+        self._by_channel: dict[int, tuple[Array, Array]] = {}
         self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
             chosen = np.flatnonzero(table["channel"] == channel)
@@ -304,7 +302,7 @@ class ChunkStore:
         self._checked[i] = isinstance(record.obj, mmap)  # mapped data is checked once
         return memoryview(data)[skip:] if skip else data
 
-    def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> np.ndarray[Any, Any]:
+    def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> Array:
         """The rows of a chunk of constant layout as one structured array; their headers are checked."""
         _, _, _, _, n, _, _, channel, _, _ = self.table[i].item()
         kept = self._chunk(i, self.codecs.get(channel), keep=keep)

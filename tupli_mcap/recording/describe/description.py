@@ -294,14 +294,14 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, np.floating) else str(int(value))
 
 
-def _bound(values: np.ndarray[Any, Any]) -> str:
+def _bound(values: Array) -> str:
     if values.size == 0:
         return "-"
     low, high = values.min(), values.max()
     return f"{low:g}" if low == high else f"{low:g}..{high:g}"
 
 
-def spread_of(values: np.ndarray[Any, Any]) -> Spread | None:
+def spread_of(values: Array) -> Spread | None:
     """The spread of one number of each episode; None without an episode."""
     if len(values) == 0:
         return None
