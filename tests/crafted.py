@@ -8,7 +8,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
-from fuzzing.model import Model, Part
+from fuzzing.model import FileRecord, Model
 
 __all__ = ["Model", "find_step", "set_flags"]
 
@@ -16,7 +16,7 @@ _MESSAGE = 5
 _EPISODE = 35  # the offset of the episode and the step in the record of a message
 
 
-def find_step(model: Model, episode: int, step: int) -> tuple[Part, int]:
+def find_step(model: Model, episode: int, step: int) -> tuple[FileRecord, int]:
     """The chunk of a step, and the step's place in it."""
     assert model.index is not None
     topics = {int.from_bytes(body[:2], "little"): body for opcode, body in model.summary if opcode == 4}

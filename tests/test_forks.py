@@ -183,7 +183,7 @@ class TestAsyncVectorEnv:
         assert Recording(tmp_path / "a.mcap").n_steps == 10
 
 
-class Rows:
+class StepSamples:
     """Steps of a recording, one a sample."""
 
     def __init__(self, recording: Recording) -> None:
@@ -236,8 +236,8 @@ class TestDataLoader:
         with Recording(path) as recording:
             wanted = recording.read().states
         made: Any = {
-            "recording": lambda: Rows(Recording(path, cache_bytes=1)),
-            "file": lambda: Rows(Recording(path.open("rb"), cache_bytes=1)),
+            "recording": lambda: StepSamples(Recording(path, cache_bytes=1)),
+            "file": lambda: StepSamples(Recording(path.open("rb"), cache_bytes=1)),
             "dataset": lambda: Samples(TupliDataset.from_files(path)),
             "storage": lambda: Samples(TupliDataset(storage)),
         }[kind]()

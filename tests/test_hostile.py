@@ -23,7 +23,7 @@ from counting import calls, grows
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 from fuzzing.crafted import checksum
-from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, Model, Part, load_seeds, record, strings
+from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, FileRecord, Model, load_seeds, record, strings
 from fuzzing.oracle import observe
 
 from tupli_mcap import RecordEpisodes
@@ -141,7 +141,7 @@ def with_summary(opcode: int, times: int, change: Callable[[int, bytes], bytes])
 def attached(name: bytes, times: int = 1, claim: int = 1) -> bytes:
     file = model()
     body = bytes(16) + strings(name, b"text/plain") + struct.pack("<Q", claim) + b"x" + bytes(4)
-    file.parts[2:2] = [Part(ATTACHMENT, body)] * times
+    file.parts[2:2] = [FileRecord(ATTACHMENT, body)] * times
     return file.encode()
 
 

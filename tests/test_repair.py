@@ -43,9 +43,9 @@ from tupli_mcap.recording import RecoveryReport
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
-from tupli_mcap.recording.recover.damaged import gather, read_tail
+from tupli_mcap.recording.recover.damaged import gather, read_file_end
 from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
-from tupli_mcap.recording.recover.evidence import RecordedChannels, Tail
+from tupli_mcap.recording.recover.evidence import FileEnd, RecordedChannels
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -515,9 +515,9 @@ def records_between_damage(count: int) -> bytes:
 @pytest.mark.parametrize(
     ("make", "work"),
     [
-        (index_heads, lambda path: read_tail(PathSource(path))),
+        (index_heads, lambda path: read_file_end(PathSource(path))),
         (record_heads, verify_recording),
-        (record_heads, lambda path: gather(PathSource(path), Tail())),
+        (record_heads, lambda path: gather(PathSource(path), FileEnd())),
         (records_between_damage, verify_recording),
     ],
 )
@@ -582,7 +582,7 @@ class Looked(int):
 def test_a_step_is_not_held_against_each_piece_of_its_episode(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", steps=20, length=20)
     source = PathSource(path)
-    gathered = gather(source, read_tail(source))
+    gathered = gather(source, read_file_end(source))
     layout = Recording(path).layout
     (whole,) = make_plan(gathered, gathered.store(), layout, RecordedChannels.of(gathered, layout)).episodes
     source.close()

@@ -28,7 +28,7 @@ from tupli_mcap.storage import TupliAPIClient
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
 
 
-class Place(NamedTuple):
+class RunningServer(NamedTuple):
     """A server, its admin, and how to list what is kept."""
 
     url: str
@@ -45,7 +45,7 @@ class Place(NamedTuple):
 
 
 @contextlib.contextmanager
-def place_of(kind: str, directory: Path, **changes: Any) -> Iterator[Place]:
+def place_of(kind: str, directory: Path, **changes: Any) -> Iterator[RunningServer]:
     settings = replace(Settings(directory), **changes)
     with contextlib.ExitStack() as stack:
         bucket = None if kind == "directory" else stack.enter_context(buckets.bucket())
@@ -53,11 +53,11 @@ def place_of(kind: str, directory: Path, **changes: Any) -> Iterator[Place]:
         url = stack.enter_context(serving(settings))
         admin = stack.enter_context(TupliAPIClient(url))
         admin.login("admin", PASSWORD)
-        yield Place(url, admin, bucket, directory, settings)
+        yield RunningServer(url, admin, bucket, directory, settings)
 
 
 @pytest.fixture(params=["directory", "bucket", "presigned"])
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Place]:
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[RunningServer]:
     with place_of(request.param, tmp_path / request.param, presigned=request.param == "presigned") as place:
         yield place
 
@@ -86,7 +86,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_recording_comes_back_bit_for_bit_in_any_part(place: Place, large: Path) -> None:
+def test_a_recording_comes_back_bit_for_bit_in_any_part(place: RunningServer, large: Path) -> None:
     name, data = place.admin.push(large), large.read_bytes()
     told = place.admin._session.ask("POST", "/v1/tickets", {"recording": name})
     url, size = place.url + told["path"], len(data)
@@ -118,7 +118,7 @@ def test_a_recording_comes_back_bit_for_bit_in_any_part(place: Place, large: Pat
         )
 
 
-def test_nothing_is_left_of_what_is_deleted(place: Place, large: Path) -> None:
+def test_nothing_is_left_of_what_is_deleted(place: RunningServer, large: Path) -> None:
     item = place.admin.store_artifact(b"wind", ArtifactMetadata(name="wind"))
     name = place.admin.push(large)
     assert sorted(place.names()) == [f"artifacts/{item.id}", name]

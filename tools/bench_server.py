@@ -90,7 +90,7 @@ def synced(path: Path) -> float:
     return time.perf_counter() - begun
 
 
-class Place:
+class UploadTarget:
     """A server to which recordings are sent."""
 
     def __init__(self, url: str) -> None:
@@ -145,7 +145,10 @@ def transfers(options: argparse.Namespace, folder: Path) -> bool:
         )
         site += _DAV.format(port=static, root=root)
         stack.enter_context(nginx.running(site, static))
-        ours = {"serve": Place(direct.url), "nginx before serve": Place(f"http://127.0.0.1:{before}")}
+        ours = {
+            "serve": UploadTarget(direct.url),
+            "nginx before serve": UploadTarget(f"http://127.0.0.1:{before}"),
+        }
         alone = f"http://127.0.0.1:{static}/run.mcap"
         up: dict[str, list[float]] = {name: [] for name in ("nginx", "nginx and fsync", *ours)}
         down: dict[str, list[float]] = {name: [] for name in ("nginx", *ours)}
@@ -181,7 +184,7 @@ def memory(options: argparse.Namespace, folder: Path) -> bool:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     with served(folder / "served") as server:
         process = psutil.Process(server.pid)
-        place = Place(server.url)
+        place = UploadTarget(server.url)
         before = held(process)
         place.send(path, digest)
         sent = held(process)
@@ -198,7 +201,7 @@ def memory(options: argparse.Namespace, folder: Path) -> bool:
         query = f"POST /v1/query HTTP/1.1\r\n{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
         cut = most_held(process, options.clients, server.port, query)
     with served(folder / "another") as server:  # what was freed before stays with a process, and would count
-        process, token = psutil.Process(server.pid), Place(server.url).token
+        process, token = psutil.Process(server.pid), UploadTarget(server.url).token
         empty = held(process)
         many = most_held_by_uploads(process, options.clients, server.url, token, path, digest)
     print(f"resident MiB: {before:.0f} at first, {sent:.0f} after an upload of {options.mib} MiB")

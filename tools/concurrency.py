@@ -161,7 +161,7 @@ class Ledger:
         return []
 
 
-class Place(NamedTuple):
+class SharedPlace(NamedTuple):
     """Where a run happens."""
 
     root: Path
@@ -180,7 +180,9 @@ class Place(NamedTuple):
 class Worker:
     """One process: works until it is told to stop, or killed."""
 
-    def __init__(self, place: Place, slot: int, token: int, seed: int, until: float, beats: Any) -> None:
+    def __init__(
+        self, place: SharedPlace, slot: int, token: int, seed: int, until: float, beats: Any
+    ) -> None:
         self.place, self.slot, self.token, self.until = place, slot, token, until
         self.beats = beats
         self.random = random.Random(f"{seed}-{token}")
@@ -399,7 +401,7 @@ def _run_worker(kind: type[Any], *args: Any) -> None:
     worker.main(worker.work)
 
 
-def prepare(root: Path, benchmarks: int, bundles: int) -> Place:
+def prepare(root: Path, benchmarks: int, bundles: int) -> SharedPlace:
     """A storage with benchmarks, and bundles from elsewhere to be imported."""
     storage = FileStorage(root / "lab")
     ids = [TupliEnvWrapper(Told(0), storage).store(name=f"shared {i}") for i in range(benchmarks)]
@@ -417,7 +419,7 @@ def prepare(root: Path, benchmarks: int, bundles: int) -> Place:
         env.close()
         paths.append(elsewhere.bundle(uri, root / f"foreign{i}.mcap"))
         elsewhere.close()
-    return Place(root, ids, paths)
+    return SharedPlace(root, ids, paths)
 
 
 def run(
@@ -465,7 +467,7 @@ def run(
     return figures + verify(place)
 
 
-def _check_alive(processes: list[Any], beats: Any, patience: float, place: Place) -> None:
+def _check_alive(processes: list[Any], beats: Any, patience: float, place: SharedPlace) -> None:
     errors = place.ledger.lines("errors")
     if errors:
         raise WrongError("\n".join(errors[:80]))
@@ -478,7 +480,7 @@ def _check_alive(processes: list[Any], beats: Any, patience: float, place: Place
             raise WrongError(f"process {slot} has waited for {patience:.0f} s")
 
 
-def verify(place: Place) -> Counter[str]:
+def verify(place: SharedPlace) -> Counter[str]:
     """Compares the storage with the ledgers."""
     figures: Counter[str] = Counter()
     storage, ledger = FileStorage(place.storage), place.ledger

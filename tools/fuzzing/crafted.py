@@ -19,8 +19,8 @@ from fuzzing.model import (
     CHUNK,
     METADATA,
     SCHEMA,
+    FileRecord,
     Model,
-    Part,
     Seed,
     footer,
     pack,
@@ -489,7 +489,7 @@ def attachment(rng: random.Random, seed: Seed, _: Sequence[Seed]) -> Mutant:
         rng.choice(found).body = body
     else:
         at = next(i for i, part in enumerate(model.parts) if part.opcode == METADATA) + 1
-        model.parts[at:at] = [Part(ATTACHMENT, body)] * rng.choice([1, 1, 2])
+        model.parts[at:at] = [FileRecord(ATTACHMENT, body)] * rng.choice([1, 1, 2])
     return _mutant(model, seed, f"attachment {name[:20]!r}: {data[:80]!r}")
 
 

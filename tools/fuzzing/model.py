@@ -25,9 +25,9 @@ __all__ = [
     "CHUNK",
     "FOOTER",
     "INDEX",
+    "FileRecord",
     "Index",
     "Model",
-    "Part",
     "Seed",
     "load_seeds",
     "pack",
@@ -70,7 +70,7 @@ def unpack(name: bytes, data: bytes, size: int) -> bytes:
 
 
 @dataclass
-class Part:
+class FileRecord:
     """A record of the data section; of a chunk, `inner` are its records and `head` the fields before them."""
 
     opcode: int
@@ -135,14 +135,14 @@ def strings(*texts: bytes) -> bytes:
 class Model:
     """The parts of a recording up to its index, the index, and the summary's other records."""
 
-    parts: list[Part]
+    parts: list[FileRecord]
     index: Index | None
     summary: list[tuple[int, bytes]]
     index_times: bytes = bytes(16)
 
     @classmethod
     def of(cls, data: bytes) -> Model:
-        parts: list[Part] = []
+        parts: list[FileRecord] = []
         index, times = None, bytes(16)
         records = split(data[len(MAGIC) :])
         summary: list[tuple[int, bytes]] = []
@@ -158,14 +158,14 @@ class Model:
                 name = body[_CHUNK_HEAD.size : _CHUNK_HEAD.size + length]
                 inner = unpack(name, body[_CHUNK_HEAD.size + length + 8 :], size)
                 pieces = [record(kind, piece) for kind, _, piece in split(inner)]
-                parts.append(Part(CHUNK, b"", pieces, name, (start, end)))
+                parts.append(FileRecord(CHUNK, b"", pieces, name, (start, end)))
             elif opcode == ATTACHMENT and INDEX_NAME.encode() in body[:64]:
                 index, times = Index.decode(_attachment_data(body)), body[:16]
             else:
-                parts.append(Part(opcode, body))
+                parts.append(FileRecord(opcode, body))
         return cls(parts, index, summary, times)
 
-    def chunks(self) -> list[Part]:
+    def chunks(self) -> list[FileRecord]:
         return [part for part in self.parts if part.opcode == CHUNK]
 
     def encode(self) -> bytes:
@@ -206,7 +206,7 @@ def footer(start: int, offsets: int, summary: bytes) -> bytes:
     return head + zlib.crc32(head, zlib.crc32(summary)).to_bytes(4, "little") + MAGIC
 
 
-def _place(row: Array, part: Part, at: int, data: bytes) -> None:
+def _place(row: Array, part: FileRecord, at: int, data: bytes) -> None:
     inner = b"".join(part.inner)
     row["offset"], row["length"] = at, len(data)
     row["uncompressed"] = (len(inner) if part.size is None else part.size) & (2**64 - 1)
@@ -215,7 +215,7 @@ def _place(row: Array, part: Part, at: int, data: bytes) -> None:
     row["skip"] = sum(len(piece) for piece in part.inner if piece[:1] != b"\x05")
 
 
-def _chunk_index(part: Part, at: int, data: bytes) -> bytes:
+def _chunk_index(part: FileRecord, at: int, data: bytes) -> bytes:
     head = struct.pack("<QQQQI", *part.times, at, len(data), 0)
     return head + bytes(8) + strings(part.compression) + struct.pack("<QQ", len(data), len(data))
 

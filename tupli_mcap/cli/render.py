@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _MOST_NAMES = 5
 
 
-_Source = Annotated[
+_Recordings = Annotated[
     str,
     typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it."),
 ]
@@ -49,7 +49,7 @@ _Rerun = Annotated[
 
 
 def render(
-    source: _Source,
+    source: _Recordings,
     output: _Output,
     episodes: Episodes = "best",
     filter_text: FilterText = None,

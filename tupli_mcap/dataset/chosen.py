@@ -23,13 +23,13 @@ from tupli_mcap.remote import is_server, is_url, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset.sources import Source as EpisodeSource
+    from tupli_mcap.dataset.sources import EpisodeSource
     from tupli_mcap.storage import TupliStorage
 
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
-Source = Recording | str | os.PathLike[str]
-Examinable: TypeAlias = Union[Source, "Listed", "TupliStorage"]
+AnyRecording = Recording | str | os.PathLike[str]
+Examinable: TypeAlias = Union[AnyRecording, "Listed", "TupliStorage"]
 
 
 @runtime_checkable
@@ -146,7 +146,9 @@ def _unopened() -> AbstractContextManager[Recording]:
 
 @contextlib.contextmanager
 def chosen_from(
-    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+    sources: AnyRecording | Sequence[AnyRecording],
+    episodes: str | Sequence[int] | None,
+    filter: BaseFilter | str | None,
 ) -> Iterator[list[Chosen]]:
     """The chosen episodes of recordings, which are open within the block.
 
@@ -181,7 +183,9 @@ def chosen_from(
 
 
 def chosen_ids(
-    sources: Source | Sequence[Source], episodes: str | Sequence[int] | None, filter: BaseFilter | str | None
+    sources: AnyRecording | Sequence[AnyRecording],
+    episodes: str | Sequence[int] | None,
+    filter: BaseFilter | str | None,
 ) -> set[str]:
     """The ids of the episodes that `chosen_from` gives, with the same errors."""
     with chosen_from(sources, episodes, filter) as chosen:

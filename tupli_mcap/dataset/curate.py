@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.sources import DatasetError, Episodes, Source
+from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource
 from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.container import Container
@@ -303,7 +303,7 @@ def relabel(
 
 
 def delete(
-    source: Source,
+    source: EpisodeSource,
     by_recording: Mapping[tuple[str, str], Collection[int]],
     *,
     force: bool = False,

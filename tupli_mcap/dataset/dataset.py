@@ -24,10 +24,10 @@ from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.keys import check_metadata, keys_of, matching, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
+    EpisodeSource,
     FilesSource,
     JoinedSource,
     OpenRecordings,
-    Source,
     checked_whole,
     numbers_by_recording,
     place_of,
@@ -59,7 +59,7 @@ class Dataset(RandomAccess):
     Use `tupli_mcap.open` to make one.
     """
 
-    def __init__(self, source: Source, headers: Sequence[EpisodeHeader] | None = None) -> None:
+    def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source
         self._filter: BaseFilter | None = None  # is true of the episodes; `save` notes it
         self._listed = None if headers is None else list(headers)
@@ -125,7 +125,7 @@ class Dataset(RandomAccess):
         for header in self.headers:
             yield self._episode(header)
 
-    def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
+    def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes that match the filter."""
         return self._source, (self if filter is None else self.filter(filter)).headers
 

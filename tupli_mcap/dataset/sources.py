@@ -54,7 +54,7 @@ def checked_whole(value: object, least: int, what: str) -> int:
     return int(value)
 
 
-class Source(Protocol):
+class EpisodeSource(Protocol):
     """Lists episodes and opens their recordings."""
 
     def episodes(self, episode_filter: BaseFilter | None) -> list[EpisodeHeader]:
@@ -234,9 +234,9 @@ class JoinedSource:
     """The recordings of several sources, each with its wanted episodes.
     DatasetError if two sources have different recordings with the same name."""
 
-    def __init__(self, sources: Sequence[tuple[Source, Sequence[EpisodeHeader]]]) -> None:
+    def __init__(self, sources: Sequence[tuple[EpisodeSource, Sequence[EpisodeHeader]]]) -> None:
         self._sources = [source for source, _ in sources]
-        self._of: dict[str, tuple[Source, str]] = {}
+        self._of: dict[str, tuple[EpisodeSource, str]] = {}
         for source, headers in sources:
             for header in headers:
                 uuid = uuid_of(header)

@@ -18,7 +18,7 @@ from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.dataset.query import Query
-from tupli_mcap.dataset.sources import FilesSource, Source, StorageSource, checked_whole
+from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
@@ -189,7 +189,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     def _headers(self) -> Sequence[EpisodeHeader]:
         return self._query.headers
 
-    def _episodes(self, filter: BaseFilter | None) -> tuple[Source, Sequence[EpisodeHeader]]:
+    def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes, listed again, that also match the filter."""
         dataset = self if filter is None else self.with_episode_filter(filter)
         return dataset._query.source, dataset.preview()

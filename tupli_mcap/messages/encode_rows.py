@@ -28,7 +28,7 @@ from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.encode_values import (
     Packed,
-    Source,
+    SourceCode,
     access_to,
     add_fields,
     add_structure_checks,
@@ -146,9 +146,9 @@ def _compiled(text: str) -> CodeType:
 
 def _code(layout: StepLayout, images: Sequence[ImageSink], *, is_sealed: bool) -> tuple[str, dict[str, Any]]:
     """The source of the encoder of a layout, and the objects that it names."""
-    size, source = layout.step_message.record_size, Source()
+    size, source = layout.step_message.record_size, SourceCode()
     tail = _tail(source, layout)
-    state = Source(source.names)
+    state = SourceCode(source.names)
     head = _head(state, layout)
     puts, firsts, advance = [], [], []
     for i, leaf in enumerate(layout.images):
@@ -201,7 +201,7 @@ def _code(layout: StepLayout, images: Sequence[ImageSink], *, is_sealed: bool) -
     return text, names
 
 
-def _tail(source: Source, layout: StepLayout) -> Packed:
+def _tail(source: SourceCode, layout: StepLayout) -> Packed:
     """The end of a row, behind its state, and the start of the next one up to its state."""
     message = layout.step_message
     after_state = [leaf.name for leaf in (*layout.action, *layout.reward) if leaf.size] + ["terminal"]
@@ -216,7 +216,7 @@ def _tail(source: Source, layout: StepLayout) -> Packed:
     return packed
 
 
-def _head(source: Source, layout: StepLayout) -> Packed:
+def _head(source: SourceCode, layout: StepLayout) -> Packed:
     """The state of a row."""
     packed = Packed(PREFIX, PREFIX)
     add_structure_checks(source, layout.observation_space, "state")

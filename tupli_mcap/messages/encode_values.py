@@ -24,7 +24,7 @@ _INT_FORMATS = {
 
 
 @dataclass
-class Source:
+class SourceCode:
     """Lines of a generated function, and the objects that they name."""
 
     names: dict[str, Any] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Packed:
         self.offset = offset + size
 
 
-def add_structure_checks(source: Source, space: Any, expression: str) -> None:
+def add_structure_checks(source: SourceCode, space: Any, expression: str) -> None:
     """Lines that raise TypeError unless tuples and dicts are those of the space."""
     if type(space) not in (spaces.Dict, spaces.Tuple):
         return
@@ -70,13 +70,15 @@ def add_structure_checks(source: Source, space: Any, expression: str) -> None:
             add_structure_checks(source, sub, access_to(source, expression, (key,)))
 
 
-def access_to(source: Source, root: str, keys: Sequence[Any]) -> str:
+def access_to(source: SourceCode, root: str, keys: Sequence[Any]) -> str:
     """The expression of a leaf: `state['arm'][0]`."""
     parts = [repr(key) if type(key) in (str, int) else source.bind("key", key) for key in keys]
     return root + "".join(f"[{part}]" for part in parts)
 
 
-def add_fields(source: Source, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: Packed) -> None:
+def add_fields(
+    source: SourceCode, layout: StepLayout, leaves: Sequence[Leaf], root: str, packed: Packed
+) -> None:
     """Lines that check the leaves of an action, a state or a reward, and what packs them."""
     for i, leaf in enumerate(leaves):
         if leaf.apart:
@@ -94,7 +96,7 @@ def add_fields(source: Source, layout: StepLayout, leaves: Sequence[Leaf], root:
         _leaf(source, leaf, dtype, value, offset, packed)
 
 
-def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, packed: Packed) -> None:
+def _leaf(source: SourceCode, leaf: Leaf, dtype: DType, value: str, offset: int, packed: Packed) -> None:
     nbytes = leaf.size * dtype.itemsize
     if leaf.kind == "scalar" and dtype.kind in "iu":
         exact = source.bind("exact", lambda value: int(exact_array(value, dtype, leaf.shape, leaf.path)))
@@ -141,7 +143,7 @@ def _leaf(source: Source, leaf: Leaf, dtype: DType, value: str, offset: int, pac
             packed.add(offset, f"{nbytes}s", nbytes, raw)
 
 
-def flag_check(source: Source, name: str) -> str:
+def flag_check(source: SourceCode, name: str) -> str:
     """The line that makes a bool of a flag."""
     exact, kind = source.bind("exact", exact_flag), source.bind("kind", np.bool_)
     return (

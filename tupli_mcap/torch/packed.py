@@ -21,7 +21,7 @@ _NUMBERS = (np.ndarray, np.generic)
 _DYING = 0.5  # seconds after closing its files until a process is surely dead
 
 
-class _Place(NamedTuple):
+class _TensorPlace(NamedTuple):
     """The place of a tensor in the shared memory."""
 
     start: int
@@ -90,7 +90,7 @@ def _placed(column: Any, arrays: list[Array], ends: list[int]) -> Any:
         start = -(-ends[-1] // _ALIGNED) * _ALIGNED
         arrays.append(array)
         ends.append(start + array.nbytes)
-        return _Place(start, ends[-1], torch.from_numpy(np.empty(0, array.dtype)).dtype, array.shape)
+        return _TensorPlace(start, ends[-1], torch.from_numpy(np.empty(0, array.dtype)).dtype, array.shape)
     if isinstance(column, Mapping):
         return {key: _placed(part, arrays, ends) for key, part in column.items()}
     return tuple(_placed(part, arrays, ends) for part in column) if isinstance(column, tuple) else column
@@ -113,7 +113,7 @@ def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: d
 
 
 def _unpacked(buffer: torch.Tensor, place: Any) -> Any:
-    if isinstance(place, _Place):
+    if isinstance(place, _TensorPlace):
         return buffer[place.start : place.stop].view(place.dtype).view(place.shape)
     if isinstance(place, Mapping):
         return {key: _unpacked(buffer, part) for key, part in place.items()}

@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from tupli_mcap.dataset.items import Items, SamplingError
-from tupli_mcap.dataset.items.shuffle import Blocks, Part, ShuffledBatches, mixing
+from tupli_mcap.dataset.items.shuffle import Blocks, Share, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 
@@ -126,7 +126,7 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             raise SamplingError(
                 f"expected a number of workers that divides streams={streams}, found {workers} workers"
             )
-        part = Part(self._rank, self._ranks, streams)
+        part = Share(self._rank, self._ranks, streams)
         total = len(self._reader.items)
         return ShuffledBatches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tupli_mcap.dataset.chosen import Source, chosen_from
+from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.plan import Form, Plan, extremes_of, plans_of
@@ -31,7 +31,7 @@ __all__ = ["Form", "ViewerError", "blueprint", "display", "in_notebook", "save",
 
 
 def save(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     target: str | os.PathLike[str],
     episodes: str | Sequence[int] | None = None,
     *,
@@ -67,7 +67,7 @@ def save(
 
 
 def show(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -94,7 +94,7 @@ def show(
 
 
 def display(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -118,7 +118,7 @@ def display(
 
 
 def serve(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -141,7 +141,7 @@ def serve(
 
 
 def blueprint(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -168,7 +168,7 @@ def send(recording: Recording, stream: Any = None, episodes: str | Sequence[int]
 
 @contextlib.contextmanager
 def _planned(
-    sources: Source | Sequence[Source],
+    sources: AnyRecording | Sequence[AnyRecording],
     episodes: str | Sequence[int] | None,
     filter: Any,
     form: Form,

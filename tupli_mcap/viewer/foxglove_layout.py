@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.dataset.chosen import Source, chosen_from
+from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording
@@ -39,7 +39,7 @@ _PLOT = {
 
 
 def write_layout(
-    sources: Source | Sequence[Source], target: str | os.PathLike[str], *, overwrite: bool = False
+    sources: AnyRecording | Sequence[AnyRecording], target: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Path:
     """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts).
 

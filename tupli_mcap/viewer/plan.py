@@ -22,7 +22,7 @@ from tupli_mcap.viewer.about import run_title, send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.panels import PALETTE, Place
+from tupli_mcap.viewer.panels import PALETTE, PanelPlace
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
@@ -34,7 +34,7 @@ _FEW = 10  # up to so many episodes are all shown, and described one by one
 _EACH = 3  # up to so many recordings, episodes are chosen from each
 
 
-class Part(NamedTuple):
+class ShownEpisodes(NamedTuple):
     """Episodes whose panels are below one root; their rows are numbered from `first`."""
 
     chosen: Chosen
@@ -60,7 +60,7 @@ class Plan(NamedTuple):
 
     name: str
     identity: str
-    parts: Sequence[Part]
+    parts: Sequence[ShownEpisodes]
     shown: str
     listed: bool = False  # it is one of several, so the viewer shows its list of recordings
 
@@ -104,14 +104,14 @@ class Plan(NamedTuple):
         for part in self.parts:
             steps[part.root] = steps.get(part.root, 0) + part.steps
         for part in self.parts:
-            place = Place(stream, part.root, part.title, part.color, single=steps[part.root] == 1)
+            place = PanelPlace(stream, part.root, part.title, part.color, single=steps[part.root] == 1)
             for panel in part.scene.panels:
                 panel.declare(place)
             for block in blocks_of(*part.chosen, part.first):
                 _send_block(place, part.scene, block)
 
 
-def _send_block(place: Place, scene: Scene, block: Block) -> None:
+def _send_block(place: PanelPlace, scene: Scene, block: Block) -> None:
     states = block.with_finals()
     times, state_times = times_of(block), times_of(states)
     for panel in scene.panels:
@@ -186,17 +186,17 @@ def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         for position in item.positions:
             number = item.recording.episodes[position].number
             name = f"episode {number} · {run_title(item.recording)}"  # the viewer's list shows only the beginning
-            part = Part(Chosen(item.recording, [position]), scene)
+            part = ShownEpisodes(Chosen(item.recording, [position]), scene)
             text = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
     scene = scene_of(*chosen[0])
-    parts: list[Part] = []
+    parts: list[ShownEpisodes] = []
     first = 0
     for item in chosen:
-        parts.append(Part(item, scene, first=first))
+        parts.append(ShownEpisodes(item, scene, first=first))
         first += parts[-1].rows
     total = sum(len(item.positions) for item in chosen)
     if total == 1:
@@ -210,7 +210,7 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
     return Plan(name, chosen[0].recording.uuid, parts, text)
 
 
-def _told_in_turn(parts: Sequence[Part]) -> Iterator[str]:
+def _told_in_turn(parts: Sequence[ShownEpisodes]) -> Iterator[str]:
     """For each episode, its first step on the timeline, and its facts."""
     yield "\n"
     for part in parts:
@@ -254,7 +254,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
                 "with different ones; show them without --compare"
             )
     scene = scene_of(*chosen[0], apart=True)
-    parts: list[Part] = []
+    parts: list[ShownEpisodes] = []
     titles = [run_title(item.recording) for item in chosen]
     if len(set(titles)) < len(titles):  # files of one run
         titles = [Path(item.recording.name).stem for item in chosen]
@@ -266,7 +266,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
             if root in {part.root for part in parts}:  # files of one name
                 root += f"_{len(parts)}"
             color = PALETTE[len(parts) % len(PALETTE)]
-            parts.append(Part(Chosen(item.recording, [position]), scene, root, title, color))
+            parts.append(ShownEpisodes(Chosen(item.recording, [position]), scene, root, title, color))
     scene.rows = max(int(row_counts(*item).max()) for item in chosen)
     lines = [
         f"\n- {_episode_in_short(item.recording, position, f' of {plain(name)}' if len(chosen) > 1 else '')}"

@@ -30,7 +30,7 @@ _CHOOSE: Final = (
 )
 
 
-class _Part(NamedTuple):
+class _Segment(NamedTuple):
     """Steps of one episode, or if `whole` of several, each ended by a flag; they have a final state each, or none."""
 
     env: int
@@ -149,7 +149,7 @@ def write_rollout(
 
 def _rollout_of(
     given: _Given, autoreset: Any, reward_space: gym.Space[Any] | None
-) -> tuple[Iterable[_Part], _Given, int, int | None]:
+) -> tuple[Iterable[_Segment], _Given, int, int | None]:
     """The parts to write, values for the spaces, how many axes these have before those of one step, and the number of
     streams."""
     for name, value in zip(given._fields[:3], given, strict=False):
@@ -180,7 +180,7 @@ class _Given(NamedTuple):
     seeds: Any
 
 
-def _write(writer: EpisodeWriter, part: _Part) -> None:
+def _write(writer: EpisodeWriter, part: _Segment) -> None:
     steps = part.states, part.actions, part.rewards, part.terminals, part.timeouts
     if part.whole:
         writer.episodes(*steps, part.final_state, env=part.env)
@@ -196,7 +196,7 @@ def _write(writer: EpisodeWriter, part: _Part) -> None:
 # ---- lists of episodes
 
 
-def _episodes(given: _Given) -> Iterator[_Part]:
+def _episodes(given: _Given) -> Iterator[_Segment]:
     """The episodes of lists of arrays."""
     for i in range(len(given.rewards)):
         one = _episode(given, i)
@@ -212,7 +212,7 @@ def _episodes(given: _Given) -> Iterator[_Part]:
             told = one.next_states is not None or _length(states) == n
             final = arrays_at(one.next_states, n - 1) if told else arrays_at(states, n)
         flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
-        yield _Part(
+        yield _Segment(
             0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, one.infos,
             one.episode_metadata or {}, one.seeds, name=f"episode {i}: ",
         )  # fmt: skip
@@ -244,7 +244,7 @@ def _episode_flags(given: Any, n: int) -> Array:
 # ---- arrays of steps
 
 
-def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Part]:
+def _streams(given: _Given, lead: int, mode: str) -> Iterator[_Segment]:
     """The episodes of arrays [T, …] or [T, N, …], one sub-environment after the other; StepError if arrays do not fit
     together; at once, before anything is written."""
     shape = given.rewards.shape[:lead]
@@ -294,7 +294,7 @@ def _spans(done: Array, mode: str) -> tuple[Array, Array]:
 
 def _parts(
     given: _Given, finals: _Finals, column: tuple[int, ...], spans: tuple[Array, Array]
-) -> Iterator[_Part]:
+) -> Iterator[_Segment]:
     """The episodes of one sub-environment; consecutive whole ones are one part."""
     begins, ends = spans
     alone, known = ~finals.done[ends, *column], finals.known(ends, column)
@@ -314,7 +314,7 @@ def _parts(
         states, actions, rewards, terminals, timeouts, infos = (
             arrays_at(tree, where) for tree in (*given[:5], given.infos)
         )
-        yield _Part(
+        yield _Segment(
             env, states, actions, rewards, terminals, timeouts, finals.at(last, column), infos,
             given.episode_metadata or {}, None if first else given.seeds[env], whole,
         )  # fmt: skip

@@ -39,7 +39,7 @@ _BEGINNING = 30.0  # seconds for that, at most
 _ESTABLISHED = "01"
 
 
-class _Place(NamedTuple):
+class _ViewPlace(NamedTuple):
     """Where a side's view goes, and whether somebody is there."""
 
     url: str
@@ -89,7 +89,7 @@ def compare(run: Run, workload: Workload) -> Iterator[Target]:
     per_step: dict[str, list[float]] = {}
     cores: dict[str, list[float]] = {}
 
-    def side(name: str, place: _Place | None) -> Callable[[], float]:
+    def side(name: str, place: _ViewPlace | None) -> Callable[[], float]:
         def ratio() -> float:
             bare, watched, core = _slices(run, workload, place)
             per_step.setdefault(name, []).append(watched * 1e6)
@@ -111,7 +111,7 @@ def compare(run: Run, workload: Workload) -> Iterator[Target]:
         yield at_most(f"live view of {workload.name}, {name}, over none", _LIMIT, figure, note, "x")
 
 
-def _slices(run: Run, workload: Workload, place: _Place | None) -> tuple[float, float, float]:
+def _slices(run: Run, workload: Workload, place: _ViewPlace | None) -> tuple[float, float, float]:
     """Seconds per step of a recorder without a view, and of another with its view at work; and how much of a core the
     view's process takes meanwhile."""
     from tupli_mcap import RecordEpisodes
@@ -168,7 +168,7 @@ def _per_step(slices: list[_Slice]) -> float:
     return sum(one.seconds for one in slices) / sum(one.steps for one in slices)
 
 
-def _begin(rollout: _Rollout, place: _Place | None) -> None:
+def _begin(rollout: _Rollout, place: _ViewPlace | None) -> None:
     """Takes steps until the recorder is warm, the view has begun and whoever is to listen does."""
     warm = time.monotonic() + _WARM
     while time.monotonic() < warm:
@@ -190,7 +190,7 @@ def _is_connected(port: int) -> bool:
 
 
 @contextlib.contextmanager
-def _viewers() -> Iterator[dict[str, _Place | None]]:
+def _viewers() -> Iterator[dict[str, _ViewPlace | None]]:
     """By side, where its view goes; what is connected is listened to for as long as the context lasts."""
     ports = [_free_port() for _ in range(4)]
     rerun = [sys.executable, "-m", "rerun", "--serve-grpc", "--bind", "127.0.0.1"]
@@ -206,10 +206,10 @@ def _viewers() -> Iterator[dict[str, _Place | None]]:
         time.sleep(3.0)
         rerun_urls = [f"rerun+http://127.0.0.1:{port}/proxy" for port in ports[:2]]
         yield {
-            "Rerun, connected": _Place(rerun_urls[0], ports[0], connected=True),
-            "Rerun, no viewer": _Place(rerun_urls[1], ports[1], connected=False),
-            "Foxglove, connected": _Place(f"ws://127.0.0.1:{ports[2]}", ports[2], connected=True),
-            "Foxglove, nobody there": _Place(f"ws://127.0.0.1:{ports[3]}", ports[3], connected=False),
+            "Rerun, connected": _ViewPlace(rerun_urls[0], ports[0], connected=True),
+            "Rerun, no viewer": _ViewPlace(rerun_urls[1], ports[1], connected=False),
+            "Foxglove, connected": _ViewPlace(f"ws://127.0.0.1:{ports[2]}", ports[2], connected=True),
+            "Foxglove, nobody there": _ViewPlace(f"ws://127.0.0.1:{ports[3]}", ports[3], connected=False),
             _CONTROL: None,
         }
 

@@ -26,7 +26,7 @@ from tupli_mcap.remote import is_url
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
-Source = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")]
+RecordingFile = Annotated[str, typer.Argument(metavar="FILE", help="A recording: a path or a URL.")]
 
 
 def bundle(
@@ -104,7 +104,7 @@ def export(
 
 
 def import_(
-    file: Source,
+    file: RecordingFile,
     storage_path: StoragePath = DEFAULT_STORAGE,
     trust: Annotated[bool, typer.Option("--trust", help="Also trust the code of its environment.")] = False,
     require_signature: Annotated[

@@ -14,7 +14,7 @@ from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
-from tupli_mcap.dataset.sources import Source
+from tupli_mcap.dataset.sources import EpisodeSource
 from tupli_mcap.errors import FilterError, SpaceError, did_you_mean, memory_for, warn
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -45,7 +45,7 @@ class Selected:
 
 
 def read_columns(
-    source: Source,
+    source: EpisodeSource,
     headers: Sequence[EpisodeHeader],
     fields: Sequence[str],
     selector: TupleSelector | None = None,
@@ -76,7 +76,9 @@ def read_columns(
         return reader.finish(headers)
 
 
-def read_in_order(source: Source, headers: Sequence[EpisodeHeader], fields: Sequence[str]) -> dict[str, Any]:
+def read_in_order(
+    source: EpisodeSource, headers: Sequence[EpisodeHeader], fields: Sequence[str]
+) -> dict[str, Any]:
     """Columns of all steps of episodes in any order, as `read_columns` reads them; opens each recording once."""
     places = {name: i for i, name in enumerate(dict.fromkeys(header.recording for header in headers))}
     order = np.argsort([places[header.recording] for header in headers], kind="stable")

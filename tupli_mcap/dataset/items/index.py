@@ -135,7 +135,7 @@ class StepIndex:
         self.layouts = [StepLayout.from_metadata(metadata) for metadata in state["layouts"]]
 
 
-class _Part(NamedTuple):
+class _FileEpisodes(NamedTuple):
     """The episodes of one file: rows of its index, and how many steps of each are meant."""
 
     stored: StoredSteps
@@ -165,7 +165,7 @@ class _Builder:
         self._names: list[str] = []
         self._known: dict[tuple[str, ...], int] = {}
         self._layout_of: list[int] = []
-        self._parts: list[_Part] = []
+        self._parts: list[_FileEpisodes] = []
         self._digest = hashlib.sha256()
 
     def add(self, recording: Recording, listed: ListedEpisodes) -> None:
@@ -175,7 +175,9 @@ class _Builder:
             source = FileOfMany(self._files, stored.where, source.path, source)
         rows = recording.index[positions_of(recording, listed)]
         self._layout_of.append(self._layout(recording.name, stored.layout))
-        self._parts.append(_Part(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths))
+        self._parts.append(
+            _FileEpisodes(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths)
+        )
         self._digest.update(f"{recording.uuid} {len(rows)} ".encode())
         self._digest.update(rows["episode"].tobytes() + listed.lengths.tobytes())
 
@@ -223,7 +225,7 @@ class _Builder:
             builder.add(file, *part.store.locate(channels[on], next_rows, np.ones_like(next_rows)))
         return builder.build()
 
-    def _places(self, part: _Part, path: str | None) -> tuple[Array, Array]:
+    def _places(self, part: _FileEpisodes, path: str | None) -> tuple[Array, Array]:
         """The channel of the steps (or images) of each episode, and its first row there."""
         stored = part.stored
         image = next((leaf.name for leaf in stored.layout.images if leaf.path == path), None)

@@ -11,8 +11,8 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.segments import Segments
 from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
-from tupli_mcap.recording.columns.gather import Column, Rows, do_all
-from tupli_mcap.recording.columns.runs import Part
+from tupli_mcap.recording.columns.gather import Column, GatheredRows, do_all
+from tupli_mcap.recording.columns.runs import ChunkPart
 
 # Threads that decode small chunks contend for the interpreter lock at each one: for few chunks, one thread is faster.
 _FEW_CHUNKS = 128
@@ -27,7 +27,7 @@ class NumberedRows:
     threads may read the same chunk, with the same result.
     """
 
-    def __init__(self, rows: Rows, segments: Segments) -> None:
+    def __init__(self, rows: GatheredRows, segments: Segments) -> None:
         self._rows, self._segments = rows, segments
         self._held: _HeldColumns | None = None
 
@@ -79,7 +79,7 @@ class NumberedRows:
         tasks = self._rows.tasks(held.columns, parts, keep=False)
         self._rows.fetch(parts)
 
-        def fill(unit: int, part: Part, task: Callable[[], None]) -> None:
+        def fill(unit: int, part: ChunkPart, task: Callable[[], None]) -> None:
             task()
             self._rows.check(held.columns, [part], whole=False)
             held.there[unit] = True  # last, since another thread may read it
@@ -107,11 +107,11 @@ class _HeldColumns:
         wanted[self._segments.units[self._segments.of(rows)]] = True
         return np.flatnonzero(wanted & ~self.there).tolist()
 
-    def part(self, unit: int) -> Part:
+    def part(self, unit: int) -> ChunkPart:
         """The rows of a unit, and their places."""
         chosen = self._order[self._ends[unit] : self._ends[unit + 1]]
         begins, starts = self._segments.begins[chosen], self._segments.starts[chosen]
         steps = np.append(self._segments.starts[1:], self._segments.total)[chosen] - starts
-        return Part(
+        return ChunkPart(
             int(self._segments.file_of[unit]), int(self._segments.chunk_of[unit]), begins, steps, starts
         )

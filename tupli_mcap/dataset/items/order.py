@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES
-from tupli_mcap.dataset.items.shuffle import Blocks, Part, ShuffledBatches, mixing
+from tupli_mcap.dataset.items.shuffle import Blocks, Share, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import Numbered, SamplingError, checked_count
 
 Shuffle = Literal["exact", "blocks"]
@@ -110,7 +110,7 @@ class Order:
             key = [self.seed, epoch]
             return iter(
                 ShuffledBatches(
-                    self._blocks, self._n, self.batch_size, Part(0, 1, 1), key, self._mix, drop_last=False
+                    self._blocks, self._n, self.batch_size, Share(0, 1, 1), key, self._mix, drop_last=False
                 )
             )
         random = seeded(self.seed, _EPOCHS, epoch)

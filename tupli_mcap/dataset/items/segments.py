@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.recording.columns.runs import Part, by_chunk
+from tupli_mcap.recording.columns.runs import ChunkPart, by_chunk
 
 
 class Segments(NamedTuple):
@@ -29,7 +29,7 @@ class Segments(NamedTuple):
         found: Array = np.searchsorted(self.starts, rows, side="right") - 1
         return found
 
-    def parts(self, rows: Array | slice) -> list[Part]:
+    def parts(self, rows: Array | slice) -> list[ChunkPart]:
         """The parts of rows in any order, one for each chunk; a slice must not be empty or go beyond the rows."""
         if isinstance(rows, slice):
             return self._between(rows.start, rows.stop)
@@ -38,11 +38,11 @@ class Segments(NamedTuple):
         at = self.of(rows)
         places, units = self.begins[at] + (rows - self.starts[at]), self.units[at]
         return [
-            Part(int(self.file_of[unit]), int(self.chunk_of[unit]), places[out], None, out)
+            ChunkPart(int(self.file_of[unit]), int(self.chunk_of[unit]), places[out], None, out)
             for unit, out in _by_value(units)
         ]
 
-    def _between(self, first: int, stop: int) -> list[Part]:
+    def _between(self, first: int, stop: int) -> list[ChunkPart]:
         low, last = self.of(np.array([first, stop - 1])).tolist()
         high = last + 1
         starts = np.maximum(self.starts[low:high], first)

@@ -84,7 +84,7 @@ def mixing(items: Numbered, cache_bytes: int) -> tuple[int, Blocks]:
     return max(2, chunks * len(blocks) // len(single)), blocks
 
 
-class Part(NamedTuple):
+class Share(NamedTuple):
     """A part of the batches: those of one of `ranks`, in `streams` streams."""
 
     rank: int
@@ -106,7 +106,7 @@ class ShuffledBatches:
         blocks: Blocks | None,
         total: int,
         size: int,
-        part: Part,
+        part: Share,
         key: Sequence[int] | None,
         mix: int,
         drop_last: bool,

@@ -19,7 +19,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.opened import OpenFile
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.recover.damaged import read_tail
+from tupli_mcap.recording.recover.damaged import read_file_end
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, STATEMENTS, Signed, is_covered_kind
 
 # Keys of the metadata that are signed; the others depend on how the file was written.
@@ -136,7 +136,7 @@ def check_readers(recording: Recording, covered: Container[str], walk: Structure
     """
     if walk is None:
         source = recording.file.source
-        walk = Structure(source, read_tail(source), Findings(VerifyReport(recording.name)))
+        walk = Structure(source, read_file_end(source), Findings(VerifyReport(recording.name)))
         walk.run()
     wrong = [problem.message + f" ({problem.place})" * bool(problem.place) for problem in walk.report.errors]
     wrong += [

@@ -34,7 +34,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.evidence import Tail
+from tupli_mcap.recording.recover.evidence import FileEnd
 
 _CDR = int.from_bytes(CDR_HEADER, "little")
 _SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length
@@ -62,9 +62,11 @@ class Structure:
     `journal_lost`: there is no journal with the rows that a killed writer was about to write.
     """
 
-    def __init__(self, source: Source, tail: Tail, findings: Findings, *, journal_lost: bool = False) -> None:
+    def __init__(
+        self, source: Source, file_end: FileEnd, findings: Findings, *, journal_lost: bool = False
+    ) -> None:
         self._source = source
-        self._tail = tail
+        self._file_end = file_end
         self._findings, self._error = findings, findings.error
         self._journal_lost = journal_lost
         self.schemas: dict[int, Schema] = {}
@@ -98,7 +100,7 @@ class Structure:
         not known."""
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
             self._error("file", "expected the magic of MCAP at the start", offset=0)
-        walk = Walk(self._source, known=self._tail.known_chunks(), end=self._tail.data_end)
+        walk = Walk(self._source, known=self._file_end.known_chunks(), end=self._file_end.data_end)
         for item in walk:
             self._records += 1
             if isinstance(item, Damage):
@@ -153,7 +155,7 @@ class Structure:
         elif record.opcode == Opcode.DATA_END:
             self._ended = True
             end = record.offset + record.length
-            if self._tail.data_end not in (None, end):
+            if self._file_end.data_end not in (None, end):
                 self._error("record", "expected the summary after the end of the data", offset=end)
             if bytes(record.body) != bytes(4):
                 self._error("record", "expected 0 as the CRC of the data section", offset=record.offset)
@@ -276,14 +278,14 @@ class Structure:
     # ---- the summary
 
     def _finish(self) -> None:
-        for why in self._tail.why:
+        for why in self._file_end.why:
             self._error("summary", why)
         known = {(Schema, number) for number in self.schemas} | {
             (Channel, number) for number in self.channels
         }
         for kind, number in sorted((kind.__name__.lower(), number) for kind, number in known - self._outside):
             self._error("layout", f"{kind} {number} is not defined outside of the chunks")
-        if not self._tail.finished or self._findings.report.state == "unfinished":
+        if not self._file_end.finished or self._findings.report.state == "unfinished":
             return  # its writer was killed, maybe while it wrote the end
         if self._waiting is not None:
             why = "expected the message index of the chunk"
@@ -292,19 +294,19 @@ class Structure:
             self._error("record", "expected the end of the data section, found none")
         if not self._attachments or self._attachments[-1].name != INDEX_NAME:
             self._error("index", f"expected {INDEX_NAME!r} as the last attachment")
-        if self._tail.index is not None:
+        if self._file_end.index is not None:
             table = np.array(self._table, CHUNK_ROWS)
-            if not np.array_equal(table, self._tail.index.chunks):
+            if not np.array_equal(table, self._file_end.index.chunks):
                 with self._findings.following(self.missing):
                     self._error("index", "the episode index lists other chunks than there are")
-        if self._tail.summary is None:
-            if not self._tail.why:
+        if self._file_end.summary is None:
+            if not self._file_end.why:
                 self._error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
         # the bytes of a replaced one may still be there
         last = {index.name: index for index in self._attachments}
         self._attachments = sorted(last.values(), key=lambda index: index.offset)
-        self._summary(self._tail.summary.start)
+        self._summary(self._file_end.summary.start)
 
     def _summary(self, start: int) -> None:
         end = self._source.size - len(MAGIC) - FOOTER.size

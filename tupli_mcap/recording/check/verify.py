@@ -28,7 +28,7 @@ from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.recover.damaged import may_be_recording, read_tail
+from tupli_mcap.recording.recover.damaged import may_be_recording, read_file_end
 from tupli_mcap.recording.recover.evidence import head
 from tupli_mcap.recording.recover.from_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -74,14 +74,14 @@ def _verify(source: Source, findings: Findings) -> None:
         findings.error("file", "it is empty", advice="delete it, or record again")
         return
     live = source.path is not None and is_locked(source.path)
-    tail = read_tail(source)
-    if not may_be_recording(source, tail):
+    file_end = read_file_end(source)
+    if not may_be_recording(source, file_end):
         findings.error("file", "it is an MCAP file, but no recording of tupli-mcap", advice=OTHER_TOOLS)
         return
     lost, unreadable = ("", False) if has_summary(source) else _lost_journal(source)
-    if not has_summary(source) and (tail.index is None or not lost):
+    if not has_summary(source) and (file_end.index is None or not lost):
         report.state = "recording" if live else "unfinished"
-    structure = Structure(source, tail, findings, journal_lost=bool(lost))
+    structure = Structure(source, file_end, findings, journal_lost=bool(lost))
     structure.run()
     if report.state != "complete":
         _note_unfinished(structure, lost, findings, unreadable=unreadable)

@@ -1,7 +1,7 @@
 """Copies rows of chunks into columns, from one file or many, of one layout or several.
 
 There are three kinds of rows: steps, images of a leaf, final states. A `RowFormat` turns rows of one kind and layout
-into columns, a `Rows` reads one kind from all files, and a `Plan` makes the fields of steps from several kinds.
+into columns, a `GatheredRows` reads one kind from all files, and a `Plan` makes the fields of steps from several kinds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tupli_mcap.messages.decoder import LOG_TIME, BatchDecoder, Decode
 from tupli_mcap.messages.shared_dtypes import common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
-from tupli_mcap.recording.columns.runs import Part
+from tupli_mcap.recording.columns.runs import ChunkPart
 from tupli_mcap.spaces.leaves import Leaf
 
 EPISODE = "episode"  # the column with the episode's number in rows of final states
@@ -81,7 +81,7 @@ class RowFormat:
             ]
             self._items = _items_dtype(dtype) if all(same) else None
 
-    def reader(self, columns: Mapping[str, Any]) -> Callable[[ChunkStore, Part, bool], None]:
+    def reader(self, columns: Mapping[str, Any]) -> Callable[[ChunkStore, ChunkPart, bool], None]:
         """A function that reads a chunk and copies rows of it into columns."""
         if self._decode is not None:
             targets = {self._fields[name]: column for name, column in columns.items()}
@@ -92,7 +92,7 @@ class RowFormat:
         return partial(self._read, self._items, [(field, _as_items(column)) for field, column in pairs])
 
     def _read(
-        self, dtype: Any, targets: Sequence[tuple[str, Array]], store: ChunkStore, part: Part, keep: bool
+        self, dtype: Any, targets: Sequence[tuple[str, Array]], store: ChunkStore, part: ChunkPart, keep: bool
     ) -> None:
         rows: Any = store.rows(part.chunk, dtype, keep=keep)
         if self._turned is not None:
@@ -100,7 +100,7 @@ class RowFormat:
         part.copy(rows, targets)
 
     def _read_decoded(
-        self, decode: Decode, targets: Mapping[str, Any], store: ChunkStore, part: Part, keep: bool
+        self, decode: Decode, targets: Mapping[str, Any], store: ChunkStore, part: ChunkPart, keep: bool
     ) -> None:
         data, records = store.records(part.chunk, keep=keep)
         rows, places = part.indexes()
@@ -116,7 +116,7 @@ class Files(NamedTuple):
     stores: Sequence[ChunkStore]
 
 
-class Rows:
+class GatheredRows:
     """The rows of one kind in some files, and their columns."""
 
     def __init__(self, files: Files, columns: Mapping[str, Column], formats: Sequence[RowFormat]) -> None:
@@ -131,7 +131,7 @@ class Rows:
         return all(column.dtype is not None for column in self.columns.values())
 
     def tasks(
-        self, columns: Mapping[str, Any], parts: Sequence[Part], keep: bool = True
+        self, columns: Mapping[str, Any], parts: Sequence[ChunkPart], keep: bool = True
     ) -> list[Callable[[], None]]:
         """Tasks that fill columns (by name), one for each part. `keep` leaves the chunks in the stores' cache."""
         filled = {name: column for name, column in columns.items() if isinstance(column, list) or column.size}
@@ -143,7 +143,7 @@ class Rows:
             partial(readers[self._formats[part.file]], self._stores[part.file], part, keep) for part in parts
         ]
 
-    def check(self, columns: Mapping[str, Any], parts: Sequence[Part], *, whole: bool) -> None:
+    def check(self, columns: Mapping[str, Any], parts: Sequence[ChunkPart], *, whole: bool) -> None:
         """Raises FormatError if bools in parts of columns are neither 0 nor 1 in their files.
 
         `whole` says that the columns hold these parts and nothing else.
@@ -157,12 +157,14 @@ class Rows:
                         f"{self._stores[part.file].name}: expected bools of 0 or 1 in {name!r}, found another byte"
                     )
 
-    def fetch(self, parts: Sequence[Part]) -> None:
+    def fetch(self, parts: Sequence[ChunkPart]) -> None:
         """Announces chunks that will be read next."""
         for file, some in itertools.groupby(parts, lambda part: part.file):
             self._stores[file].fetch(part.chunk for part in some)
 
-    def read(self, names: Sequence[str], parts: Sequence[Part], total: int, threads: int) -> dict[str, Any]:
+    def read(
+        self, names: Sequence[str], parts: Sequence[ChunkPart], total: int, threads: int
+    ) -> dict[str, Any]:
         """Columns of `total` rows, by name."""
         columns = {name: self.columns[name].empty(total) for name in names}
         self.fetch(parts)
@@ -170,7 +172,7 @@ class Rows:
         self.check(columns, parts, whole=True)
         return columns
 
-    def bytes_of(self, parts: Sequence[Part]) -> int:
+    def bytes_of(self, parts: Sequence[ChunkPart]) -> int:
         """Bytes of the chunks once they are decompressed."""
         return sum(int(self._stores[part.file].table["uncompressed"][part.chunk]) for part in parts)
 
@@ -178,7 +180,7 @@ class Rows:
 # ---- kinds
 
 
-def step_rows(files: Files) -> Rows:
+def step_rows(files: Files) -> GatheredRows:
     """Rows of steps: the leaves that are no images, "terminal", "timeout" and `LOG_TIME`."""
     apart = image_names(files.layouts)
     leaves = [leaf for leaf in files.layouts[0].leaves if leaf.name not in apart]
@@ -188,7 +190,7 @@ def step_rows(files: Files) -> Rows:
     )
 
 
-def final_rows(files: Files) -> Rows:
+def final_rows(files: Files) -> GatheredRows:
     """Rows of final states: the leaves, and `EPISODE`."""
     leaves, plain = files.layouts[0].state, {EPISODE: Column((), _U32)}
     return _rows(
@@ -196,7 +198,7 @@ def final_rows(files: Files) -> Rows:
     )
 
 
-def image_rows(files: Files, name: str) -> Rows:
+def image_rows(files: Files, name: str) -> GatheredRows:
     """Rows of a leaf of the state (ROS name in the first layout) that is an image in one of the layouts."""
     (leaf,) = (leaf for leaf in files.layouts[0].state if leaf.name == name)
     columns = {name: _column(files, leaf)}
@@ -208,7 +210,7 @@ def image_rows(files: Files, name: str) -> Rows:
         turned = next((one for one in layout.images if one.name == own and one.frames_last), None)
         return RowFormat(columns, layout.image_messages[own].dtype, None, {name: "data"}, turned)
 
-    return Rows(files, columns, [of_layout(layout) for layout in files.layouts])
+    return GatheredRows(files, columns, [of_layout(layout) for layout in files.layouts])
 
 
 def image_names(layouts: Sequence[StepLayout]) -> dict[str, str]:
@@ -223,7 +225,7 @@ def _rows(
     plain: Mapping[str, Column],
     dtype_of: Callable[[StepLayout], np.dtype[Any]],
     decode_of: Callable[[BatchDecoder], Decode],
-) -> Rows:
+) -> GatheredRows:
     columns = {**{leaf.name: _column(files, leaf) for leaf in leaves}, **plain}
 
     def of_layout(layout: StepLayout) -> RowFormat:
@@ -232,7 +234,7 @@ def _rows(
             return RowFormat(columns, dtype_of(layout), None, fields)
         return RowFormat(columns, None, decode_of(BatchDecoder(layout)), fields)
 
-    return Rows(files, columns, [of_layout(layout) for layout in files.layouts])
+    return GatheredRows(files, columns, [of_layout(layout) for layout in files.layouts])
 
 
 def _column(files: Files, leaf: Leaf) -> Column:

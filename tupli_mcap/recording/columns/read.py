@@ -18,8 +18,8 @@ from tupli_mcap.recording.columns.fields import FIELDS, GymnasiumNames, Parts, d
 from tupli_mcap.recording.columns.gather import (
     EPISODE,
     Files,
+    GatheredRows,
     Plan,
-    Rows,
     do_all,
     final_rows,
     image_rows,
@@ -119,13 +119,13 @@ class ColumnReader:
         return [None, *(leaf.name for leaf in self._layout.images)]
 
     @cached_property
-    def _kinds(self) -> list[Rows]:
+    def _kinds(self) -> list[GatheredRows]:
         return [
             step_rows(self._files) if leaf is None else image_rows(self._files, leaf) for leaf in self._leaves
         ]
 
     @cached_property
-    def _finals(self) -> Rows:
+    def _finals(self) -> GatheredRows:
         return final_rows(self._files)
 
     def _image_channels(self, name: str, channels: Array | Sequence[int]) -> Array:

@@ -14,7 +14,7 @@ _FEW = 4  # up to this many pieces are copied one by one
 Numbers = Array | Sequence[int]
 
 
-class Part(NamedTuple):
+class ChunkPart(NamedTuple):
     """Rows of one chunk: `steps[i]` rows from row `begin[i]` on go to the places from `out[i]` on.
 
     These are int64 arrays, or lists if they are short. Without `steps`, each is one row. `file` is the number of the
@@ -95,7 +95,7 @@ def _joined(channels: Array, first: Array, steps: Array) -> Runs:
     return Runs(channels[starts], first[starts], np.add.reduceat(steps, starts))
 
 
-def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
+def parts_of(runs: Runs, store: ChunkStore) -> list[ChunkPart]:
     """The parts of some runs, one for each chunk; raises FormatError if the recording has no such rows."""
     if len(runs.first) <= _FEW:  # a window or an episode: array operations take longer
         return _of_few(runs, store)
@@ -104,7 +104,7 @@ def parts_of(runs: Runs, store: ChunkStore) -> list[Part]:
     return by_chunk(np.zeros_like(chunks), chunks, begin, counts, np.cumsum(counts) - counts)
 
 
-def _of_few(runs: Runs, store: ChunkStore) -> list[Part]:
+def _of_few(runs: Runs, store: ChunkStore) -> list[ChunkPart]:
     found: dict[int, tuple[list[int], list[int], list[int]]] = {}
     out = 0
     for channel, first, steps in zip(*map(_listed, runs), strict=True):
@@ -113,20 +113,20 @@ def _of_few(runs: Runs, store: ChunkStore) -> list[Part]:
             for part, value in zip(parts, (begin, end - begin, out), strict=True):
                 part.append(value)
             out += end - begin
-    return [Part(0, chunk, *parts) for chunk, parts in found.items()]
+    return [ChunkPart(0, chunk, *parts) for chunk, parts in found.items()]
 
 
 def _listed(part: Numbers) -> Sequence[int]:
     return part.tolist() if isinstance(part, np.ndarray) else part
 
 
-def by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Array) -> list[Part]:
+def by_chunk(files: Array, chunks: Array, begin: Array, steps: Array, out: Array) -> list[ChunkPart]:
     """Pieces of chunks of files, as a part for each chunk, in the order of files and chunks."""
     order = np.lexsort((begin, chunks, files))
     files, chunks, begin, steps, out = (each[order] for each in (files, chunks, begin, steps, out))
     firsts = np.flatnonzero((np.diff(chunks, prepend=-1) != 0) | (np.diff(files, prepend=-1) != 0))
     ends = np.append(firsts[1:], len(chunks))
     return [
-        Part(int(files[a]), int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
+        ChunkPart(int(files[a]), int(chunks[a]), begin[a:b], steps[a:b], out[a:b])
         for a, b in zip(firsts.tolist(), ends.tolist(), strict=True)
     ]

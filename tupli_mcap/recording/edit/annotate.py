@@ -26,7 +26,7 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
 _MOST_EDITS = 20  # edits that can be undone
-_Place = TypeVar("_Place", bound=str | os.PathLike[str])
+_Path = TypeVar("_Path", bound=str | os.PathLike[str])
 _Change = TypeVar("_Change")
 
 
@@ -139,8 +139,8 @@ def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
 
 
 def change_all(
-    paths: Iterable[_Place],
-    change: Callable[[_Place, bool], _Change],
+    paths: Iterable[_Path],
+    change: Callable[[_Path, bool], _Change],
     *,
     dry_run: bool,
     gathered: Gathered | None = None,

@@ -38,7 +38,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.recover.evidence import Evidence, Piece, RepairedChunk, Tail
+from tupli_mcap.recording.recover.evidence import Evidence, FileEnd, Piece, RepairedChunk
 
 _NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
 _BEFORE_NAME = 9 + 16  # opcode, length and two times
@@ -48,26 +48,26 @@ _HEAD = 4096  # the recording's metadata record begins within this many bytes
 # ---- the end of the file
 
 
-def read_tail(source: Source) -> Tail:
+def read_file_end(source: Source) -> FileEnd:
     """Reads summary and index; raises nothing if they are missing or damaged."""
-    tail = Tail(finished=has_summary(source))
-    if tail.finished:
+    file_end = FileEnd(finished=has_summary(source))
+    if file_end.finished:
         try:
-            tail.summary = read_summary(source)
-            tail.statistics = _statistics(source, tail.summary)
+            file_end.summary = read_summary(source)
+            file_end.statistics = _statistics(source, file_end.summary)
         except FormatError as err:
-            tail.why.append(str(err).removeprefix(f"{source.name}: "))
-    place = None if tail.summary is None else tail.summary.attachments.get(INDEX_NAME)
+            file_end.why.append(str(err).removeprefix(f"{source.name}: "))
+    place = None if file_end.summary is None else file_end.summary.attachments.get(INDEX_NAME)
     if place is None:
         place = _find_index(source)
     if place is None:
-        return tail
+        return file_end
     try:
-        tail.index = EpisodeIndex.decode(read_attachment(source, place), source.name)
-        tail.finished = True
+        file_end.index = EpisodeIndex.decode(read_attachment(source, place), source.name)
+        file_end.finished = True
     except FormatError as err:
-        tail.why.append(str(err).removeprefix(f"{source.name}: "))
-    return tail
+        file_end.why.append(str(err).removeprefix(f"{source.name}: "))
+    return file_end
 
 
 def _statistics(source: Source, summary: Summary) -> Statistics | None:
@@ -121,15 +121,15 @@ def _length_at(source: Source, place: int) -> int:
 # ---- all of it
 
 
-def gather(source: Source, tail: Tail) -> Evidence:
+def gather(source: Source, file_end: FileEnd) -> Evidence:
     """Reads the whole file once, without its journal; raises nothing for damage. NewerVersionError if the recording's
     format is not known."""
-    evidence = Evidence(source, tail)
-    if tail.summary is not None:
-        evidence.schemas, evidence.channels = dict(tail.summary.schemas), dict(tail.summary.channels)
+    evidence = Evidence(source, file_end)
+    if file_end.summary is not None:
+        evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
     indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
-    for item in Walk(source, known=tail.known_chunks(), end=tail.data_end):
+    for item in Walk(source, known=file_end.known_chunks(), end=file_end.data_end):
         if isinstance(item, Damage):
             evidence.damages.append(item)
         elif item.chunk is not None:
@@ -209,7 +209,7 @@ def _take_chunk(
     except FormatError as err:
         _add_damage(evidence, record, str(err))
         return None
-    if evidence.tail.summary is None:  # definitions in chunks have a CRC, those outside have none
+    if evidence.file_end.summary is None:  # definitions in chunks have a CRC, those outside have none
         evidence.schemas |= {schema.id: schema for schema in content.schemas}
         evidence.channels |= {channel.id: channel for channel in content.channels}
     channel, count = content.channel, len(content.headers)
@@ -232,11 +232,11 @@ def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> N
             evidence.damages.append(Damage(chunk.offset, chunk.offset + 49, chunk.repaired, -1))
 
 
-def may_be_recording(source: Source, tail: Tail) -> bool:
+def may_be_recording(source: Source, file_end: FileEnd) -> bool:
     """Whether the file may be a recording of this package: False if it names another profile."""
-    if tail.index is not None or source.size < len(MAGIC) + 9:
+    if file_end.index is not None or source.size < len(MAGIC) + 9:
         return True
-    if tail.summary is not None and RECORDING_METADATA in tail.summary.metadata:
+    if file_end.summary is not None and RECORDING_METADATA in file_end.summary.metadata:
         return True
     if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
         return True
@@ -249,5 +249,7 @@ def may_be_recording(source: Source, tail: Tail) -> bool:
 
 def is_recording(evidence: Evidence) -> bool:
     """Whether anything in the file shows that it is a recording of this package."""
-    known = evidence.profile == PROFILE or evidence.metadata is not None or evidence.tail.index is not None
+    known = (
+        evidence.profile == PROFILE or evidence.metadata is not None or evidence.file_end.index is not None
+    )
     return known or any("observation_space" in channel.metadata for channel in evidence.channels.values())

@@ -136,7 +136,7 @@ def make_plan(evidence: Evidence, store: PackedStore, layout: StepLayout, channe
     records = _read_records(evidence, store, channels)
     if evidence.strict:
         _ignore_ends(records, kept)
-    _add_index(records, evidence.tail.index)
+    _add_index(records, evidence.file_end.index)
     plan = Plan(records, kept, _totals(evidence, channels, records))
     return _Planner(evidence, plan, runs, channels, images=bool(layout.images)).run()
 
@@ -191,7 +191,7 @@ def _add_index(records: EpisodeRecords, index: EpisodeIndex | None) -> None:
 def _totals(evidence: Evidence, channels: RecordedChannels, records: EpisodeRecords) -> list[int]:
     """The number of rows that each sub-environment had, as far as the file shows."""
     totals = [evidence.stop(channel) for channel in channels.steps]
-    statistics = evidence.tail.statistics
+    statistics = evidence.file_end.statistics
     for env, channel in enumerate(channels.steps):
         ids = [channel, *(images[env] for images in channels.images.values())]
         if statistics is not None:
@@ -222,7 +222,7 @@ class _Planner:
         self._starts_whole = all(first == 0 for first, _ in starts)  # none is missing before or between them
         self._taken: set[int] = set()
         # whether no rows can be missing after the last known one
-        self._knows_totals = not evidence.tail.finished or evidence.tail.statistics is not None
+        self._knows_totals = not evidence.file_end.finished or evidence.file_end.statistics is not None
 
     def run(self) -> Plan:
         for run in self._runs:
@@ -265,7 +265,7 @@ class _Planner:
             return None
         ended = run.terminal or run.timeout
         # without an end, the final state belongs to a step that was not finished
-        unfinished = old_end is None and not ended and not self._evidence.tail.finished
+        unfinished = old_end is None and not ended and not self._evidence.file_end.finished
         if run.episode in self._records.finals and not unfinished:
             return self._records.finals[run.episode]
         if ended and not self._images and (run.env, run.stop) in self._evidence.finals:
@@ -287,7 +287,7 @@ class _Planner:
         if hole is None or not self._starts_whole:
             self._plan.lost_starts.append(run.episode)
         seed, time = "", run.first_time if hole is None else hole.time_ns
-        index = self._evidence.tail.index
+        index = self._evidence.file_end.index
         if index is not None and number in self._records.index:
             row = index.episodes[self._records.index[number]]
             seed, time = str(int(row["seed"])) if row["has_seed"] == HAS_SEED else "", int(row["start_time"])
@@ -303,7 +303,7 @@ class _Planner:
             time, metadata, how, row = old.time, old.end.metadata, old.end.end, old.row
             if head:
                 total = old.end.episode_return
-        elif tail and self._evidence.tail.finished:
+        elif tail and self._evidence.file_end.finished:
             self._plan.lost_ends.append(run.episode)
         return End(time, EpisodeEnd(number, run.env, 0, run.steps, total, how, has_final, metadata), row)
 

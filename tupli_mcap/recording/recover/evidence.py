@@ -35,7 +35,7 @@ _CACHE = 64 << 20
 
 
 @dataclass
-class Tail:
+class FileEnd:
     """The end of a file: `summary` and `index` are None if missing or damaged, and `why` has a sentence for each.
 
     `finished` says that there is a footer or an index.
@@ -132,7 +132,7 @@ class Evidence:
     """
 
     source: Source
-    tail: Tail
+    file_end: FileEnd
     strict: bool = False
     good_end: int = 0
     profile: str = ""
@@ -285,7 +285,7 @@ def prefix(source: Source, *, only_metadata: bool = False) -> Evidence:
 
     FormatError if the chunks of a channel do not hold its rows without gaps. A damaged end raises nothing.
     """
-    evidence, walk = Evidence(source, Tail(), strict=True, good_end=len(MAGIC)), Walk(source)
+    evidence, walk = Evidence(source, FileEnd(), strict=True, good_end=len(MAGIC)), Walk(source)
     waiting: tuple[tuple[int, ...], Rows] | None = None  # a chunk whose message index comes next
     for opcode, position, length in walk.places():
         if opcode == Opcode.MESSAGE_INDEX:

@@ -125,7 +125,7 @@ def add_journal(evidence: Evidence) -> None:
 
     Raises nothing for a missing or damaged journal: `evidence.journal` and `evidence.notes` say it.
     """
-    if evidence.tail.finished or evidence.source.path is None:
+    if evidence.file_end.finished or evidence.source.path is None:
         return
     path = evidence.source.path
     # a writer makes the journal before the channels

@@ -13,7 +13,7 @@ from tupli_mcap.journal.file import journal_aside, journal_in, journal_info, jou
 from tupli_mcap.recording.recover.evidence import metadata_at
 
 
-class Place:
+class RecordingPlace:
     """Which recording is written, and where.
 
     Attributes:

@@ -26,7 +26,7 @@ from tupli_mcap.recording.recover.evidence import head, metadata_at
 from tupli_mcap.recording.recover.from_journal import belongs, misplaced_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions
-from tupli_mcap.recording.write.place import Place
+from tupli_mcap.recording.write.place import RecordingPlace
 
 
 class Resumed(NamedTuple):
@@ -46,7 +46,7 @@ class Resumed(NamedTuple):
 
 
 def resume(
-    path: Path, options: RecordOptions, format_version: str, place: Place, container: Container
+    path: Path, options: RecordOptions, format_version: str, place: RecordingPlace, container: Container
 ) -> Resumed:
     """Reads what a file (already locked) holds: a finished one, or one whose writer was killed. Sets `place` and
     `container` to go on behind it.
@@ -129,10 +129,10 @@ def _check_nothing_behind(path: Path, contents: Contents, source: Source) -> Non
     """What lies behind the end is cut off: the torn record of a killed writer, but not good rows behind damage."""
     if contents.complete or source.size == contents.data_end:
         return
-    from tupli_mcap.recording.recover.damaged import gather, read_tail
+    from tupli_mcap.recording.recover.damaged import gather, read_file_end
     from tupli_mcap.recording.recover.from_journal import add_journal
 
-    evidence = gather(source, read_tail(source))
+    evidence = gather(source, read_file_end(source))
     add_journal(evidence)
     for channel in contents.channels:
         kept = int(contents.table["rows"][contents.table["channel"] == channel].sum())
@@ -187,7 +187,7 @@ def _more_runs(
     return {} if runs is earlier else {RUN_NAME: (RUN_MEDIA_TYPE, runs.to_json())}
 
 
-def _restore_place(place: Place, path: Path, options: RecordOptions, contents: Contents) -> None:
+def _restore_place(place: RecordingPlace, path: Path, options: RecordOptions, contents: Contents) -> None:
     """The file says where its journal is; a reader would look for it there."""
     place.uuid = contents.metadata["uuid"]
     place.rewritten = contents.metadata.get("rewritten", "")

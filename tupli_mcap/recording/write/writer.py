@@ -32,7 +32,7 @@ from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilde
 from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts
 from tupli_mcap.recording.write.options import RecordOptions, check_place
-from tupli_mcap.recording.write.place import Place
+from tupli_mcap.recording.write.place import RecordingPlace
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
@@ -56,7 +56,7 @@ class RecordingWriter:
     ) -> None:
         check_place(path)
         self.path = Path(path)
-        self.place = Place(path, options.journal_dir)
+        self.place = RecordingPlace(path, options.journal_dir)
         self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
         self.closed = False
         self.failed = ""  # why nothing more can be recorded, where that is known

@@ -85,7 +85,7 @@ def recordings_of(filter: BaseFilter) -> Condition:
     return true()
 
 
-class Source(NamedTuple):
+class IndexLookup(NamedTuple):
     """Episodes that an index leads to.
 
     Attributes:
@@ -117,7 +117,7 @@ class Source(NamedTuple):
         return exists().where(*same, *self.all, or_(*self.either)).correlate(ids)
 
 
-def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
+def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[IndexLookup]:
     """What an index finds for a filter; each has all episodes that match."""
     if filter.type is FilterType.AND:
         parts = [*_leaves(filter)]
@@ -134,11 +134,13 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
         elif path in indexed:
             values.append(part)
     row_id = EPISODE.c.id
-    of_facts = (Source(row_id, found, [true()], (EPISODE.c[name], row_id)) for name, found in facts.items())
+    of_facts = (
+        IndexLookup(row_id, found, [true()], (EPISODE.c[name], row_id)) for name, found in facts.items()
+    )
     return [*of_facts, *_by_values(values, indexed)]
 
 
-def in_all(given: Sequence[Source]) -> Select[Any]:
+def in_all(given: Sequence[IndexLookup]) -> Select[Any]:
     """Ids of episodes that each source has, and of their recordings: PostgreSQL hashes ids alone so that many of them
     collide."""
     first, *others = sorted(given, key=_alternatives, reverse=True)
@@ -147,7 +149,7 @@ def in_all(given: Sequence[Source]) -> Select[Any]:
     return select(row_id, _recording(row_id)).where(*(other.has(ids) for other in others))
 
 
-def _alternatives(source: Source) -> int:
+def _alternatives(source: IndexLookup) -> int:
     """How many there are: of more than one, each is for one value, and an index has its ids in order."""
     return len(source.either)
 
@@ -156,7 +158,7 @@ def _recording(row_id: ColumnElement[int]) -> ColumnElement[int]:
     return row_id // (1 << EPISODE_BITS)
 
 
-def _by_values(parts: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int]) -> list[Source]:
+def _by_values(parts: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], int]) -> list[IndexLookup]:
     """What the index of `VALUE` finds for comparisons that must all be true. Flags are in each of its rows, and lead
     to episodes by themselves only if nothing else does."""
     values: dict[int, list[Sequence[Condition]]] = {}
@@ -172,7 +174,7 @@ def _by_values(parts: Sequence[BaseFilter], indexed: Mapping[tuple[str, ...], in
     for key, alternatives in (values or dict(itertools.islice(flags.items(), 1))).items():
         most = max(alternatives, key=len)
         others = [or_(*each) for each in alternatives if each is not most]
-        found.append(Source(VALUE.c.episode_id, [VALUE.c.key == key, *also, *others], most, by))
+        found.append(IndexLookup(VALUE.c.episode_id, [VALUE.c.key == key, *also, *others], most, by))
     return found
 
 

@@ -56,7 +56,7 @@ class Sort(NamedTuple):
         return cls(text.removeprefix("-"), text.startswith("-")) if text else None
 
 
-class Place(NamedTuple):
+class SortValue(NamedTuple):
     """A value that decides on the place of an episode, and whether the largest one is the first."""
 
     value: ColumnElement[Any]
@@ -76,7 +76,7 @@ class Range(NamedTuple):
 
     table: FromClause
     having: ColumnElement[bool]
-    places: Sequence[Place]
+    places: Sequence[SortValue]
     led_by: Sequence[ColumnElement[Any]] = ()
 
     @property
@@ -93,12 +93,12 @@ class Range(NamedTuple):
     @property
     def order(self) -> list[ColumnElement[Any]]:
         """What to order a statement by."""
-        places = [*(Place(column, self.places[0].falling) for column in self.led_by), *self.places]
+        places = [*(SortValue(column, self.places[0].falling) for column in self.led_by), *self.places]
         return [value.desc() if falling else value for value, falling in places]
 
     def backwards(self) -> Range:
         """The same episodes in the opposite order."""
-        return self._replace(places=[Place(value, not falling) for value, falling in self.places])
+        return self._replace(places=[SortValue(value, not falling) for value, falling in self.places])
 
     def beyond(self, reached: Sequence[Any]) -> list[Range]:
         """The ranges after an episode with these values."""
@@ -138,7 +138,7 @@ def ranges(
     elif few:
         found = [Range(EPISODE, true(), _by_recording(row_id))]
     else:
-        found = [Range(EPISODE, true(), (Place(RECORDING.c.path, False), Place(row_id, False)))]
+        found = [Range(EPISODE, true(), (SortValue(RECORDING.c.path, False), SortValue(row_id, False)))]
     return [part.backwards() for part in reversed(found)] if backwards else found
 
 
@@ -158,8 +158,8 @@ def beyond(connection: Connection, found: Sequence[Range], sort: Sort | None, af
     raise NotFoundError("the episode after which the page begins is gone; list from the beginning")
 
 
-def _by_recording(row_id: ColumnElement[int] = EPISODE.c.id) -> list[Place]:
-    return [Place(func.coalesce(RECORDING.c.path, ""), False), Place(row_id, False)]
+def _by_recording(row_id: ColumnElement[int] = EPISODE.c.id) -> list[SortValue]:
+    return [SortValue(func.coalesce(RECORDING.c.path, ""), False), SortValue(row_id, False)]
 
 
 def _of_key(sort: Sort, indexed: Mapping[tuple[str, ...], int]) -> list[Range]:
@@ -189,7 +189,7 @@ def _of_key(sort: Sort, indexed: Mapping[tuple[str, ...], int]) -> list[Range]:
 
 
 def _of_column(value: ColumnElement[Any], having: ColumnElement[bool], falling: bool) -> Range:
-    return Range(EPISODE, having, [Place(value, falling), *_by_recording()])
+    return Range(EPISODE, having, [SortValue(value, falling), *_by_recording()])
 
 
 def _of_declared(key: int, falling: bool) -> list[Range]:
@@ -198,7 +198,7 @@ def _of_declared(key: int, falling: bool) -> list[Range]:
     texts = and_(number.is_(None), text.is_not(None))
     held = exists().where(row_id == EPISODE.c.id, of_key, or_(number.is_not(None), text.is_not(None)))
     return [
-        Range(ORDERED, and_(of_key, number.is_not(None)), [Place(number, falling), *after]),
-        Range(ORDERED, and_(of_key, texts), [Place(text, falling), *after], led_by=[number]),
+        Range(ORDERED, and_(of_key, number.is_not(None)), [SortValue(number, falling), *after]),
+        Range(ORDERED, and_(of_key, texts), [SortValue(text, falling), *after], led_by=[number]),
         Range(EPISODE, ~held, _by_recording()),
     ]

@@ -24,7 +24,7 @@ from sqlalchemy import ColumnElement, Connection, Select, Subquery, and_, func, 
 
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.catalog.compare_sql import Narrowed
-from tupli_mcap.storage.catalog.filter_sql import Source, in_all, narrowed, recordings_of, sources
+from tupli_mcap.storage.catalog.filter_sql import IndexLookup, in_all, narrowed, recordings_of, sources
 from tupli_mcap.storage.catalog.order import After, Range, Sort, beyond, has_index, ranges
 from tupli_mcap.storage.catalog.tables import (
     EPISODE,
@@ -117,7 +117,9 @@ def candidates(connection: Connection, asked: Asked, wanted: int) -> Iterator[tu
         yield _ids(connection, asked, in_all(given).subquery(), left), left
 
 
-def _fewest(connection: Connection, asked: Asked, given: Sequence[Source]) -> tuple[Subquery, int] | None:
+def _fewest(
+    connection: Connection, asked: Asked, given: Sequence[IndexLookup]
+) -> tuple[Subquery, int] | None:
     """The ids of the source that has the fewest, and how many, if they are few. If a page is sorted and all sources
     have many, only their ids in the recordings that may have such episodes are counted."""
     fewest, least = None, _FEW + 1
@@ -145,9 +147,9 @@ def _count(connection: Connection, ids: Subquery) -> int:
     return count
 
 
-def _of_recordings(asked: Asked) -> Source:
+def _of_recordings(asked: Asked) -> IndexLookup:
     """All episodes of the recordings that may have such."""
-    return Source(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
+    return IndexLookup(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
 
 
 def _ids(connection: Connection, asked: Asked, source: Subquery, left: Left) -> Iterator[int]:

@@ -48,7 +48,7 @@ from tupli_mcap.messages.topics import (
 )
 from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.evidence import Evidence, Piece, RecordedChannels, Tail, prefix
+from tupli_mcap.recording.recover.evidence import Evidence, FileEnd, Piece, RecordedChannels, prefix
 from tupli_mcap.recording.recover.from_journal import belongs, define, take_rows
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
@@ -113,7 +113,7 @@ class _GrowingFile:
 
     def evidence(self, seen: Mapping[int, int]) -> Evidence:
         """The file as if it held all rows that were looked at, so that they are not read from the journal again."""
-        evidence = Evidence(self._source, Tail(), strict=True, good_end=self._source.size)
+        evidence = Evidence(self._source, FileEnd(), strict=True, good_end=self._source.size)
         evidence.pieces = {channel: list(pieces) for channel, pieces in self._pieces.items()}
         for channel, count in seen.items():
             stop = evidence.stop(channel)

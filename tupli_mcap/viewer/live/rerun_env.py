@@ -18,7 +18,16 @@ from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block, Piece
 from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
-from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Place, Rewards, Series, value_range
+from tupli_mcap.viewer.panels import (
+    Camera,
+    HeatMap,
+    LiveInfos,
+    Panel,
+    PanelPlace,
+    Rewards,
+    Series,
+    value_range,
+)
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.sending import Times, send_scalars
 
@@ -51,7 +60,7 @@ class _NewestMap:
         panel, (low, high) = self._panel, value_range(new)
         self._panel = replace(panel, low=np.minimum(panel.low, low), high=np.maximum(panel.high, high))
 
-    def send(self, place: Place, times: Times) -> None:
+    def send(self, place: PanelPlace, times: Times) -> None:
         self._panel.send_map(place, self._values, times)
 
 
@@ -61,7 +70,7 @@ class LiveEnv:
     """
 
     def __init__(
-        self, layout: StepLayout, seconds: float | None, scene: Scene, env: int, place: Place, share: int
+        self, layout: StepLayout, seconds: float | None, scene: Scene, env: int, place: PanelPlace, share: int
     ) -> None:
         self._env = env
         self._place = place
@@ -86,9 +95,9 @@ class LiveEnv:
         self._maps = [_NewestMap(panel) for panel in shown if isinstance(panel, HeatMap)]
 
     @property
-    def _alone(self) -> Place:
+    def _alone(self) -> PanelPlace:
         """The place of entities that only the first sub-environment has: at the top, below no root."""
-        return Place(self._place.stream)
+        return PanelPlace(self._place.stream)
 
     @property
     def end(self) -> int:

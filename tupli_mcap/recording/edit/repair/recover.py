@@ -20,7 +20,7 @@ from tupli_mcap.recording.edit.assemble import replacing, tidy
 from tupli_mcap.recording.edit.repair.write import RepairWriter, rows_lost
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_tail
+from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_file_end
 from tupli_mcap.recording.recover.episodes import Plan, losses, make_plan
 from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
 from tupli_mcap.recording.recover.from_journal import add_journal
@@ -227,8 +227,8 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
 def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") -> RecoveryReport:
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
-    tail = read_tail(source)
-    evidence = gather(source, tail) if may_be_recording(source, tail) else None
+    file_end = read_file_end(source)
+    evidence = gather(source, file_end) if may_be_recording(source, file_end) else None
     if evidence is None or not is_recording(evidence):
         raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
     evidence.attachments.pop(leave_out, None)
@@ -258,9 +258,9 @@ def _recover_ours(
 ) -> RecoveryReport:
     report = RecoveryReport(
         evidence.source.name,
-        finished=evidence.tail.finished,
+        finished=evidence.file_end.finished,
         journal=evidence.journal,
-        notes=[*evidence.tail.why, *evidence.notes],
+        notes=[*evidence.file_end.why, *evidence.notes],
     )
     writer = RepairWriter(container, evidence)
     if known is None:
@@ -302,7 +302,7 @@ def _report_plan(report: RecoveryReport, plan: Plan) -> None:
 
 def _attachments_lost(evidence: Evidence) -> list[str]:
     """Names of the attachments that are lost, as far as the file shows."""
-    summary = evidence.tail.summary
+    summary = evidence.file_end.summary
     known = set() if summary is None else set(summary.attachments)
     known |= {attachment_name(evidence.source, damage) or INDEX_NAME for damage in evidence.damages}
     return sorted(known - set(evidence.attachments) - {INDEX_NAME})
@@ -310,10 +310,10 @@ def _attachments_lost(evidence: Evidence) -> list[str]:
 
 def _ends(evidence: Evidence) -> list[DamagedPlace]:
     """Damage of the magic at the start and of the end of the file, which hold no data."""
-    source, tail = evidence.source, evidence.tail
+    source, file_end = evidence.source, evidence.file_end
     places = []
     if source.read(0, min(len(MAGIC), source.size)) != MAGIC:
         places.append(DamagedPlace(0, min(len(MAGIC), source.size), "expected the magic of MCAP"))
-    if tail.finished and tail.summary is None and not tail.why:
+    if file_end.finished and file_end.summary is None and not file_end.why:
         places.append(DamagedPlace(source.size, 0, "the footer is damaged or cut off"))
     return places

@@ -280,7 +280,7 @@ def rows_lost(evidence: Evidence, ids: Sequence[int]) -> int:
     """The number of rows that are known to have been recorded, and were not found in every one of these channels."""
     whole = reduce(intersection, map(evidence.ranges, ids))
     counts = [evidence.stop(channel) for channel in ids]
-    if evidence.tail.index is not None:
-        table = evidence.tail.index.chunks
+    if evidence.file_end.index is not None:
+        table = evidence.file_end.index.chunks
         counts += [int(table["rows"][table["channel"] == channel].sum()) for channel in ids]
     return max(counts) - sum(b - a for a, b in whole)
