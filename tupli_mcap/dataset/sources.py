@@ -33,7 +33,7 @@ from tupli_mcap.schema.times import iso_utc, iso_utc_each
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import by_recording, episode_id, uuid_of
 from tupli_mcap.storage.benchmark_json import restored
-from tupli_mcap.storage.listing import files_matching
+from tupli_mcap.storage.listing import recordings_at
 from tupli_mcap.storage.sidecar import Notes, storage_of
 
 if TYPE_CHECKING:
@@ -316,14 +316,10 @@ def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
             f"{name} is a directory; give a pattern such as {str(path / '*.mcap')!r}, or open a storage with "
             f"TupliDataset(FileStorage({name!r}))"
         )
-    if path.exists():
-        return [str(path)]
-    files = [str(file) for file in files_matching(path)]
-    if not files:
+    if not path.exists() and not glob.has_magic(name):
         what = "there is no file" if path.suffix else "there is no file or directory"
-        what = "no file matches" if glob.has_magic(name) else what
         raise RecordingError(f"{what} {name!r}; give the path of a recording (.mcap)")
-    return files
+    return [str(file) for file in recordings_at(path)]
 
 
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:

@@ -224,14 +224,15 @@ def list_recordings(
 
 
 def recordings_at(source: Path | str) -> Sequence[Path | str]:
-    """The recordings of a path, as `find_recordings` finds them, or the files or URLs that match a pattern.
-    RecordingError if there are none."""
+    """The recordings of a path, as `find_recordings` finds them, or the files or URLs that match a pattern, sorted; in
+    it, `**` matches folders. RecordingError if there are none."""
     if isinstance(source, str) and is_url(source):
         return matching(source)
     path = path_of(source)
     if path.is_dir() or not is_of_several(str(source)):
         return find_recordings(path)
-    if not (files := files_matching(path)):
+    found = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
+    if not (files := [file for file in map(Path, found) if not file.is_dir()]):
         raise RecordingError(f"no file matches {str(path)!r}; give the path of a recording (.mcap)")
     return files
 
@@ -242,12 +243,6 @@ def is_of_several(source: str) -> bool:
         return is_server(source) or is_pattern(source)
     path = path_of(source)
     return path.is_dir() or (glob.has_magic(str(path)) and not path.exists())
-
-
-def files_matching(pattern: Path) -> list[Path]:
-    """The files that match a pattern, sorted; `**` matches folders."""
-    found = sorted(glob.glob(str(pattern), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    return [path for path in map(Path, found) if not path.is_dir()]
 
 
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
