@@ -22,7 +22,7 @@ from tupli_mcap.viewer.about import run_title, send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.panels import PALETTE, PanelPlace
+from tupli_mcap.viewer.panels import PALETTE, Root
 from tupli_mcap.viewer.scene import Scene, scene_of
 from tupli_mcap.viewer.sdk import rerun_sdk
 from tupli_mcap.viewer.sending import Times
@@ -104,14 +104,14 @@ class Plan(NamedTuple):
         for part in self.parts:
             steps[part.root] = steps.get(part.root, 0) + part.steps
         for part in self.parts:
-            place = PanelPlace(stream, part.root, part.title, part.color, single=steps[part.root] == 1)
+            place = Root(stream, part.root, part.title, part.color, single=steps[part.root] == 1)
             for panel in part.scene.panels:
                 panel.declare(place)
             for block in blocks_of(*part.chosen, part.first):
                 _send_block(place, part.scene, block)
 
 
-def _send_block(place: PanelPlace, scene: Scene, block: Block) -> None:
+def _send_block(place: Root, scene: Scene, block: Block) -> None:
     states = block.with_finals()
     times, state_times = times_of(block), times_of(states)
     for panel in scene.panels:

@@ -18,16 +18,7 @@ from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block, Piece
 from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
-from tupli_mcap.viewer.panels import (
-    Camera,
-    HeatMap,
-    LiveInfos,
-    Panel,
-    PanelPlace,
-    Rewards,
-    Series,
-    value_range,
-)
+from tupli_mcap.viewer.panels import Camera, HeatMap, LiveInfos, Panel, Rewards, Root, Series, value_range
 from tupli_mcap.viewer.scene import Scene
 from tupli_mcap.viewer.sending import Times, send_scalars
 
@@ -60,7 +51,7 @@ class _NewestMap:
         panel, (low, high) = self._panel, value_range(new)
         self._panel = replace(panel, low=np.minimum(panel.low, low), high=np.maximum(panel.high, high))
 
-    def send(self, place: PanelPlace, times: Times) -> None:
+    def send(self, place: Root, times: Times) -> None:
         self._panel.send_map(place, self._values, times)
 
 
@@ -70,7 +61,7 @@ class LiveEnv:
     """
 
     def __init__(
-        self, layout: StepLayout, seconds: float | None, scene: Scene, env: int, place: PanelPlace, share: int
+        self, layout: StepLayout, seconds: float | None, scene: Scene, env: int, place: Root, share: int
     ) -> None:
         self._env = env
         self._place = place
@@ -95,9 +86,9 @@ class LiveEnv:
         self._maps = [_NewestMap(panel) for panel in shown if isinstance(panel, HeatMap)]
 
     @property
-    def _alone(self) -> PanelPlace:
+    def _alone(self) -> Root:
         """The place of entities that only the first sub-environment has: at the top, below no root."""
-        return PanelPlace(self._place.stream)
+        return Root(self._place.stream)
 
     @property
     def end(self) -> int:

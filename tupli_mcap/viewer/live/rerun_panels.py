@@ -18,7 +18,7 @@ from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
 from tupli_mcap.viewer.live.rerun_env import MOST_INFOS, LiveEnv, columns_of
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.panels import PALETTE, PanelPlace, numbers_in
+from tupli_mcap.viewer.panels import PALETTE, Root, numbers_in
 from tupli_mcap.viewer.scene import live_scene
 from tupli_mcap.viewer.sdk import rr
 from tupli_mcap.viewer.sending import tensor_array
@@ -139,5 +139,5 @@ class LivePanels:
         stream.log("/card", document, static=True)
 
 
-def _place(root: str, env: int) -> PanelPlace:
-    return PanelPlace(None, root, f"env {env}", PALETTE[env % len(PALETTE)]) if root else PanelPlace(None)
+def _place(root: str, env: int) -> Root:
+    return Root(None, root, f"env {env}", PALETTE[env % len(PALETTE)]) if root else Root(None)

@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import LeafPanel, PanelPlace, flat_values, named
+from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, named
 from tupli_mcap.viewer.sdk import pa, rr, rrb
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
@@ -40,7 +40,7 @@ class Picture(LeafPanel):
     black: float = 0.0
     white: float = 255.0
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         height, width, channels = self._tiled(np.empty((1, *self.leaf.shape), np.uint8)).shape[1:]
         model = {1: rr.ColorModel.L, 3: rr.ColorModel.RGB, 4: rr.ColorModel.RGBA}[channels]
         form = rr.components.ImageFormat(width, height, color_model=model, channel_datatype="U8")
@@ -48,7 +48,7 @@ class Picture(LeafPanel):
         image = rr.Image.from_fields(format=form, magnification_filter=nearest)
         place.stream.log(place.root + self.entity, image, static=True)
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         pictures = self._tiled(self._bytes(self.leaf.get(getattr(block.columns, self.column))))
         values = np.ascontiguousarray(pictures).reshape(len(pictures), -1)
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
@@ -99,7 +99,7 @@ class Picture(LeafPanel):
 class Grid(LeafPanel):
     """A leaf of two or three dimensions: a tensor a step."""
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         values = self.leaf.get(getattr(block.columns, self.column))
         kind = np.uint8 if values.dtype == np.uint8 else np.float32
         send_tensors(
@@ -124,13 +124,13 @@ class HeatMap(LeafPanel):
     low: Array
     high: Array
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         scaled = self._scaled(flat_values(self.leaf, self.column, block))
         maps = [_pooled(scaled[piece.begin : piece.end].T) for piece in block.pieces]
         at = times.at(np.array([piece.begin for piece in block.pieces]))
         send_tensors(place.stream, place.root + self.entity, at, maps, ("dimension", "step"))
 
-    def send_map(self, place: PanelPlace, values: Array, times: Times) -> None:
+    def send_map(self, place: Root, values: Array, times: Times) -> None:
         """Sends one map of `values` (steps x dimensions) for the one time of `times`."""
         maps = [_pooled(self._scaled(values).T)]
         send_tensors(place.stream, place.root + self.entity, times, maps, ("dimension", "step"))
@@ -172,10 +172,10 @@ class Camera:
     title: str
     column: str = "states"
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         """Sends nothing: everything is sent with the frames."""
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         if self.name not in block.recording.cameras:  # of another recording in the same view
             return
         for piece in block.pieces:
@@ -186,7 +186,7 @@ class Camera:
                 at = times.at(steps[few] - piece.step + piece.begin)
                 self.send_frames(place, [frames.encoded(int(i)) for i in few], at)
 
-    def send_frames(self, place: PanelPlace, frames: Sequence[EncodedFrame], times: Times) -> None:
+    def send_frames(self, place: Root, frames: Sequence[EncodedFrame], times: Times) -> None:
         """Sends one frame a row."""
         ends = np.cumsum([0, *(len(frame.data) for frame in frames)])
         blobs = blob_array(np.frombuffer(b"".join(frame.data for frame in frames), np.uint8), ends)

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import LeafPanel, PanelPlace, flat_values, plot, send_lines
+from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, plot, send_lines
 from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars
 
@@ -30,11 +30,11 @@ class Series(LeafPanel):
     names: Sequence[str]
     stepped: bool = False
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         names = [place.series_name(name, alone=len(self.names) == 1) for name in self.names]
         place.declare_series(self.entity, names, place.colors(len(names)), stepped=self.stepped)
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         values = flat_values(self.leaf, self.column, block)
         if len(self.dims) < values.shape[1]:
             values = values[:, list(self.dims)]
@@ -55,7 +55,7 @@ class Rewards:
     column: str = "rewards"
     _running: float = 0.0  # the return of an episode that goes on in the next block
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         for name, color in (("reward", 6), ("return", 2)):
             place.declare_series(f"/{name}", [place.series_name(name, alone=True)], place.colors(1, color))
         shape_of = rr.components.MarkerShape
@@ -66,7 +66,7 @@ class Rewards:
             )
             place.stream.log(f"{place.root}/end/{name}", points, static=True)
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are infinite, or NaN
             rewards = self._totals(block)
             returns = self._returns(rewards, block)

@@ -21,7 +21,7 @@ PALETTE: Final = (
 """Colours that can be told apart next to each other, on a light and on a dark ground (RGBA)."""
 
 
-class PanelPlace(NamedTuple):
+class Root(NamedTuple):
     """Where a panel's entities go: below `root` in a stream.
 
     title, color: tell several episodes in one view apart; empty if there is only one.
@@ -76,10 +76,10 @@ class Panel(Protocol):
     def column(self) -> str:
         """The field that it shows. Only "states" have a value after the last step of an episode."""
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         """Sends what does not change."""
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         """Sends a block of steps; of "states", a block `with_finals`."""
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
@@ -95,7 +95,7 @@ class LeafPanel:
     entity: str
     title: str
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         """Sends nothing: everything is sent with the values."""
 
 
@@ -105,7 +105,7 @@ def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
     return values.reshape(len(block), -1)
 
 
-def send_lines(place: PanelPlace, entity: str, times: Times, values: Array) -> None:
+def send_lines(place: Root, entity: str, times: Times, values: Array) -> None:
     """Sends `values` (rows x width), with a row of NaN at the time of each seam, which breaks the lines there."""
     if times.seams:
         values = np.insert(values.astype(np.float64, copy=False), times.seams, np.nan, axis=0)

@@ -13,7 +13,7 @@ from tupli_mcap.messages.infos import with_text_keys
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
-from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, PanelPlace, named, plot
+from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, Root, named, plot
 from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars, send_texts
 
@@ -27,12 +27,12 @@ class Lanes(LeafPanel):
 
     labels: Sequence[str]  # of the values from `start` on
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         colors = np.resize(np.array(PALETTE, np.uint32), len(self.labels))
         style = rr.StateConfiguration(values=list(self.labels), labels=list(self.labels), colors=colors)
         place.stream.log(place.root + self.entity, style, static=True)
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         values = self.leaf.get(getattr(block.columns, self.column)).astype(np.int64)
         changed = np.ones(len(values), np.bool_)
         changed[1:] = values[1:] != values[:-1]
@@ -63,7 +63,7 @@ class Lanes(LeafPanel):
 class Words(LeafPanel):
     """A leaf of variable size: a text as it is, anything else as Python would print it."""
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         values = self.leaf.get(getattr(block.columns, self.column))
         texts = [_shown(value) for value in values]
         entity = place.root + self.entity
@@ -96,11 +96,11 @@ class Infos:
     title: str = "infos"
     column: str = "infos"
 
-    def declare(self, place: PanelPlace) -> None:
+    def declare(self, place: Root) -> None:
         for i, (key, entity) in enumerate(self.numbers.items()):
             place.declare_series(entity, [place.series_name(key, alone=False)], place.colors(1, i))
 
-    def send(self, place: PanelPlace, block: Block, times: Times) -> None:
+    def send(self, place: Root, block: Block, times: Times) -> None:
         pairs_of: dict[str, list[tuple[int, Any]]] = {key: [] for key in (*self.numbers, *self.texts)}
         seams = set(times.seams)
         breaking: set[str] = set()  # keys whose next value is of another episode than the one before
@@ -146,7 +146,7 @@ class LiveInfos(Infos):
     """The numbers in infos of the first sub-environment of a running rollout; below no root."""
 
     def send_numbers(
-        self, place: PanelPlace, infos: Sequence[Mapping[str, Any]], times: Times, *, missed: bool
+        self, place: Root, infos: Sequence[Mapping[str, Any]], times: Times, *, missed: bool
     ) -> None:
         """Sends the numbers of `infos`, one for each row of `times`. `missed`: infos before them were not sent, so the
         lines break."""
