@@ -774,7 +774,7 @@ class TestLook:
     def test_the_columns_of_ls_as_json(self, cartpole: Path, here: Path) -> None:
         (told,) = run("ls", cartpole, "--columns", "Steps,return", "--json").json
         assert list(told) == ["steps", "return"]
-        listed = re.search(r"Columns are (.*?)\.", ok("ls", "--help"), re.DOTALL)
+        listed = re.search(r"Columns are\s(.*?)\.", ok("ls", "--help"), re.DOTALL)
         assert listed is not None
         names = ",".join(re.findall(r"\w+", listed[1]))
         assert ",".join(run("ls", cartpole, "--columns", names, "--json").json[0]) == names

@@ -50,6 +50,7 @@ from tupli_mcap.recording import (
 )
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.schema.times import local_text, time_ns
+from tupli_mcap.storage.listing import listed_of
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
@@ -298,13 +299,19 @@ class TestRun:
         path = str(tmp_path / "all.mcap")
         merge_recordings(paths, path)
 
-        def told(filter: str) -> list[Any]:
-            words = ["--filter", filter, "--columns", "run,tags,episodes,settings", "--json"]
-            (row,) = json.loads(command("ls", path, *words))["result"]
-            return list(row.values())
+        def told(filter: str) -> list[list[Any]]:
+            words = ["--filter", filter, "--columns", "run,tags,episodes,settings,size", "--json"]
+            return [list(row.values()) for row in json.loads(command("ls", path, *words))["result"]]
 
-        assert told('run.name = "w1"') == ["w1", ["tag1"], 1, {"lr": 1, "gamma": 1}]
-        assert told('run.name != "w0"') == ["w1, w2", ["tag1"], 2, {"gamma": 1}]
+        size = Path(path).stat().st_size
+        first, second = (
+            ["w1", ["tag1"], 1, {"lr": 1, "gamma": 1}],
+            ["w2", ["tag2"], 1, {"lr": 2, "gamma": 1}],
+        )
+        assert told('run.name = "w1"') == [[*first, size]]
+        assert told('run.name != "w0"') == [[*first, size], [*second, None]]  # the file counts once
+        served = list(listed_of(tupli_mcap.open(path).filter('run.name != "w0"').headers))
+        assert [[row.name, list(row.tags), row.episodes, row.settings] for row in served] == [first, second]
 
     def test_can_be_edited(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap", metadata={"lr": 1, "old": 2})
@@ -1077,8 +1084,12 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     assert [episode.run.metadata["lr"] for episode in dataset] == [1.5] * 7 + [3] + [2] * 2
     assert len(dataset.filter("run.name = 'two'")) == 2
     assert verify_recording(path).ok
-    listed = json.loads(CliRunner().invoke(app, ["ls", str(path), "--json"]).output)["result"][0]
-    assert listed["run"].startswith("one, killed, two") and listed["settings"] == {}  # nothing that all share
+    listed = json.loads(CliRunner().invoke(app, ["ls", str(path), "--json"]).output)["result"]
+    assert [(row["run"], row["settings"]["lr"]) for row in listed] == [
+        ("one", 1.5),
+        ("killed", 3),
+        ("two", 2),
+    ]
     with pytest.raises(RecordingError, match="has 3 runs; only a recording of one run"):
         edit_run(path, name="x")
     before = path.read_bytes()

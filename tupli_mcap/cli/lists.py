@@ -126,8 +126,8 @@ def ls(
 ) -> None:
     """List runs in files, directories and servers.
 
-    A run that was recorded into several files is one row, and so is a file that has several
-    runs, or was made of other files. Columns are recording, files, run, environment,
+    A run that was recorded into several files is one row; a file with several runs has one for
+    each, and its size is told with the first. Columns are recording, files, run, environment,
     episodes, steps, return, success, started, size, state, split, tags, settings, paths.
     RECORDING is the first file of the run, FILES how many there are, if a run has several.
     The last four appear only with --columns; settings are the metadata of the run, and

@@ -7,7 +7,7 @@ import errno
 import glob
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -64,17 +64,18 @@ _STATES = ("incomplete", "recording", "recovered", "complete", "")
 
 
 class ListedRecording(NamedTuple):
-    """Facts about a recording, or all those of a run, without its deleted episodes; `error` says why they are missing.
+    """Facts about a run, without its deleted episodes; `error` says why they are missing.
 
     Attributes:
-        paths: of the recording; of a run, those of its recordings in their order in time.
+        paths: of its recordings in their order in time.
         return_sum: over its episodes, without the `return_nan` whose return is NaN.
-        size: of the files (bytes); None if unknown.
+        size: of the files (bytes); None if unknown. A file with several runs counts as the first one's.
         state: see `tupli_mcap.recording.describe.description.state_of`.
-        name, environment, started (ISO 8601 in UTC), split, tags: of its run.
-        settings: the metadata of its run; of several, what they have in common.
+        name, environment, split, tags: see `tupli_mcap.Run`.
+        started: ISO 8601 in UTC.
+        settings: its metadata.
         succeeded: how many episodes did, of the `success_known` whose metadata say it.
-        run_id: the run that it is a part of; empty if it has several, or was made of other recordings.
+        run_id: empty if the recording was made of others, whose episodes it repeats.
         span: when the first of its episodes ended, and the last (ISO 8601 in UTC); empty texts without an episode.
     """
 
@@ -207,9 +208,10 @@ def find_recordings(path: Path) -> list[Path]:
 def list_recordings(
     sources: Iterable[Path | str], choose: Callable[[Recording], Array] | None = None
 ) -> Iterator[ListedRecording]:
-    """The recordings of files, directories and URLs; one that cannot be read is listed with its error.
+    """The runs of each recording of files, directories and URLs; a recording that cannot be read is listed with its
+    error.
 
-    `choose` returns the positions of the episodes that count; recordings without any are left out.
+    `choose` returns the positions of the episodes that count; runs without any are left out.
     """
     for source in sources:
         try:
@@ -218,9 +220,10 @@ def list_recordings(
             yield ListedRecording((shown_name(str(source)),), error=str(err))
             continue
         for file in found:
-            listed = _listed(file, source if isinstance(source, Path) and source.is_dir() else None, choose)
-            if listed.episodes or listed.error or choose is None:
-                yield listed
+            root = source if isinstance(source, Path) and source.is_dir() else None
+            for item in _listed(file, root, choose):
+                if item.episodes or item.error or choose is None:
+                    yield item
 
 
 def recordings_at(source: Path | str) -> Sequence[Path | str]:
@@ -246,29 +249,25 @@ def is_of_several(source: str) -> bool:
 
 
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:
-    """The recordings that episodes of a storage are in, as far as their headers tell; size and state are unknown."""
-    for name, same in by_recording(headers).items():
-        returns = np.array([header.episode_return for header in same], np.float64)  # None becomes NaN
-        said = [found for header in same if (found := success_of(header.metadata)) is not None]
-        run, runs = same[0].run, {str(header.run.get("id") or "") for header in same}
-        yield ListedRecording(
-            paths=(name,),
-            episodes=len(same),
-            steps=sum(header.n_tuples for header in same),
-            **_return_facts(returns),
-            size=None,
-            benchmark_id=same[0].benchmark_id,
-            name=", ".join(dict.fromkeys(str(header.run.get("name", "")) for header in same)),
-            environment=str(run.get("environment") or ""),
-            started=str(run.get("started") or ""),
-            succeeded=sum(said),
-            success_known=len(said),
-            split=str(run.get("split") or ""),
-            tags=tuple(map(str, run.get("tags") or ())),
-            settings=_shared(header.run.get("metadata") or {} for header in same),
-            run_id=runs.pop() if len(runs) == 1 else "",
-            span=(min(ends := [header.created_at for header in same]), max(ends)),
-        )
+    """The runs of each recording of a storage that has some episodes, as far as their headers tell; size and state are
+    unknown."""
+    for name, of_file in by_recording(headers).items():
+        runs: dict[Any, list[EpisodeHeader]] = {}
+        for header in of_file:
+            runs.setdefault((header.run.get("id"), header.run.get("name")), []).append(header)
+        for same in runs.values():
+            run, ends = Run.of_document(same[0].run, name), [header.created_at for header in same]
+            yield _of_run(
+                name,
+                run,
+                lengths=np.array([header.n_tuples for header in same]),
+                returns=np.array([header.episode_return for header in same], np.float64),  # None becomes NaN
+                said=[found for header in same if (found := success_of(header.metadata)) is not None],
+                span=(min(ends), max(ends)),
+                size=None,
+                benchmark_id=same[0].benchmark_id,
+                run_id=run.id,
+            )
 
 
 def by_run(items: Iterable[ListedRecording]) -> list[ListedRecording]:
@@ -307,13 +306,6 @@ def _joined(parts: Sequence[ListedRecording]) -> ListedRecording:
     )
 
 
-def _return_facts(returns: Array) -> dict[str, Any]:
-    """`return_sum` and `return_nan` of the returns of episodes (float64)."""
-    known = returns[~np.isnan(returns)]
-    with np.errstate(invalid="ignore", over="ignore"):  # of infinite returns
-        return {"return_sum": float(known.sum()), "return_nan": len(returns) - len(known)}
-
-
 def compactable(root: Path) -> list[Compactable]:
     """The recordings of a storage that `FileStorage.compact` would rewrite.
     FormatError if a recording with deleted episodes, or its sidecar, is damaged."""
@@ -329,59 +321,66 @@ def compactable(root: Path) -> list[Compactable]:
     return compactables
 
 
-def _shared(settings: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """What settings have in common."""
-    first, *others = settings
-    return {
-        key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)
-    }
-
-
-def _runs_of(recording: Recording, positions: Array) -> list[Run]:
-    """The runs of some episodes, each once, in their order; without episodes, all runs."""
-    runs = recording.readable_runs
-    if len(runs) == 1 or not len(positions):
-        return runs
-    places = recording.run_places
-    return [runs[place] for place in dict.fromkeys(places[i] for i in positions.tolist())]
-
-
 def _listed(
     file: Path | str, root: Path | None, choose: Callable[[Recording], Array] | None
-) -> ListedRecording:
+) -> list[ListedRecording]:
+    """The runs of a recording; without episodes, all of them."""
     name = shown_name(str(file))
     try:
         notes = Notes.read(file, root) if isinstance(file, Path) else None
         with Recording(file) as recording:
-            deleted = set() if notes is None else notes.about(recording.metadata).deleted
-            numbers = recording.index["episode"]
             if choose is not None:
                 kept = choose(recording)
             else:
-                kept = np.flatnonzero(~np.isin(numbers, list(deleted)))
-            rows = recording.index[kept]
-            ends = rows["end_time"]
-            said, runs = successes(recording, kept), _runs_of(recording, kept)
-            run = runs[0]
-            return ListedRecording(
-                paths=(name,),
-                episodes=len(rows),
-                steps=int(rows["length"].sum()),
-                **_return_facts(rows["return"]),
-                size=recording.size,
-                created_ns=recording.created_ns,
-                benchmark_id=recording.benchmark_id,
-                state=state_of(recording),
-                name=", ".join(dict.fromkeys(run.name for run in runs)),
-                environment=run.environment,
-                started=run.started,
-                succeeded=sum(said),
-                success_known=len(said),
-                split=run.split,
-                tags=run.tags,
-                settings=_shared(each.metadata for each in runs),
-                run_id=run.id if len(runs) == 1 and recording.is_recorded else "",
-                span=(iso_utc(int(ends.min())), iso_utc(int(ends.max()))) if len(ends) else ("", ""),
-            )
+                deleted = set() if notes is None else notes.about(recording.metadata).deleted
+                kept = np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
+            runs, places = recording.readable_runs, recording.readable_places[kept]
+            listed: list[ListedRecording] = []
+            for i in dict.fromkeys(places.tolist()) or range(len(runs)):
+                positions = kept[places == i]
+                rows = recording.index[positions]
+                ends = rows["end_time"]
+                listed.append(
+                    _of_run(
+                        name,
+                        runs[i],
+                        lengths=rows["length"],
+                        returns=rows["return"],
+                        said=successes(recording, positions),
+                        span=(iso_utc(int(ends.min())), iso_utc(int(ends.max()))) if len(ends) else ("", ""),
+                        size=None if listed else recording.size,
+                        created_ns=recording.created_ns,
+                        benchmark_id=recording.benchmark_id,
+                        state=state_of(recording),
+                        run_id=runs[i].id if recording.is_recorded else "",
+                    )
+                )
+            return listed
     except (TupliError, OSError) as err:
-        return ListedRecording((name,), error=str(err))
+        return [ListedRecording((name,), error=str(err))]
+
+
+def _of_run(
+    path: str, run: Run, *, lengths: Array, returns: Array, said: Sequence[bool], **more: Any
+) -> ListedRecording:
+    """What one recording has of a run, from facts about the episodes: steps, returns (float64, NaN if unknown), and
+    for those that tell it, whether they succeeded."""
+    known = returns[~np.isnan(returns)]
+    with np.errstate(invalid="ignore", over="ignore"):  # of infinite returns
+        return_sum = float(known.sum())
+    return ListedRecording(
+        paths=(path,),
+        episodes=len(returns),
+        steps=int(lengths.sum()),
+        return_sum=return_sum,
+        return_nan=len(returns) - len(known),
+        name=run.name,
+        environment=run.environment,
+        started=run.started,
+        succeeded=sum(said),
+        success_known=len(said),
+        split=run.split,
+        tags=run.tags,
+        settings=run.metadata,
+        **more,
+    )

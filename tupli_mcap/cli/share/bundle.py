@@ -177,12 +177,14 @@ def _signing_key(path: Path) -> SigningKey:
 
 
 def _print_written(path: Path, as_json: bool) -> None:
-    from tupli_mcap.storage.listing import list_recordings
+    from tupli_mcap.recording import Recording
 
-    (item,) = list_recordings([path])
-    facts = {"path": path, "benchmark_id": item.benchmark_id}
+    with Recording(path) as recording:
+        lengths, size = recording.index["length"], recording.size
+        facts = {"path": path, "benchmark_id": recording.benchmark_id}
+    episodes, steps = len(lengths), int(lengths.sum())
     print_result(
-        {**facts, "episodes": item.episodes, "steps": item.steps, "size": item.size},
-        f"{path}: {counted(item.episodes, 'episode')}, {counted(item.steps, 'step')}, {bytes_of(item.size or 0)}",
+        {**facts, "episodes": episodes, "steps": steps, "size": size},
+        f"{path}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}",
         as_json=as_json,
     )

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, TupliError, warn
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
 from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
@@ -30,7 +31,7 @@ class DescribedRecording(OpenedRecording):
 
     @cached_property
     def runs(self) -> list[Run]:
-        """The runs of the episodes; several only if the recording was made of others.
+        """The runs of the episodes; several if the recording was made of others, or other runs were appended to it.
 
         Raises:
             FormatError: `run.json` is damaged.
@@ -114,11 +115,16 @@ class DescribedRecording(OpenedRecording):
             name = PurePosixPath(file_name(self.name)).stem
             return [Run().known_as(name, "", self.created_ns, 0)]
 
+    @cached_property
+    def readable_places(self) -> Array:
+        """The index in `readable_runs` of each episode's run (int64)."""
+        places = self.run_places if len(self.readable_runs) > 1 else [0] * len(self.index)
+        return np.array(places, np.int64)
+
     def listed_runs(self) -> list[dict[str, Any]]:
         """The run of each episode, as filters see it; damage is handled as in `readable_runs`."""
         found = [run.as_dict() for run in self.readable_runs]
-        places = self.run_places if len(found) > 1 else []
-        return [found[place] for place in places] or found * len(self.index)
+        return [found[place] for place in self.readable_places.tolist()]
 
     def episode_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i`, with annotations applied."""

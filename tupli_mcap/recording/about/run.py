@@ -128,7 +128,7 @@ class RecordedRuns(NamedTuple):
     """The runs of a recording's episodes.
 
     Attributes:
-        runs: one, unless the recording was made of others.
+        runs: several if the recording was made of others, or other runs were appended to it.
         spans: (number of episodes, index in `runs`) in the order of the index; episodes beyond the last span belong to
             the last run.
         before: earlier versions of an edited run, the latest last.

@@ -185,10 +185,7 @@ def state_of(recording: Recording) -> str:
 
 def _runs(recording: Recording, positions: Array) -> list[dict[str, Any]]:
     runs = recording.readable_runs
-    places = (
-        np.array(recording.run_places)[positions] if len(runs) > 1 else np.zeros(len(positions), np.int64)
-    )
-    counts = np.bincount(places, minlength=len(runs)).tolist()
+    counts = np.bincount(recording.readable_places[positions], minlength=len(runs)).tolist()
     return [{"name": run.name, "episodes": count} for run, count in zip(runs, counts, strict=True)]
 
 
