@@ -1362,6 +1362,7 @@ class TestSharing:
         assert trust.is_trusted(shown["digest"])
         assert run("trust", path, "--remove", "--json").json["trusted"] is False
         assert not trust.is_trusted(shown["digest"])
+        assert "expected a path, found s3://lab/r.mcap" in fails("trust", "s3://lab/r.mcap", code=2)
         assert fails("trust", path, "--show", "--remove", code=2).startswith(
             "Invalid value: --show, --remove, --list and --key exclude each other"
         )
@@ -1427,6 +1428,11 @@ def help_of(command: str) -> str:
 
 
 class TestProgram:
+    def test_as_a_module(self) -> None:
+        words = [sys.executable, "-m", "tupli_mcap", "version"]
+        told = subprocess.run(words, check=True, capture_output=True, text=True).stdout
+        assert told == ok("version")
+
     def test_help(self, here: Path) -> None:
         listed = ok("--help")
         assert ok() == ok("help") == listed

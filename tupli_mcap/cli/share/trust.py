@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import Json
+from tupli_mcap.cli.options import Json, local_path
 from tupli_mcap.cli.output import print_facts, print_json, print_result
 from tupli_mcap.errors import bytes_of
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def trust(
     file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A recording.", readable=False)
+        Path | None, typer.Argument(metavar="[FILE]", help="A recording.", parser=local_path)
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Only show what rebuilding would run.")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Stop trusting it.")] = False,

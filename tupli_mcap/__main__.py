@@ -1,0 +1,5 @@
+"""`python -m tupli_mcap` is `tupli-mcap`."""
+
+from tupli_mcap.cli import main
+
+main()
