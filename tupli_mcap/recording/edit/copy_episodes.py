@@ -193,10 +193,10 @@ class EpisodeCopier:
         for first, count in spans:
             for span in self._store.spans(channel, first, count):
                 part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
-                renumbered = (self._shift or self._trims) and "episode" in (dtype.names or ())
-                if renumbered or new:
+                is_numbered = (self._shift or self._trims) and "episode" in (dtype.names or ())
+                if is_numbered or new:
                     part = writable(part)
-                if renumbered:
+                if is_numbered:
                     self._renumber_rows(part)
                 for name, column in new.items():
                     part[name] = column[first : first + len(part)]

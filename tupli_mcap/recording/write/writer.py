@@ -145,10 +145,8 @@ class RecordingWriter:
         found = resume(self.path, self.options, self.format_version, self.place, self.container)
         contents, self.index, self.layout, self.recorded_envs, self.recorded_vector, self.arriving = found
         self.next_episode = contents.next_episode
-        if (
-            not contents.complete
-        ):  # what is cut is derivable from the chunks: a crash in between loses nothing
-            self.cut()
+        if not contents.complete:
+            self.cut()  # what is cut follows from the chunks: a crash in between loses nothing
             for channel in contents.undefined:  # the file was shorter after a power loss
                 self.container.write(self.container.definitions(channel))
             for rows in contents.tail:
