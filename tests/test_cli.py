@@ -524,6 +524,22 @@ class TestLook:
         )
         assert "did you mean 'recording'" in fails("ls", "--columns", "file", code=2)
 
+    def test_ls_counts_the_chosen_episodes(self, here: Path) -> None:
+        for name in ("a", "b"):
+            record_rollouts("CartPole-v1", f"runs/{name}.mcap", name=name, episodes=4, seed=ord(name))
+        returns = [tupli_mcap.open(f"runs/{name}.mcap").returns for name in "ab"]
+        told = run("ls", "runs", "--episodes", "0,2", "--json").json
+        assert [(row["run"], row["episodes"], row["return"]) for row in told] == [
+            (name, 2, found[[0, 2]].mean()) for name, found in zip("ab", returns, strict=True)
+        ]
+        (told,) = run("ls", "runs", "--episodes", "best", "--columns", "run,return", "--json").json
+        assert told == {"run": "ab"[np.argmax([max(found) for found in returns])], "return": np.max(returns)}
+        (told,) = run(
+            "ls", "runs", "-e", "0-3", "--filter", f"return < {np.min(returns) + 0.5}", "--json"
+        ).json
+        assert told["return"] == np.min(returns)
+        assert "no episode '9'" in fails("ls", "runs", "--episodes", "9")
+
     def test_ls_counts_no_episode_of_a_run_twice(self, here: Path) -> None:
         record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)
         names = sorted(path.name for path in here.glob("*.mcap"))

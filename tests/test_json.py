@@ -28,7 +28,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 PAGE = (Path(__file__).parents[1] / "docs" / "reference" / "json.md").read_text()
-WITHOUT_JSON = {"view", "browse", "serve", "help", "version"}
+WITHOUT_JSON = {"browse", "serve", "help", "version"}
 
 
 def tables(page: str) -> dict[str, tuple[bool, dict[str, str]]]:
@@ -145,6 +145,8 @@ episodes: episodes lab
 doctor: doctor nan.mcap bad.mcap a.mcap | 1
 doctor --list: doctor --list
 verify: verify lab runs damaged.mcap nan.mcap --rerun --episodes 0 | 1
+view: view a.mcap --save a.rrd
+view: view a.mcap --layout a.json
 plot: plot a.mcap
 render --rerun: render a.mcap -o film.mcap --episodes first --every 10
 render: render film.mcap -o film.gif --episodes first
@@ -224,7 +226,7 @@ def test_every_command_prints_what_the_page_says(url: str) -> None:
         (["list-episodes"], "StorageError", 1),
         (["ls", ".", "--filter", "return >"], "FilterError", 2),
         (["ls", "--sort", "colour"], "UsageError", 2),
-        (["view", "a.mcap"], "UsageError", 2),
+        (["browse", "a.mcap"], "UsageError", 2),
         (["verify", "empty"], "RecordingError", 1),
         (["nothing"], "UsageError", 2),
     ],

@@ -40,6 +40,8 @@ from tupli_mcap.remote import is_server, is_url, path_of
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.dataset.which import Positions
+    from tupli_mcap.recording import Recording
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
     from tupli_mcap.storage.listing import ListedRecording
@@ -119,6 +121,7 @@ def ls(
             help="Recordings, directories, patterns, storages, URLs; by default, this directory.",
         ),
     ] = None,
+    which: Episodes = None,
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
@@ -135,14 +138,15 @@ def ls(
     ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
     writer was killed or failed: all finished steps are there; `incomplete` if its journal is
     missing, too. A server does not tell SIZE and STATE. Deleted episodes are not counted.
-    With --filter, only the episodes that match are counted.
+    With --episodes or --filter, only those episodes are counted.
     """
     from tupli_mcap.storage.listing import by_run
 
-    wanted = filter_of(filter_text)
-    listed = by_run(item for source in paths or ["."] for item in _listed(source, wanted))
+    sources, wanted = paths or ["."], filter_of(filter_text)
+    ids = _chosen_ids(sources, which, wanted)
+    listed = by_run(item for source in sources for item in _listed(source, wanted, ids))
     if wanted is not None and not listed:
-        _check_there(paths or ["."], wanted)
+        _check_there(sources, wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).value, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
@@ -157,21 +161,44 @@ def ls(
         raise typer.Exit(1)
 
 
-def _listed(source: str, wanted: BaseFilter | None) -> Iterator[ListedRecording]:
+def _chosen_ids(sources: Sequence[str], which: str | None, wanted: BaseFilter | None) -> set[str] | None:
+    """The ids of the episodes that --episodes names; None without it."""
+    if which is None:
+        return None
+    from tupli_mcap.dataset.chosen import chosen_ids
+
+    return chosen_ids(sources, which, wanted)
+
+
+def _listed(source: str, wanted: BaseFilter | None, ids: set[str] | None) -> Iterator[ListedRecording]:
+    """The recordings of a source, of which the episodes count that match and have one of the `ids`."""
     from tupli_mcap.storage.listing import list_recordings, listed_of
 
     if is_server(source):
         with any_storage(source) as storage:
-            yield from listed_of(storage.list_episodes(wanted))
+            headers = storage.list_episodes(wanted)
+        yield from listed_of(header for header in headers if ids is None or header.id in ids)
         return
     choose = None
-    if wanted is not None:
-        from tupli_mcap.dataset.which import candidates
+    if wanted is not None or ids is not None:
         from tupli_mcap.schema import EpisodeHeader, check_keys
 
-        check_keys(wanted, EpisodeHeader)
-        choose = partial(candidates, filter=wanted)
+        if wanted is not None:
+            check_keys(wanted, EpisodeHeader)
+        choose = partial(_positions, wanted=wanted, ids=ids)
     yield from list_recordings([source if is_url(source) else path_of(source)], choose)
+
+
+def _positions(recording: Recording, wanted: BaseFilter | None, ids: set[str] | None) -> Positions:
+    """The positions of the episodes that match and have one of the `ids`."""
+    from tupli_mcap.dataset.which import candidates
+    from tupli_mcap.storage.base import episode_id
+
+    found = candidates(recording, wanted)
+    if ids is None:
+        return found
+    numbers = recording.index["episode"][found].tolist()
+    return found[[episode_id(recording.uuid, number) in ids for number in numbers]]
 
 
 def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
@@ -310,10 +337,7 @@ def episodes(
         return
     wanted = filter_of(filter_text)
     headers = _headers_of(dataset_of(paths), wanted, sort)
-    if which is not None:
-        from tupli_mcap.dataset.chosen import chosen_ids
-
-        ids = chosen_ids(paths, which, wanted)
+    if (ids := _chosen_ids(paths, which, wanted)) is not None:
         headers = [header for header in headers if header.id in ids]
     _print_headers(headers[:limit], columns, as_json=as_json)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Force, Sources, check_extras, filter_of
-from tupli_mcap.cli.terminal import flush, say
+from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, check_extras, filter_of
+from tupli_mcap.cli.output import print_result
+from tupli_mcap.cli.terminal import flush
 from tupli_mcap.errors import bytes_of
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
@@ -48,6 +50,7 @@ def view(
     connect: _Connect = None,
     force: Force = False,
     layout: _Layout = None,
+    as_json: Json = False,
 ) -> None:
     """Look at recordings in the Rerun viewer.
 
@@ -63,7 +66,7 @@ def view(
             raise typer.BadParameter(
                 "--layout goes only with --force: a layout is made for a whole recording"
             )
-        _write_layout(sources, layout, force=force)
+        _write_layout(sources, layout, force=force, as_json=as_json)
         return
     if compare and apart:
         raise typer.BadParameter("--compare overlays episodes, --apart shows them apart; give one of them")
@@ -82,21 +85,32 @@ def view(
     if save is not None:
         commands: list[str] = []
         path = viewer.save(sources, save, episode, overwrite=force, tell=commands.append, **shown)
-        say(f"{path}: {bytes_of(path.stat().st_size)}; open it with: {commands[0]}", *notes)
+        size, command = path.stat().st_size, commands[0]
+        line = f"{path}: {bytes_of(size)}; open it with: {command}"
+        _tell(line, as_json=as_json, notes=notes, path=path, size=size, command=command)
     elif web:
-        viewer.serve(sources, episode, tell=lambda url: _tell(url, *notes), **shown)
+        line = "open this address in a browser; Ctrl-C ends the viewer"
+        viewer.serve(
+            sources,
+            episode,
+            tell=lambda url: _tell(url, line, as_json=as_json, notes=notes, address=url),
+            **shown,
+        )
     else:
         viewer.show(sources, episode, connect=connect, **shown)
-        say(*notes)
+        _tell(as_json=as_json, notes=notes)
 
 
-def _tell(url: str, *notes: str) -> None:
-    say(url, "open this address in a browser; Ctrl-C ends the viewer", *notes)
+def _tell(*lines: str, as_json: bool, notes: Sequence[str] = (), **facts: Any) -> None:
+    """Prints what is shown, and where; at once, since the viewer may go on."""
+    known = {"path": None, "size": None, "command": None, "address": None}
+    print_result({**known, **facts, "notes": notes}, *lines, *notes, as_json=as_json)
     flush()
 
 
-def _write_layout(sources: list[str], target: Path, *, force: bool) -> None:
+def _write_layout(sources: list[str], target: Path, *, force: bool, as_json: bool) -> None:
     from tupli_mcap.viewer.foxglove_layout import write_layout
 
     path = write_layout(sources, target, overwrite=force)
-    say(f"{path}: open the recording in Foxglove, then import this file as a layout")
+    line = f"{path}: open the recording in Foxglove, then import this file as a layout"
+    _tell(line, as_json=as_json, path=path, size=path.stat().st_size)
