@@ -731,7 +731,9 @@ def test_images_and_large_arrays_come_to_arrow(tmp_path: Path) -> None:
     assert len([name for name in frame if "state" in name]) == 4
     assert np.array_equal(np.stack(list(frame["state.depth"])), dataset.read().states["depth"])
     assert frame["state.depth"][0].shape == (16, 32, 1)
-    assert set(dataset.stats()) == {"states['depth']", "states['x']", "actions", "rewards"}
+    found = dataset.stats()
+    assert set(found) == {"states['depth']", "states['x']", "actions", "rewards"}
+    assert found["observations['x']"] is found["states['x']"]
 
 
 def test_columns_without_a_common_type_come_to_arrow_as_json(tmp_path: Path) -> None:

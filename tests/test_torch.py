@@ -25,9 +25,11 @@ from hypothesis import given, settings, strategies as st
 from test_readme import run_python
 from test_sampling import SPACES, record
 
+import tupli_mcap
 from tupli_mcap import F, FormatError, Recording, TupliDataset
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.items import DeltaWindows, Order, Sampler, SamplingError
+from tupli_mcap.recording.columns.fields import ColumnDict
 
 torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402
@@ -47,7 +49,8 @@ def as_numpy(column: Any) -> Any:
     if isinstance(column, torch.Tensor):
         return column.numpy()
     if isinstance(column, dict):
-        return {key: as_numpy(part) for key, part in column.items()}
+        found = {key: as_numpy(part) for key, part in column.items()}
+        return ColumnDict(found) if isinstance(column, ColumnDict) else found
     return tuple(as_numpy(part) for part in column) if isinstance(column, tuple) else column
 
 
@@ -211,7 +214,7 @@ def test_a_batch_comes_from_a_worker_in_one_piece(each_space: TupliDataset) -> N
     windows = each_space.windows(4, pad="zero")
     loader = DataLoader(StreamDataset(windows, 7, shuffle=False), None, num_workers=1, collate_fn=collate)
     for i, batch in enumerate(loader):
-        assert type(batch) is dict
+        assert type(batch) is ColumnDict
         assert same(as_numpy(batch), windows[i * 7 : i * 7 + 7].asdict())
         assert batch["rewards"].untyped_storage().data_ptr() == batch["mask"].untyped_storage().data_ptr()
 
@@ -227,6 +230,26 @@ def test_packing_lets_go_of_the_arrays() -> None:
     finally:
         gc.enable()
     assert batch["b"]["c"][1] == ["text"]
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+@pytest.mark.parametrize("length", [None, 3])
+def test_a_batch_is_found_by_gymnasiums_names(num_workers: int, length: int | None, tmp_path: Path) -> None:
+    dataset = tupli_mcap.open(record(tmp_path / "a.mcap", SPACES["box"], 50))
+    fields = ["observations", "truncations"]
+    batch = next(iter(dataset.loader(length, batch_size=4, num_workers=num_workers, fields=fields)))
+    assert batch["observations"] is batch["states"] is batch.get("observations")
+    assert batch["truncations"] is batch["timeouts"]
+    assert "observations" in batch and "observations" not in list(batch)
+    assert "rewards" not in batch and batch.get("rewards") is None
+    for name, meant in (("obs", r" \(did you mean 'states'\?\)"), ("rewards", "")):
+        with pytest.raises(KeyError, match=f"expected one of .*states.*, found '{name}'{meant}"):
+            batch[name]
+    copied = pickle.loads(pickle.dumps(batch))
+    assert torch.equal(copied["observations"], batch["states"])
+    sample = MapDataset(dataset.windows(3))[0]
+    assert sample["observations"] is sample["states"]
+    assert default_collate([sample, sample])["observations"].shape[0] == 2
 
 
 def doubled(samples: Any) -> Any:
@@ -338,10 +361,8 @@ def test_transitions_with_several_steps(dataset: TupliDataset) -> None:
 def test_deltas_are_nested(dataset: TupliDataset) -> None:
     items = DeltaWindows(dataset.steps, {"state": [-1, 0], "action": range(3)})
     batch = next(iter(DataLoader(MapDataset(items), 8, num_workers=1, collate_fn=collate)))
-    expected = items[:8]
-    assert same(
-        as_numpy(batch), {name: getattr(expected, name) for name in ("values", "masks", "steps", "episodes")}
-    )
+    assert [*batch] == ["values", "masks", "steps", "episodes"]
+    assert same(as_numpy(batch), items[:8].asdict())
 
 
 # ---- resuming

@@ -34,7 +34,7 @@ from tupli_mcap.dataset.sources import (
 )
 from tupli_mcap.errors import plural, warn
 from tupli_mcap.recording import Columns, Episode, Recording
-from tupli_mcap.recording.columns.fields import FIELDS, FIVE, field_names
+from tupli_mcap.recording.columns.fields import FIELDS, FIVE, ColumnDict, field_names
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
@@ -355,7 +355,8 @@ class Dataset(RandomAccess):
         drop_last: bool = False,
         **chosen: Any,
     ) -> Any:
-        """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)).
+        """A PyTorch `DataLoader` of batches: dicts of tensors (`batch["states"]`, shape (batch, length, ...)), in which
+        Gymnasium's names find the same columns (`batch["observations"]`).
 
         It cannot go on within an epoch; `tupli_mcap.torch.StreamDataset` with a `StatefulDataLoader` can.
 
@@ -392,8 +393,8 @@ class Dataset(RandomAccess):
     ) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf (`states`, or `states['arm']`; `actions`, `rewards`).
 
-        Steps are read once, one block after the other, and the result is kept. Images, and leaves of variable size
-        (texts, graphs), have no statistics.
+        Gymnasium's names find them, too. Steps are read once, one block after the other, and the result is kept.
+        Images, and leaves of variable size (texts, graphs), have no statistics.
 
         Raises:
             DatasetError: a field has no numbers, or there is no step.
@@ -402,7 +403,7 @@ class Dataset(RandomAccess):
         names = field_names(fields, STATISTICAL, DatasetError)
         if missing := [name for name in names if name not in self._stats]:
             self._stats |= statistics_of(self.steps, missing)
-        return {leaf: found for name in names for leaf, found in self._stats[name].items()}
+        return ColumnDict({leaf: found for name in names for leaf, found in self._stats[name].items()})
 
     # ---- out
 

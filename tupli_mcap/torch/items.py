@@ -17,6 +17,7 @@ from torch.utils.data import default_collate, get_worker_info
 
 from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.dataset.items.steps import checked_count
+from tupli_mcap.recording.columns.fields import ColumnDict
 from tupli_mcap.torch.packed import packed
 
 WORKER_CACHE_BYTES = 64 << 20
@@ -32,11 +33,10 @@ class ReadItems:
         self._worker_cache_bytes = checked_count(worker_cache_bytes, 0, "a budget of workers in bytes")
         self._limited_in = 0  # the worker process that keeps to the budget
 
-    def read(self, index: Any) -> dict[str, Any]:
+    def read(self, index: Any) -> ColumnDict:
         """The columns of an item (an integer), or of several (an array of them), by name."""
         if get_worker_info() is None:
-            found: dict[str, Any] = tensors(self.items[index].asdict())
-            return found
+            return ColumnDict(tensors(self.items[index].asdict()))
         if self._limited_in != os.getpid():
             self._limited_in = os.getpid()
             self.items.source.limit(self._worker_cache_bytes, 1)
@@ -77,5 +77,5 @@ def collate(samples: Any) -> Any:
     Anything else is collated by PyTorch's own function.
     """
     if isinstance(samples, Samples):
-        return tensors(samples.batch)
+        return ColumnDict(tensors(samples.batch))
     return samples if isinstance(samples, dict) else default_collate(samples)

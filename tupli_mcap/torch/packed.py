@@ -15,6 +15,7 @@ import torch
 from torch.multiprocessing.reductions import reduce_storage
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.recording.columns.fields import ColumnDict
 
 _ALIGNED = 64  # bytes
 _NUMBERS = (np.ndarray, np.generic)
@@ -30,21 +31,21 @@ class _TensorPlace(NamedTuple):
     shape: tuple[int, ...]
 
 
-class PackedBatch(dict[str, Any]):
-    """A dict of columns whose tensors share one buffer (uint8); once pickled, it is a plain dict of tensors."""
+class PackedBatch(ColumnDict):
+    """Columns whose tensors share one buffer (uint8); once pickled, it is a plain `ColumnDict`."""
 
     def __init__(self, buffer: torch.Tensor, places: dict[str, Any]) -> None:
-        super().__init__(_unpacked(buffer, places))
+        super().__init__(_columns(buffer, places))
         self._parts = buffer, places
         self._leaves = list(_leaves(self))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_unpacked, self._parts) if self._unchanged else (dict, (dict(self),))
+        return (_columns, self._parts) if self._unchanged else (ColumnDict, (dict(self),))
 
     def _handed_over(self) -> tuple[Any, ...]:
         """The form in which `ForkingPickler` passes it to another process."""
         if not self._unchanged:
-            return dict, (dict(self),)
+            return ColumnDict, (dict(self),)
         buffer, places = self._parts
         return _received, (*reduce_storage(buffer.untyped_storage()), places)  # type: ignore[no-untyped-call]
 
@@ -54,8 +55,8 @@ class PackedBatch(dict[str, Any]):
         now = list(_leaves(self))
         return len(now) == len(self._leaves) and all(map(_same, now, self._leaves))
 
-    def __copy__(self) -> dict[str, Any]:
-        return dict(self)  # a changed copy would not be what is in the buffer
+    def __copy__(self) -> ColumnDict:
+        return ColumnDict(self)  # a changed copy would not be what is in the buffer
 
 
 def _leaves(column: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
@@ -99,7 +100,7 @@ def _placed(column: Any, arrays: list[Array], ends: list[int]) -> Any:
 ForkingPickler.register(PackedBatch, PackedBatch._handed_over)
 
 
-def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: dict[str, Any]) -> Any:
+def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: dict[str, Any]) -> ColumnDict:
     """The batch of another process, in the memory that this one shares. RuntimeError if that process is dead."""
     try:
         storage = rebuild(*arguments)
@@ -109,7 +110,11 @@ def _received(rebuild: Callable[..., Any], arguments: tuple[Any, ...], places: d
             "a worker of the DataLoader has died while it handed over a batch; it may have been killed, for using too "
             "much memory for example"
         ) from err
-    return _unpacked(torch.empty(0, dtype=torch.uint8).set_(storage), places)
+    return _columns(torch.empty(0, dtype=torch.uint8).set_(storage), places)
+
+
+def _columns(buffer: torch.Tensor, places: dict[str, Any]) -> ColumnDict:
+    return ColumnDict(_unpacked(buffer, places))
 
 
 def _unpacked(buffer: torch.Tensor, place: Any) -> Any:

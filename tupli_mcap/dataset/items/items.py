@@ -16,7 +16,7 @@ from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.dataset.items.draws import Sampler, Weights
 from tupli_mcap.dataset.items.order import Numbers, Order, Shuffle
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_numbers
-from tupli_mcap.recording.columns.fields import Parts
+from tupli_mcap.recording.columns.fields import ColumnDict, Parts
 from tupli_mcap.schema import BaseFilter, F
 
 T = TypeVar("T", bound="Parts")
@@ -42,10 +42,12 @@ class Samples(Sequence[dict[str, Any]]):
             return [self[k] for k in range(*i.indices(self._size))]
         if not -self._size <= i < self._size:
             raise IndexError(f"expected a sample from 0 to {self._size - 1}, found {i}")
-        return {
-            name: column[i] if isinstance(column, np.ndarray) else arrays_at(column, i)
-            for name, column in self.batch.items()
-        }
+        return ColumnDict(
+            {
+                name: column[i] if isinstance(column, np.ndarray) else arrays_at(column, i)
+                for name, column in self.batch.items()
+            }
+        )
 
 
 class Items(ABC, Generic[T]):

@@ -67,18 +67,42 @@ def described(column: Any) -> str:
     return f"{len(column)} values"
 
 
+class ColumnDict(dict[str, Any]):
+    """Columns by name. Gymnasium's names find ours: `batch["observations"]` is `batch["states"]`; the keys are ours.
+
+    A name may go on with a leaf, as in `stats["observations['arm']"]`. A KeyError names the keys there are.
+    """
+
+    def __missing__(self, name: object) -> Any:
+        known = _own_name(name)
+        if known == name or not dict.__contains__(self, known):
+            raise KeyError(
+                f"expected one of {', '.join(self)}, found {name!r:.80}{did_you_mean(known, self)}"
+            )
+        return self[known]
+
+    def __contains__(self, name: object) -> bool:
+        return dict.__contains__(self, _own_name(name))
+
+    def get(self, name: str, default: Any = None, /) -> Any:
+        """The column, or the default if there is none."""
+        return dict.get(self, _own_name(name), default)
+
+
+def _own_name(name: Any) -> Any:
+    """This package's name of a column, or of a leaf in it."""
+    if not isinstance(name, str):
+        return name
+    column, bracket, leaf = name.partition("[")
+    return OTHER_NAMES.get(column, column) + bracket + leaf
+
+
 class Parts(SaysWhatIsMeant):
     """Columns and facts about them as attributes, None if not requested. `parts["states"]` is `parts.states`, as in a
     dict."""
 
     def __getitem__(self, name: str) -> Any:
-        found = self.asdict()
-        known = OTHER_NAMES.get(name, name)
-        if known not in found:
-            raise KeyError(
-                f"expected one of {', '.join(found)}, found {name!r:.80}{did_you_mean(name, found)}"
-            )
-        return found[known]
+        return self.asdict()[name]
 
     def __repr__(self) -> str:
         told = "; ".join(f"{name}: {described(value)}" for name, value in self.asdict().items())
@@ -87,11 +111,11 @@ class Parts(SaysWhatIsMeant):
     __iter__ = None  # it has no order
 
     def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and OTHER_NAMES.get(name, name) in self.asdict()
+        return name in self.asdict()
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> ColumnDict:
         """The requested columns and facts, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        return ColumnDict({name: value for name, value in vars(self).items() if value is not None})
 
 
 class GymnasiumNames(SaysWhatIsMeant):
