@@ -638,7 +638,7 @@ class TestLook:
             r"^infos +logp, name, step$", out, re.M
         )
         assert re.search(r"^info\.logp .* -0\.500 +-0\.500$", out, re.M) and "info.step" in out
-        assert "info.name" not in out
+        assert "info.name" not in out and "\ninfos that are not shown: name\n" in out
         facts = json.loads(ok("info", "i.mcap", "--json", "--episodes", "1,2"))["result"]
         assert (facts["info_keys"], facts["seeds"]) == (["logp", "name", "step"], 1)
         with RecordEpisodes(env, here / "j.mcap", step_callback=lambda step: {"force": 1}) as recorded:

@@ -681,7 +681,7 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     )
     assert panel(made, "metadata: score") and panel(made, "info: distance")  # of episodes; step by step
     assert not {"metadata: constant", "info: k, mean of each episode"} & set(texts(made))  # all the same
-    assert made.notes == []
+    assert made.notes == ["Infos without numbers are not shown: word."]
 
 
 def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -711,6 +711,20 @@ def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
     np.testing.assert_array_equal(made.measured[0].numbers["info: 0"], [2.5, 2.5])
     assert panel(made, "info: 0")
+
+
+def test_infos_without_numbers_are_named(tmp_path: Path) -> None:
+    env = Scripted(
+        lambda n: UNIT.low,
+        UNIT,
+        info=lambda n: {"force": 1.0, "contact": np.ones(2), "note": "x", "is_success": False},
+        length=4,
+    )
+    made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
+    assert [note for note in made.notes if note.startswith("Infos")] == [
+        "Infos without numbers are not shown: contact, note."
+    ]
+    assert "info: force" in texts(made)
 
 
 def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:

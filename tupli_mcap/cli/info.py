@@ -363,6 +363,8 @@ def _print_series(recording: Recording, positions: Any, steps: int) -> None:
         hidden = f"{number(summary.hidden)} more dimensions" if summary.hidden else ""
         if told or hidden:
             say(", ".join(filter(None, (hidden, told))))
+        if summary.infos_hidden:
+            print_wrapped(f"infos that are not shown: {_some(summary.infos_hidden)}", "", "")
         odd = [f"{number(one.odd)} of {one.name}" for one in summary.distributions if one.odd]
         if odd:
             print_wrapped(f"not finite, left out: {', '.join(odd)}", "", "")

@@ -23,7 +23,7 @@ from tupli_mcap.spaces.leaves import Leaf
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
-_INFO_PLACES, _MOST_KEYS = 40, 64
+_INFO_PLACES, _MOST_KEYS, _MOST_NAMED = 40, 64, 8
 # a key of `Measured.numbers`, and how others begin
 SUCCESS, INFO, METADATA = "success", "info: ", "metadata: "
 _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
@@ -37,6 +37,7 @@ class Measured:
     is_recorded: see `Recording.is_recorded`.
     numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata: key`, and `info: key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
+    other_infos: keys of infos that are never a finite number.
     read_episodes, read_steps: how many episodes and steps the values are from.
     states, actions, rewards: the values of their leaves. seeds: the different seeds of the chosen episodes, ascending.
     """
@@ -51,6 +52,7 @@ class Measured:
     numbers: dict[str, Array] = field(default_factory=dict)
     info_steps: int = 0
     read_infos: int = 0
+    other_infos: list[str] = field(default_factory=list)
     step_seconds: float | None = None
     read_episodes: int = 0
     read_steps: int = 0
@@ -83,6 +85,12 @@ class Measured:
             )
         if self.read_infos < self.info_steps:
             notes.append(f"Infos are those of {self.read_infos:,} of {self.info_steps:,} steps.")
+        if self.other_infos:
+            more = len(self.other_infos) - _MOST_NAMED
+            names = ", ".join(key[:40] for key in self.other_infos[:_MOST_NAMED])
+            notes.append(
+                f"Infos without numbers are not shown: {names}{f' and {more:,} more' if more > 0 else ''}."
+            )
         for leaf in self.leaves:
             notes += leaf.notes()
         odd = int(np.isnan(self.rows["return"]).sum())
@@ -182,13 +190,19 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     decoder = InfoCodec.from_metadata(file.contents.channels[number].metadata)
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
     sums: dict[str, Array] = {}
+    keys, numbers = set[str](), set(KEYS)
     for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
         for body in file.store.bodies(number, first, each):
             episode, _, info = decoder.decode(body)
-            for key, value in numbers_in(info) if episode in at else ():
+            if episode not in at:
+                continue
+            keys.update(with_text_keys(info))
+            for key, value in numbers_in(info):
+                numbers.add(key)
                 if INFO + key in sums or len(sums) < _MOST_KEYS:
                     sums.setdefault(INFO + key, np.zeros((2, len(at))))[:, at[episode]] += value, 1
     measured.info_steps, measured.read_infos = channel.messages, each * places
+    measured.other_infos = sorted(keys - numbers)
     with np.errstate(invalid="ignore"):
         measured.numbers |= {key: total / count for key, (total, count) in sums.items()}
 

@@ -54,6 +54,7 @@ class Sketch(NamedTuple):
         distributions: counts of steps, from the smallest value to the largest.
         sampled: number of steps that the distributions count.
         hidden: number of dimensions that are left out.
+        infos_hidden: keys of infos without a distribution.
         error: why the steps could not be read; empty if there was no error.
     """
 
@@ -61,6 +62,7 @@ class Sketch(NamedTuple):
     distributions: tuple[Series, ...]
     sampled: int
     hidden: int
+    infos_hidden: tuple[str, ...] = ()
     error: str = ""
 
 
@@ -82,7 +84,7 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
         pieces = list(_pieces(recording, positions))
         infos = sampled_infos(recording, positions)
     except TupliError as err:  # a damaged chunk must not hide the other series
-        return Sketch(courses, (), 0, 0, str(err))
+        return Sketch(courses, (), 0, 0, error=str(err))
     layout = recording.layout
     shown = tuple(
         series
@@ -95,8 +97,10 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
     )
     dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind != "variable" and not leaf.apart)
     hidden = dimensions - len(shown)
-    shown += tuple(itertools.islice(_of_infos(infos, points), _MOST_INFOS))
-    return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden)
+    of_infos = dict(itertools.islice(_of_infos(infos, points), _MOST_INFOS))
+    others = tuple(sorted({key for info in infos for key in info} - of_infos.keys()))
+    shown += tuple(of_infos.values())
+    return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden, others)
 
 
 def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS) -> list[dict[str, Any]]:
@@ -117,12 +121,12 @@ def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS
     return [with_text_keys(info) for episode, _, info in map(codec.decode, bodies) if episode in wanted]
 
 
-def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[Series]:
-    """The distribution of each number of infos."""
+def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[tuple[str, Series]]:
+    """The distribution of each number of infos, by its key."""
     for key in dict.fromkeys(key for info in infos for key in info):
         found = [info[key] for info in infos if key in info]
         if all(isinstance(value, int | float | np.number | np.bool_) for value in found):
-            yield _distribution(None, f"info.{key}", np.array(found, np.float64), points)
+            yield key, _distribution(None, f"info.{key}", np.array(found, np.float64), points)
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:
