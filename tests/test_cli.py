@@ -591,6 +591,15 @@ class TestLook:
             storage.delete_episode(storage.list_episodes()[0].id)
         assert sum(item["episodes"] for item in run("ls", "lab", "--json").json) == 4
 
+    def test_ls_leaves_out_the_folders_of_a_storage(self, lab: tuple[Path, str, str]) -> None:
+        told = run("ls", "lab", "--json").json
+        paths = [Path(row["recording"]) for row in told]
+        assert all(path.exists() and path.parts[:2] == ("lab", "recordings") for path in paths)
+        _, *rows = ok("ls", "lab").splitlines()
+        assert [row.split()[0] for row in rows] == [f"lab/…/{path.name}" for path in paths]
+        _, *rows = ok("ls", "lab", "--columns", "paths").splitlines()
+        assert rows == [str(path) for path in paths]
+
     def test_ls_tells_a_live_recording_from_a_killed_one(self, here: Path) -> None:
         env = RecordEpisodes(gym.make("CartPole-v1"), "a.mcap")
         env.reset(seed=1)

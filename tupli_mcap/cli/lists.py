@@ -31,6 +31,7 @@ from tupli_mcap.cli.output import (
     print_json,
     print_table,
     short_ids,
+    short_path,
     short_value,
     when,
 )
@@ -77,7 +78,7 @@ def _success(item: ListedRecording) -> str:
 
 
 _COLUMNS = {
-    "recording": _listed_by(attrgetter("path"), Column("RECORDING", shrink="start"), short_ids),
+    "recording": _listed_by(attrgetter("path"), Column("RECORDING", shrink="start"), short_path),
     "files": _listed_by(attrgetter("files"), Column("FILES", "right"), number),
     "run": _listed_by(attrgetter("name"), Column("RUN", shrink="end")),
     "environment": _listed_by(attrgetter("environment"), Column("ENVIRONMENT", shrink="end")),
@@ -132,7 +133,8 @@ def ls(
     A run that was recorded into several files is one row; a file with several runs has one for
     each, and its size is told with the first. Columns are recording, files, run, environment,
     episodes, steps, return, success, started, size, state, split, tags, settings, paths.
-    RECORDING is the first file of the run, FILES how many there are, if a run has several.
+    RECORDING is the first file of the run, in a storage without its folders, which PATHS and
+    --json show; FILES is how many there are, if a run has several.
     The last four appear only with --columns; settings are the metadata of the run, and
     `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
     ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
@@ -438,7 +440,7 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
     rows = [  # a column without any value is not shown
         (
             short_ids(h.id) if several else str(h.episode),
-            "" if not several else h.run.get("name", "") if by_run else short_ids(h.recording),
+            "" if not several else h.run.get("name", "") if by_run else short_path(h.recording),
             str(h.env) if several_envs else "",
             number(h.n_tuples),
             total,

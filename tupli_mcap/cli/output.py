@@ -21,6 +21,8 @@ _GAP = "  "
 _WIDEST = 100  # columns of running text
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
+_STORED = re.compile(r"\brecordings/[0-9a-f]{64}/")
+
 
 class Column(NamedTuple):
     """A column of a table; `shrink` says which end of its values is cut if the terminal is too narrow."""
@@ -192,6 +194,12 @@ def _printable(value: Any, levels: int) -> Any:
 def short_ids(text: str) -> str:
     """Shortens every long id in a text to 12 digits on a terminal; elsewhere leaves the text as it is."""
     return text if terminal_width() is None else _LONG_ID.sub(r"\1…", text)
+
+
+def short_path(path: str) -> str:
+    """The path of a recording as a cell of a table. The folders in a storage, which have long ids as names, are `…`:
+    the name of the file tells it apart."""
+    return short_ids(_STORED.sub("…/", path))
 
 
 def number(value: float | None, decimals: int = 2) -> str:
