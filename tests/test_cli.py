@@ -198,8 +198,8 @@ class TestRecord:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)
         before = Path("a.mcap").read_bytes()
         assert fails("record", "CartPole-v1", "-o", "a.mcap") == (
-            'a.mcap exists and is not overwritten; choose another path, or mode="a" (--mode a) to append, '
-            'mode="w" (--mode w) to replace; a directory gets a new file each time'
+            "a.mcap exists and is not overwritten; choose another path, or --mode a to append, "
+            "--mode w to replace; a directory gets a new file each time"
         )
         assert Path("a.mcap").read_bytes() == before
         told = run("record", "CartPole-v1", "-o", "a.mcap", "--steps", 30, "--mode", "a", "--json").json

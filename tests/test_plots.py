@@ -1029,7 +1029,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with Recording(tiny) as recording:
         assert told["episodes"] == int((recording.index["length"] > 9).sum())
     assert run("plot", tiny)[::2] == (
-        1, "error: tiny.png exists; choose another name, or pass overwrite=True (--force)\n",
+        1, "error: tiny.png exists; choose another name, or pass --force\n",
     )  # fmt: skip
     assert run("plot", tiny, "--force")[0] == 0
 

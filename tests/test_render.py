@@ -337,7 +337,7 @@ class TestTrust:
         code, out, err = run("render", path, "-o", tmp_path / "new.mcap")
         assert (code, out) == (1, "")
         assert err.startswith("error: rebuilding the environment")
-        assert "pass trust=True (--trust) or run `tupli-mcap trust FILE`" in err
+        assert "pass --trust or run `tupli-mcap trust FILE`" in err
         assert not (tmp_path / "new.mcap").exists()
         monkeypatch.undo()
         assert run("render", path, "-o", tmp_path / "new.mcap", "--trust", "--episodes", "all")[0] == 0

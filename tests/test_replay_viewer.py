@@ -216,7 +216,7 @@ def test_a_file_is_replaced_only_if_told(
     goal.write_bytes(b"mine")
     words = ["replay", str(cartpole), "--save", str(goal)]
     assert app(words, standalone_mode=False) == 1
-    assert "out.rrd exists; choose another path, or pass overwrite=True (--force)" in capfd.readouterr().err
+    assert "out.rrd exists; choose another path, or pass --force" in capfd.readouterr().err
     assert goal.read_bytes() == b"mine"
     assert not app([*words, "--force", "--episode", "best"], standalone_mode=False)
     assert "open it with: rerun" in capfd.readouterr().out

@@ -809,7 +809,7 @@ class TestCommands:
         assert {e.run.name for e in Recording(target).episodes} == {"run-0", "run-1"}
         again = CliRunner().invoke(app, words)
         assert again.exit_code == 1
-        assert "o.mcap exists; choose another path, or pass overwrite=True (--force)" in again.output
+        assert "o.mcap exists; choose another path, or pass --force" in again.output
         command(*words, "--force")
 
     def test_tag_and_edit(self, tmp_path: Path, capsys: Any) -> None:

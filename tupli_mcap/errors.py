@@ -13,6 +13,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -149,6 +150,24 @@ class Gathered:
             raise self._errors[0]
         if self._errors:
             raise RecordingError(f"nothing was changed: {'; also, '.join(map(str, self._errors))}")
+
+
+_in_command: Final = ContextVar("_in_command", default=False)
+
+
+@contextlib.contextmanager
+def in_command() -> Iterator[None]:
+    """Within the block, messages name the options of a command instead of arguments in Python."""
+    token = _in_command.set(True)
+    try:
+        yield
+    finally:
+        _in_command.reset(token)
+
+
+def asking(argument: str, option: str) -> str:
+    """How the one who reads a message asks for something: `overwrite=True`, or `--force` if a command was called."""
+    return option if _in_command.get() else argument
 
 
 def brief(err: BaseException | None) -> str:

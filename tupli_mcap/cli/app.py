@@ -31,7 +31,7 @@ from tupli_mcap.cli.terminal import (
     stop_writing,
     warnings_in_one_line,
 )
-from tupli_mcap.errors import FilterError, TupliError, did_you_mean
+from tupli_mcap.errors import FilterError, TupliError, did_you_mean, in_command
 
 FAILED, USAGE, INTERRUPTED = 1, 2, 130  # 128 + SIGINT, as shells have it
 _VALUES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH", "file": "FILE"}  # in helps
@@ -56,7 +56,11 @@ class _Group(TyperGroup):
         begin_json(next((word for word in given if word in _NAMES), None))
         try:
             from_servers = any("://" in word for word in given)
-            with warnings_in_one_line(), fetch_progress() if from_servers else contextlib.nullcontext():
+            with (
+                in_command(),
+                warnings_in_one_line(),
+                fetch_progress() if from_servers else contextlib.nullcontext(),
+            ):
                 code = super().main(words, prog_name, complete_var, False, windows_expand_args, **extra)
             flush()
         except BaseException as err:  # noqa: BLE001 - _report raises again what is not for the user

@@ -14,7 +14,7 @@ from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource
 from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
-from tupli_mcap.errors import FormatError, RecordingError
+from tupli_mcap.errors import FormatError, RecordingError, asking
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
@@ -265,7 +265,9 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
     if any(source is not None and target.samefile(source) for source in sources):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     if not overwrite:
-        raise DatasetError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
+        raise DatasetError(
+            f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
+        )
 
 
 def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:

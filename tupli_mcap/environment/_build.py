@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment._pickling import load
 from tupli_mcap.environment._record import EnvironmentRecord, sha256
-from tupli_mcap.errors import TupliError, UntrustedError
+from tupli_mcap.errors import TupliError, UntrustedError, asking
 
 # These render modes open no window.
 _PICTURES = frozenset(
@@ -69,7 +69,7 @@ def build(
     if reasons and not trusted:
         raise UntrustedError(
             f"rebuilding the environment {record.name[:200]!r} would run {'; '.join(reasons)}. If you trust "
-            "where it comes from, pass trust=True (--trust) or run `tupli-mcap trust FILE` (digest "
+            f"where it comes from, pass {asking('trust=True', '--trust')} or run `tupli-mcap trust FILE` (digest "
             f"{record.digest}); reading its episodes needs no trust"
         )
     spec = record.spec

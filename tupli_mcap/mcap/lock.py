@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, os_reason
+from tupli_mcap.errors import RecordingError, asking, os_reason
 
 _BUSY = (errno.EAGAIN, errno.EACCES)
 _PATIENCE = 2.0  # seconds to wait for readers that ask whether the writer lives
@@ -184,9 +184,10 @@ class FileLock:
 
 
 def _exists(path: Path) -> RecordingError:
+    append, replace = asking('mode="a"', "--mode a"), asking('mode="w"', "--mode w")
     return RecordingError(
-        f'{path} exists and is not overwritten; choose another path, or mode="a" (--mode a) to append, '
-        'mode="w" (--mode w) to replace; a directory gets a new file each time'
+        f"{path} exists and is not overwritten; choose another path, or {append} to append, {replace} to replace; "
+        "a directory gets a new file each time"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
 from tupli_mcap.dataset.which import named_positions
-from tupli_mcap.errors import RecordingError, os_reason
+from tupli_mcap.errors import RecordingError, asking, os_reason
 from tupli_mcap.files import write_bytes
 from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes
@@ -192,7 +192,9 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
         raise RecordingError(f"there is no directory {str(goal.parent)!r}; make it first")
     if goal.is_dir() or (goal.exists() and not overwrite):
         what = "is a directory" if goal.is_dir() else "exists"
-        raise RecordingError(f"{goal} {what}; choose another name, or pass overwrite=True (--force)")
+        raise RecordingError(
+            f"{goal} {what}; choose another name, or pass {asking('overwrite=True', '--force')}"
+        )
     return goal
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import RecordingError, missing_extra
+from tupli_mcap.errors import RecordingError, asking, missing_extra
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.images.pictures import (
     FrameFormat,
@@ -102,7 +102,7 @@ def check_goal(goal: Path, kinds: Sequence[str], *, overwrite: bool) -> str:
         raise RecordingError(f"{goal}: expected a name that ends in {', '.join(kinds[:-1])} or {kinds[-1]}")
     if goal.exists() and not overwrite:
         raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or pass overwrite=True (--force)"
+            f"{goal} exists and is not replaced; give another name, or pass {asking('overwrite=True', '--force')}"
         )
     if kind == ".mp4":
         _av()
@@ -139,7 +139,7 @@ def write_movie(path: Path, kind: str, pictures: Iterator[Picture], count: int, 
     width, height = size = first.shape[1], first.shape[0]
     rest = (resized(picture, *size) for picture in pictures)
     failed = RecordingError(
-        f"expected pictures that {kind} can hold, found {width} x {height} pixels; give another width (--width)"
+        f"expected pictures that {kind} can hold, found {width} x {height} pixels; give another width"
     )
     if kind == ".gif":
         if max(size) > _GIF_PIXELS:

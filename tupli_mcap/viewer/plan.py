@@ -14,7 +14,7 @@ import numpy as np
 
 from tupli_mcap.dataset.chosen import Chosen, extremes
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, asking
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import KEYS, success_of
@@ -149,9 +149,8 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
         of = f" of {run_title(group[0].recording)}" if len(groups) > 1 else ""
         told.append(", ".join(words) + of)
     number = sum(len(item.positions) for item in some)
-    return some, (
-        f"{number} of {total:,} episodes: {'; '.join(told)}. Others: --episodes 3,7 or all (in Python: episodes=)"
-    )
+    others = asking('episodes="3,7" or "all"', "--episodes 3,7 or all")
+    return some, f"{number} of {total:,} episodes: {'; '.join(told)}. Others: {others}"
 
 
 def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
@@ -167,7 +166,7 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
     elif form == "compare":
         if total > _MOST_COMPARED:
             raise RecordingError(
-                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some (--episodes)"
+                f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some of them"
             )
         yield _compared(chosen)
     else:

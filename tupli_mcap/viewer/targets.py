@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, asking
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
@@ -66,7 +66,9 @@ def to_file(
 def check_new(goal: Path, *, overwrite: bool) -> None:
     """Raises RecordingError if a file exists (without `overwrite`), or there is no directory for it."""
     if goal.exists() and not overwrite:
-        raise RecordingError(f"{goal} exists; choose another path, or pass overwrite=True (--force)")
+        raise RecordingError(
+            f"{goal} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
+        )
     if not goal.parent.is_dir():
         raise RecordingError(
             f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
@@ -129,7 +131,7 @@ def _await_viewer(url: str) -> None:
             if time.monotonic() > until:
                 raise ViewerError(
                     f"no viewer answers at {url} ({err.strerror or err}); start one there (rerun --port "
-                    f"{parts.port}), or write a file with --save FILE.rrd (in Python: save=)"
+                    f"{parts.port}), or write a file with {asking('viewer.save', '--save FILE.rrd')}"
                 ) from err
         time.sleep(0.1)
 
@@ -148,8 +150,8 @@ def to_window(plans: Iterable[Plan]) -> int:
     program = viewer_program()
     if not has_display():
         raise ViewerError(
-            "there is no display here; look in a browser with --web (in Python: viewer.serve), or write a file with "
-            "--save FILE.rrd (viewer.save)"
+            f"there is no display here; look in a browser with {asking('viewer.serve', '--web')}, or write a file with "
+            f"{asking('viewer.save', '--save FILE.rrd')}"
         )
     port = free_port()
     options = ["--port", str(port), "--hide-welcome-screen", "--expect-data-soon"]

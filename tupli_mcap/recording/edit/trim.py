@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, asking
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import Trim
@@ -56,7 +56,9 @@ def trim_recording(
             exists (and not `overwrite`), or cannot be written.
     """
     if target.exists() and not overwrite:
-        raise RecordingError(f"{target} exists; choose another path, or pass overwrite=True (--force)")
+        raise RecordingError(
+            f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
+        )
     if target.exists() and source.path is not None and target.samefile(source.path):
         raise RecordingError(f"{target} is the recording itself; write to another path")
     trims = trims_of(source, steps)

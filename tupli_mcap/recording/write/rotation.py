@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
-from tupli_mcap.errors import FormatError, RecordingError, os_reason
+from tupli_mcap.errors import FormatError, RecordingError, asking, os_reason
 from tupli_mcap.files import as_file_name
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
@@ -99,9 +99,10 @@ class Rotation:
         if mode != "a":
             if later:
                 names = ", ".join(one.name for one in list(later.values())[:3])
+                append = asking('mode="a"', "--mode a")
                 raise RecordingError(
                     f"{path}: {names}{' …' if len(later) > 3 else ''} of an earlier series would follow it; "
-                    'delete them, record to another path, or go on with mode="a" (--mode a)'
+                    f"delete them, record to another path, or go on with {append}"
                 )
             return
         files = [base, *later.values()]

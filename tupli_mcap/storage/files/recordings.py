@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError, asking
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
@@ -177,7 +177,7 @@ class RecordingFiles:
                 if gone == left and gone and not force:
                     raise RecordingError(
                         f"{path}: all its episodes would be deleted, and with them the file, which nothing brings "
-                        "back; choose fewer episodes, or pass force=True (--force)"
+                        f"back; choose fewer episodes, or pass {asking('force=True', '--force')}"
                     )
                 if gone:
                     doomed[relative] = Sidecar(uuid=uuid, deleted=gone)

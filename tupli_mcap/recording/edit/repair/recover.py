@@ -7,7 +7,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, os_reason
+from tupli_mcap.errors import (
+    FormatError,
+    MissingExtraError,
+    RecordingError,
+    SignatureError,
+    asking,
+    os_reason,
+)
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import MAGIC, OTHER_TOOLS
@@ -186,7 +193,7 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
         raise RecordingError(f"{path} is never overwritten; give another file to write to")
     if goal.exists() and not overwrite:
         raise RecordingError(
-            f"{goal} exists and is not overwritten; give another file, or pass overwrite=True (--force)"
+            f"{goal} exists and is not overwritten; give another file, or pass {asking('overwrite=True', '--force')}"
         )
 
 
