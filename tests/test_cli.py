@@ -1521,6 +1521,7 @@ class TestProgram:
 
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")
+        assert "(in Python: tupli_mcap.open(PATH).map(...))" in fails("relabel", code=2)
         assert fails("frobnicate", code=2) == "No such command 'frobnicate'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
         assert fails("info", code=2) == "Missing argument 'PATH|URL'; see tupli-mcap info --help"

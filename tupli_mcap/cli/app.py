@@ -78,7 +78,9 @@ class _Group(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         # Typer would suggest hidden ones, too.
         if args and not args[0].startswith("-") and args[0] not in self.commands:
-            ctx.fail(f"No such command {args[0]!r}{did_you_mean(args[0], _NAMES)}")
+            found = _IN_PYTHON.get(args[0])
+            hint = did_you_mean(args[0], _NAMES) if found is None else f" (in Python: {found})"
+            ctx.fail(f"No such command {args[0]!r}{hint}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -387,6 +389,8 @@ _NAMES = [name for commands in _COMMANDS.values() for name in commands]
 _READING = {name for name in _NAMES if name.startswith("list-")}.union(
     ("ls", "info", "episodes", "browse", "whoami", "read-group"), _COMMANDS["Check"], _COMMANDS["Help"]
 )
+_IN_PYTHON = dict.fromkeys(("relabel", "map"), "tupli_mcap.open(PATH).map(...)")
+"""What takes a function, and is no command, by the names that somebody may try."""
 _ASKING = {*_COMMANDS["Server"], *_COMMANDS["People"]} - {"serve", "backup-server", "restore-server"}
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
