@@ -1,7 +1,8 @@
 """Runs everything that reads a file on malicious bundles, in a process that traps the execution of code.
 
-`python trapped.py CORPUS TARGET` prints a JSON object: `trapped` (everything that would have run, imported, connected
-or written, with the operation that did it), `wrong` (errors that are not ours), and the number of operations.
+`python trapped.py CORPUS TARGET N` does every Nth operation on each file, another one first on the next file, so that
+N files in a row get every operation. It prints a JSON object: `trapped` (everything that would have run, imported, connected or written, with
+the operation that did it), `wrong` (errors that are not ours), and the number of operations.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import itertools
 import json
 import os
 import pickle
@@ -345,7 +347,7 @@ def _cli(*words: str) -> Callable[[], Any]:
     return run
 
 
-def main(corpus: Path, target: Path) -> None:
+def main(corpus: Path, target: Path, every: int) -> None:
     os.environ["TUPLI_MCAP_CONFIG_DIR"] = str(target / "config")
     os.environ["TUPLI_MCAP_CACHE_DIR"] = str(target / "cache")
     os.environ.pop("TUPLI_MCAP_STORAGE", None)
@@ -379,12 +381,12 @@ def main(corpus: Path, target: Path) -> None:
     run("warm", operations(corpus / "harmless.mcap", warm), armed=False)
     run("warm", operations(corpus / "harmless_cut.mcap", warm), armed=False)
     run("warm", storage_operations(target / "storage", warm), armed=False)
-    for path in sorted(corpus.glob("*.mcap")):
-        if not path.name.startswith("harmless"):
-            run(path.name, operations(path, target), armed=True)
+    paths = sorted(path for path in corpus.glob("*.mcap") if not path.name.startswith("harmless"))
+    for number, path in enumerate(paths):
+        run(path.name, itertools.islice(operations(path, target), number % every, None, every), armed=True)
     run("storage", storage_operations(target / "storage", target), armed=True)
     print(json.dumps({"trapped": trap.trapped, "wrong": wrong, "operations": count}))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
