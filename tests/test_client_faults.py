@@ -9,7 +9,7 @@ from tool_modules import tool
 from tupli_mcap import FileStorage
 
 TOOL = tool("client_faults")
-SEED = 4  # of which the first three rounds push, record and pull
+SEED = 2910  # of which the first three rounds push and are killed, pull, record with two processes and are killed
 
 
 def test_nothing_acknowledged_is_lost_and_retries_change_nothing(tmp_path: Path) -> None:
