@@ -77,17 +77,15 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture
-def alice(tmp_path: Path) -> signing.SigningKey:
-    return write_key(tmp_path / "alice")
-
-
-@pytest.fixture
-def bundle(tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A bundle that Alice made and signed on her machine: a pickled environment, an artifact, three episodes."""
-    with monkeypatch.context() as there:
-        there.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "alices_config"))
-        storage = FileStorage(tmp_path / "alices")
+@pytest.fixture(scope="module")
+def alices(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Alice's machine: her key, and a bundle that she signed, of a pickled environment, an artifact, three episodes."""
+    machine = tmp_path_factory.mktemp("alices")
+    key = write_key(machine / "alice")
+    with pytest.MonkeyPatch.context() as there:
+        there.setenv("TUPLI_MCAP_CONFIG_DIR", str(machine / "config"))
+        there.setenv("TUPLI_MCAP_DATA_DIR", str(machine / "data"))
+        storage = FileStorage(machine / "storage")
         artifact = storage.store_artifact(b"wind\n1\n", ArtifactMetadata(name="wind.csv"))
 
         class WithArtifact(TupliEnvWrapper):
@@ -102,9 +100,22 @@ def bundle(tmp_path: Path, alice: signing.SigningKey, monkeypatch: pytest.Monkey
                 pass
         env.close()
         assert env.id is not None
-        target = storage.bundle(env.id, tmp_path / "bundle.mcap", sign=alice)
+        storage.bundle(env.id, machine / "bundle.mcap", sign=key)
         storage.close()
-    return target
+    return machine
+
+
+@pytest.fixture
+def alice(alices: Path, tmp_path: Path) -> signing.SigningKey:
+    for name in ("alice", "alice.pub"):
+        shutil.copy(alices / name, tmp_path)
+    return signing.SigningKey(tmp_path / "alice")
+
+
+@pytest.fixture
+def bundle(alices: Path, tmp_path: Path, alice: signing.SigningKey) -> Path:
+    """A copy of Alice's bundle, beside her key."""
+    return Path(shutil.copy(alices / "bundle.mcap", tmp_path))
 
 
 def verified(path: Path) -> Any:
