@@ -1,4 +1,4 @@
-"""What importing must not import: what is not needed yet, each looked at in a process of its own."""
+"""What importing must not import: what is not needed yet, looked at in new processes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,18 @@ HEAVY = (*EXTRAS, "gymnasium", "numpy", "pydantic", "sqlalchemy", "sqlite3", "mc
 DATABASE = ("sqlalchemy", "sqlite3", "asyncio", "ssl")
 
 
+def looks(*codes: str) -> list[set[str]]:
+    """The modules that are there after each of `codes`, which run one after another in a new process."""
+    script = "import sys\n" + "".join(f"{code}\nprint('\\nlook', *sys.modules)\n" for code in codes)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    found = [set(line.split()[1:]) for line in done.stdout.splitlines() if line.startswith("look ")]
+    assert len(found) == len(codes)
+    return found
+
+
 def imported(code: str) -> set[str]:
     """The modules that are there after `code` has run in a new process."""
-    script = f"import sys\n{code}\nprint('\\n' + '\\n'.join(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(done.stdout.split())
+    return looks(code)[0]
 
 
 def run(*arguments: str) -> str:
@@ -33,29 +40,38 @@ def run(*arguments: str) -> str:
     return f"from tupli_mcap.cli import app\ntry: app({list(arguments)!r})\nexcept SystemExit: pass"
 
 
-@pytest.mark.parametrize(
-    ("code", "left_out"),
-    [
+# Each list is of codes that may import more and more: what an earlier one has imported, the later ones may, too.
+LEFT_OUT = {
+    "reading": [
         ("import tupli_mcap", (*HEAVY, "typer", "dataclasses")),
         ("import tupli_mcap; dir(tupli_mcap); tupli_mcap.__all__", HEAVY),
         ("from tupli_mcap import TupliError", HEAVY),
         ("import tupli_mcap.cli", HEAVY),
-        (run("--help"), [name for name in HEAVY if name != "rich"]),  # draws the help
-        (run("record", "--help"), [name for name in HEAVY if name not in ("rich", "pydantic")]),  # typer's
         ("from tupli_mcap import F, FilterEQ", (*EXTRAS, *DATABASE, "gymnasium", "mcap")),
         ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.write.writer")),
         ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
         ("from tupli_mcap import open, merge_recordings", (*EXTRAS, *DATABASE)),
-        (run("ls", "none.mcap"), (*EXTRAS, *DATABASE)),
+        ("from tupli_mcap import FileStorage, TupliDataset, TupliEnvWrapper", EXTRAS),
+    ],
+    "recording": [
         (
             "from tupli_mcap import RecordEpisodes; from tupli_mcap.vector import RecordEpisodes",
             (*EXTRAS, *DATABASE, "tupli_mcap.viewer", "tupli_mcap.recording.edit.repair"),
         ),
-        ("from tupli_mcap import FileStorage, TupliDataset, TupliEnvWrapper", EXTRAS),
     ],
-)
-def test_left_out(code: str, left_out: tuple[str, ...]) -> None:
-    assert imported(code) & set(left_out) == set()
+    "commands": [
+        (run("--help"), [name for name in HEAVY if name != "rich"]),  # draws the help
+        (run("record", "--help"), [name for name in HEAVY if name not in ("rich", "pydantic")]),  # typer's
+        (run("ls", "none.mcap"), (*EXTRAS, *DATABASE)),
+    ],
+}
+
+
+@pytest.mark.parametrize("what", LEFT_OUT)
+def test_left_out(what: str) -> None:
+    codes, left_out = zip(*LEFT_OUT[what], strict=True)
+    for code, found, names in zip(codes, looks(*codes), left_out, strict=True):
+        assert found & set(names) == set(), code
 
 
 def test_a_replay_is_saved_without_what_pyarrow_would_import(tmp_path: Path) -> None:
