@@ -61,7 +61,7 @@ def contents(directory: Path) -> dict[str, bytes]:
 @pytest.mark.sampled(0, keep=["5"])
 @pytest.mark.parametrize("every", [1, 5])
 def test_nothing_in_a_file_is_run(corpus: Path, tmp_path: Path, every: int) -> None:
-    """Every operation on every file, or a fifth of them, with each operation on a pickle, a space, a spec and a text."""
+    """Every operation on every file; or a fifth of them, each operation on a pickle, a space, a spec and a text."""
     shutil.copytree(corpus / "corpus/storage", tmp_path / "storage")
     before = contents(corpus)
     child = run_child(corpus, tmp_path, [str(HERE / "trapped.py"), "corpus", str(tmp_path), str(every)])

@@ -1,8 +1,8 @@
 """Runs everything that reads a file on malicious bundles, in a process that traps the execution of code.
 
 `python trapped.py CORPUS TARGET N` does every Nth operation on each file, another one first on the next file, so that
-N files in a row get every operation. It prints a JSON object: `trapped` (everything that would have run, imported, connected or written, with
-the operation that did it), `wrong` (errors that are not ours), and the number of operations.
+N files in a row get every operation. It prints a JSON object: `trapped` (everything that would have run, imported,
+connected or written, with the operation that did it), `wrong` (errors that are not ours), and the number of operations.
 """
 
 from __future__ import annotations
