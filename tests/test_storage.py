@@ -606,17 +606,18 @@ class TestFileStorage(StorageContract):
         storage.delete_benchmark(header.id)
         assert list((storage.root / "recordings").iterdir()) == []
 
+    @pytest.mark.sampled(0, keep=["0-6-KeyboardInterrupt", "1-6-OSError"])
     @pytest.mark.parametrize("kind", [KeyboardInterrupt, OSError])
+    @pytest.mark.parametrize(("first", "every"), [(0, 1), (0, 6), (1, 6)])
     def test_deleting_from_several_recordings_is_done_or_not(
-        self, storage: FileStorage, tmp_path: Path, kind: type[BaseException]
+        self, storage: FileStorage, tmp_path: Path, kind: type[BaseException], first: int, every: int
     ) -> None:
         header = storage.store_benchmark(query())
         for i in range(3):
             storage.record_episodes([episode(header.id, score=float(score)) for score in (i == 2, 1)])
         (storage.root / next(storage.root.rglob("*.mcap"))).rename(storage.root / "dropped\udcff.mcap")
-        seen, k = set(), -1 if kind is OSError else -2
-        while True:
-            k += 2
+        seen = set()
+        for k in itertools.count(first, every):
             root = tmp_path / f"{k}"
             shutil.copytree(storage.root, root)
             calls = Calls(k, kind)
