@@ -116,7 +116,7 @@ def test_one_environment(tmp_path: Path, seed: int, infos: float) -> None:
     assert same(told(mine), told(oracle))
 
 
-@pytest.mark.sampled(2)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("infos", [0.0, 0.01])
 @pytest.mark.parametrize("seed", range(3))
 def test_sub_environments(tmp_path: Path, seed: int, infos: float) -> None:
@@ -152,8 +152,10 @@ def test_sub_environments(tmp_path: Path, seed: int, infos: float) -> None:
                 assert same(getattr(x, name), getattr(y, name)), name
 
 
+@pytest.mark.sampled(0, keep=["400-0", "400-3"])
 @pytest.mark.parametrize("num_envs", [0, 3])
-def test_a_copy_at_any_time_is_whole(tmp_path: Path, num_envs: int) -> None:
+@pytest.mark.parametrize("steps", [400, 800])
+def test_a_copy_at_any_time_is_whole(tmp_path: Path, steps: int, num_envs: int) -> None:
     """The file and its journal hold every finished step, start, end and final state at any time."""
     path, oracle = tmp_path / "r.mcap", tmp_path / "oracle.mcap"
     copied = tmp_path / "copied.mcap"
@@ -180,7 +182,7 @@ def test_a_copy_at_any_time_is_whole(tmp_path: Path, num_envs: int) -> None:
     for env in envs:
         env.reset(seed=3)
     done = False
-    for i in range(800):
+    for i in range(steps):
         for env in envs:
             if done:
                 env.reset()
@@ -189,7 +191,7 @@ def test_a_copy_at_any_time_is_whole(tmp_path: Path, num_envs: int) -> None:
                 _, _, terminal, timeout, _ = env.step(action)
         done = not num_envs and not done and bool(terminal or timeout)
         look(i)
-    assert len(lengths) > 10
+    assert len(lengths) >= steps // 50
     for mine, theirs in zip(lengths, wanted, strict=True):
         assert same(mine[:3], theirs[:3])  # first rows, lengths, returns
         assert same([e[4:] for e in mine[len(EXACT) :]], [e[4:] for e in theirs[len(EXACT) :]])
