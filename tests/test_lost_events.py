@@ -109,6 +109,7 @@ def vector(path: Path, space: spaces.Space[Any], envs: int = 3, **options: Any) 
     return RecordVector(SyncVectorEnv(makers), path, **options)
 
 
+@pytest.mark.sampled(0, keep=["20", "851", "852"])
 @pytest.mark.parametrize("steps", [20, 850, 851, 852, 853, 854, 1600])
 def test_a_vector_recording_without_its_events(tmp_path: Path, ticks: Callable[[], None], steps: int) -> None:
     """Half of the rows may be in the file: their holes are still there."""
@@ -147,6 +148,7 @@ def steps_in(journal: JournalContents, layout: StepLayout) -> CommittedRows:
     return CommittedRows(journal, "steps", 0, layout.step_message.dtype, journal.info["channels"][0][0])
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize(
     ("steps", "length"), [(57, 5), (60, 4), (100, 4), (5, 5), (60, 12), (56, 7), (57, 7), (90, 3), (63, 63)]
@@ -300,6 +302,7 @@ def test_images_of_final_states_are_not_made_up(tmp_path: Path, ticks: Callable[
                 assert episode.final_state is None or same(episode.final_state, other.final_state)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     "space",
     [BOX, spaces.Box(0, 255, (6, 5, 1), np.uint8), spaces.Dict({"x": BOX, "note": spaces.Text(3)})],
