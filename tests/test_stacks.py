@@ -145,6 +145,7 @@ def pictures(path: Path) -> list[Array]:
     return found
 
 
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("shape", [(H, W), (H, W, 1), (H, W, 3), (H, W, 4)])
 @pytest.mark.parametrize("padding", ["reset", "zero"])
 @BOTH
@@ -235,7 +236,7 @@ def test_other_processes_are_not_asked_what_they_stack(tmp_path: Path) -> None:
         assert np.array_equal(recording.episodes[1].final_state, states[1])
 
 
-@pytest.mark.sampled(7)
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("kind", [SyncVectorEnv, AsyncVectorEnv])
 @pytest.mark.parametrize("stacked", [FrameStackObservation, Older])
 @BOTH
@@ -402,6 +403,7 @@ class Plain(gym.Env[Any, Any]):
         return self._env.step(action)
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("shape", [(H, W), (H, W, 3)])
 @pytest.mark.parametrize("frames", [3, 4, 7])
 @BOTH
