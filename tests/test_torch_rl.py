@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from test_sampling import SPACES, at, record
 
 from tupli_mcap import F, TupliDataset
 from tupli_mcap.dataset.items import SamplingError
+from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.recording import EpisodeData, write_recording
 
 torch = pytest.importorskip("torch")
@@ -121,9 +122,9 @@ def test_what_a_storage_refuses(tmp_path: Path) -> None:
         other.load_state_dict(RecordedStorage(transitions).state_dict())
 
 
-def test_without_torchrl_the_extra_is_named() -> None:
-    code = "import sys; sys.modules['torchrl'] = None\nimport tupli_mcap.torch.rl"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "MissingExtraError: tupli_mcap.torch.rl needs TorchRL" in done.stderr
-    assert "[torchrl]" in done.stderr
+def test_without_torchrl_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ["torchrl", *(each for each in sys.modules if each.startswith("torchrl."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "tupli_mcap.torch.rl", raising=False)
+    with pytest.raises(MissingExtraError, match=r"(?s)tupli_mcap[.]torch[.]rl needs TorchRL.*\[torchrl\]"):
+        importlib.import_module("tupli_mcap.torch.rl")
