@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from test_sampling import SPACES, record
 
 from tupli_mcap import F, RecordEpisodes, TupliDataset
 from tupli_mcap.dataset.items import SamplingError
+from tupli_mcap.errors import MissingExtraError
 
 
 @pytest.fixture
@@ -151,10 +152,10 @@ def test_a_dataset_without_transitions(tmp_path: Path) -> None:
         assert (buffer.transition_count, buffer.size(), list(buffer.episodes)) == (0, 0, [])
 
 
-def test_without_d3rlpy_the_extra_is_named() -> None:
+def test_without_d3rlpy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
-    code = "import sys; sys.modules['d3rlpy'] = None\nimport tupli_mcap.torch.d3rlpy"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "MissingExtraError: tupli_mcap.torch.d3rlpy needs d3rlpy" in done.stderr
-    assert "[d3rlpy]" in done.stderr
+    for name in ["d3rlpy", *(each for each in sys.modules if each.startswith("d3rlpy."))]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "tupli_mcap.torch.d3rlpy", raising=False)
+    with pytest.raises(MissingExtraError, match=r"(?s)tupli_mcap[.]torch[.]d3rlpy needs d3rlpy.*\[d3rlpy\]"):
+        importlib.import_module("tupli_mcap.torch.d3rlpy")
