@@ -543,7 +543,7 @@ def test_episodes_without_a_reset_and_with_options(tmp_path: Path) -> None:
     assert certificate.agreed.episodes > 5
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("space", SPACES, ids=space_id)
 def test_every_space(tmp_path: Path, space: gym.Space[Any]) -> None:
     env = Sampler(
