@@ -125,6 +125,7 @@ def _plain(step: Any) -> tuple[Any, ...]:
     return state, action, float(reward), terminal, timeout
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("durability", ["os", "step"])
 @pytest.mark.parametrize("num_envs", [None, 1, 3])
 @pytest.mark.parametrize("name", SPACES)
