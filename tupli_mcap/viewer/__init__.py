@@ -23,7 +23,7 @@ from typing import Any
 from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.plan import Form, Plan, extremes_of, plans_of
+from tupli_mcap.viewer.plan import Form, Plan, extremes_of, plans_of, runs_apart
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk
 from tupli_mcap.viewer.targets import Display, in_notebook, to_browser, to_file, to_viewer, to_window
 
@@ -177,7 +177,8 @@ def _planned(
     """The Rerun recordings to show; the source files are open within the block."""
     rerun_sdk()
     with chosen_from(sources, episodes, filter) as chosen:
-        some, choice = extremes_of(chosen) if episodes is None else (chosen, "")
+        of_runs = runs_apart(chosen)
+        some, choice = extremes_of(of_runs) if episodes is None else (of_runs, "")
         if choice and note is not None:
             note(choice)
         plans = plans_of(some, form)

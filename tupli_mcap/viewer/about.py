@@ -103,9 +103,10 @@ def card(recording: Recording) -> str:
     return "\n".join([f"### {plain(run_title(recording))}", "", lines[0], "|---|---|", *lines[1:]])
 
 
-def run_title(recording: Recording) -> str:
-    """The name of the run, else of the file; shortened, and without unprintable characters."""
-    name = recording.readable_runs[0].name or Path(recording.name).stem
+def run_title(recording: Recording, position: int = 0) -> str:
+    """The name of an episode's run, else of the file; shortened, and without unprintable characters."""
+    place = recording.readable_places[position] if len(recording.index) else 0
+    name = recording.readable_runs[place].name or Path(recording.name).stem
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import re
 import uuid
@@ -31,7 +32,7 @@ Form = Literal["joined", "apart", "compare"]
 _MOST_APART = 200
 _MOST_COMPARED = 16
 _FEW = 10  # up to so many episodes are all shown, and described one by one
-_EACH = 3  # up to so many recordings, episodes are chosen from each
+_EACH = 3  # up to so many runs, episodes are chosen from each
 
 
 class ShownEpisodes(NamedTuple):
@@ -132,10 +133,19 @@ def name_of(recording: Recording) -> str:
     return (carried and recording.benchmark.record.name) or Path(recording.name).stem
 
 
+def runs_apart(chosen: Sequence[Chosen]) -> list[Chosen]:
+    """The same episodes in the same order, those of each run of a recording by themselves."""
+    return [
+        Chosen(recording, list(same))
+        for recording, positions in chosen
+        for _, same in itertools.groupby(positions, recording.readable_places.__getitem__)
+    ]
+
+
 def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
     """The last, the best and the worst of many episodes, and a sentence about this choice; all episodes and "" if few.
 
-    They are chosen in each recording; if there are more than three recordings, among all.
+    They are chosen in each run; if there are more than three runs, among all.
     """
     total = sum(len(item.positions) for item in chosen)
     if total <= _FEW:
@@ -146,7 +156,7 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
     for group in groups:
         found, words = extremes(group)
         some += found
-        of = f" of {run_title(group[0].recording)}" if len(groups) > 1 else ""
+        of = f" of {_title(group[0])}" if len(groups) > 1 else ""
         told.append(", ".join(words) + of)
     number = sum(len(item.positions) for item in some)
     others = asking('episodes="3,7" or "all"', "--episodes 3,7 or all")
@@ -184,7 +194,7 @@ def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
-            name = f"episode {number} · {run_title(item.recording)}"  # the viewer's list shows only the beginning
+            name = f"episode {number} · {run_title(item.recording, position)}"  # the viewer's list shows only the beginning
             part = ShownEpisodes(Chosen(item.recording, [position]), scene)
             text = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
@@ -204,9 +214,13 @@ def _joined(chosen: Sequence[Chosen]) -> Plan:
         text = f"{total:,} episodes, {sum(part.steps for part in parts):,} steps, on one timeline"
         text += "".join(_told_in_turn(parts)) if total <= _FEW else ""
     scene.rows = first
-    titles = list(dict.fromkeys(run_title(item.recording) for item in chosen))
+    titles = list(dict.fromkeys(map(_title, chosen)))
     name = ", ".join(titles[:_EACH]) + (f" and {len(titles) - _EACH:,} more" if len(titles) > _EACH else "")
     return Plan(name, chosen[0].recording.uuid, parts, text)
+
+
+def _title(item: Chosen) -> str:
+    return run_title(item.recording, item.positions[0])
 
 
 def _told_in_turn(parts: Sequence[ShownEpisodes]) -> Iterator[str]:
@@ -214,7 +228,7 @@ def _told_in_turn(parts: Sequence[ShownEpisodes]) -> Iterator[str]:
     yield "\n"
     for part in parts:
         recording, positions = part.chosen
-        of = f" of {plain(run_title(recording))}" if len(parts) > 1 else ""
+        of = f" of {plain(_title(part.chosen))}" if len(parts) > 1 else ""
         starts = part.first + np.cumsum([0, *row_counts(recording, positions)])
         for position, start in zip(positions, starts.tolist(), strict=False):
             yield f"\n- from step {start:,}: {_episode_in_short(recording, position, of)}"
@@ -254,7 +268,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
             )
     scene = scene_of(*chosen[0], apart=True)
     parts: list[ShownEpisodes] = []
-    titles = [run_title(item.recording) for item in chosen]
+    titles = [_title(item) for item in chosen]
     if len(set(titles)) < len(titles):  # files of one run
         titles = [Path(item.recording.name).stem for item in chosen]
     for item, name in zip(chosen, titles, strict=True):

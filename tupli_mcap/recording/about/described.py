@@ -36,11 +36,14 @@ class DescribedRecording(OpenedRecording):
         Raises:
             FormatError: `run.json` is damaged.
         """
-        rows = self.index
-        ended = int(rows["end_time"].max()) if len(rows) else 0
         said, name = self.recorded_runs.runs, PurePosixPath(file_name(self.name)).stem
+        ended = np.zeros(len(said), np.int64)
+        np.maximum.at(ended, self.run_places, self.index["end_time"])
         environment = "" if all(run.environment for run in said) else self._environment_name
-        return [run.known_as(name, environment, self.created_ns, ended) for run in said]
+        return [
+            run.known_as(name, environment, self.created_ns, last)
+            for run, last in zip(said, ended.tolist(), strict=True)
+        ]
 
     @cached_property
     def run_places(self) -> list[int]:
