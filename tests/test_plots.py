@@ -81,7 +81,7 @@ def tiny(tmp_path: Path) -> Path:
 
 def measured(path: Path) -> Measured:
     with Recording(path) as recording:
-        return measure(recording, np.arange(len(recording)))
+        return measure(recording, np.arange(len(recording)))[0]
 
 
 def texts(made: Report) -> list[str]:
@@ -151,8 +151,8 @@ def test_the_largest_numbers_are_drawn_or_said_not_to_be(tmp_path: Path) -> None
 def test_of_long_recordings_some_episodes_are_read(cartpole: Path) -> None:
     with Recording(cartpole) as recording:
         rows, states = recording.index, recording.read().states
-        found, again = (measure(recording, np.arange(len(recording)), 8000) for _ in range(2))
-        first = measure(recording, np.array([2]), 1)  # one episode is read at least
+        found, again = (measure(recording, np.arange(len(recording)), 8000)[0] for _ in range(2))
+        (first,) = measure(recording, np.array([2]), 1)  # one episode is read at least
     assert 0 < found.read_steps < 200
     kept = found.states[0].values.T
     assert kept.shape == (found.read_steps, 4)

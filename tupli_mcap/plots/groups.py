@@ -52,7 +52,7 @@ class PlottedRun(NamedTuple):
             places = (index["end_time"] - index["start_time"].min(initial=2**62)) / 1e9
         elif x == "steps":
             places[by_end] = np.cumsum(index["length"][by_end])
-        elif len(self.recordings) == 1:
+        elif len(self.recordings) == 1 and len(index) == self.recordings[0].facts.episodes:
             places = index["episode"]
         else:
             places[by_end] = np.arange(len(index))
@@ -85,15 +85,19 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
 
     Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
     settings, the same other settings, and the same environment and split. A run that names no seed is a group by
-    itself, with all its files, also those it was split into; so is a recording that was made of others in another way.
+    itself, with all its files, also those it was split into. The runs of a recording that was made of others in another
+    way, and may repeat them, are only of a group with each other.
     """
     found: dict[Any, dict[Any, list[Measured]]] = {}
-    uuids = set()
+    known = set()
     for place, one in enumerate(measured):
         key: tuple[Any, ...] = ("", "", place)
-        if one.is_recorded and one.facts.uuid not in uuids:
-            key = _seedless(one) or (("", one.run.name, one.run.id) if one.run.id else key)
-        uuids.add(one.facts.uuid)
+        seedless, same = _seedless(one), (one.facts.uuid, one.run.id, one.run.name)
+        if same not in known and one.is_recorded:
+            key = seedless or (("", one.run.name, one.run.id) if one.run.id else key)
+        elif same not in known and seedless:
+            key = (one.facts.name, *seedless[1:])
+        known.add(same)
         found.setdefault(key, {}).setdefault(one.run.id or place, []).append(one)
     alike: dict[str, list[tuple[Any, ...]]] = {}
     for key, runs in found.items():

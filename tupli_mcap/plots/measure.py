@@ -101,14 +101,25 @@ class Measured:
         return notes
 
 
-def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES) -> Measured:
-    """Reads the episodes at some positions; if they have more than `read_bytes`, a random choice of them. Raises
-    FormatError if the recording is damaged."""
+def measure(recording: Recording, positions: Array, read_bytes: int = READ_BYTES) -> list[Measured]:
+    """Reads the episodes at some positions, those of each run by themselves; if they have more than `read_bytes`, a
+    random choice of them. Without episodes, the first run has none. Raises FormatError if the recording is damaged."""
+    facts, places = describe(recording), recording.readable_places
+    runs = dict.fromkeys(places[positions].tolist()) or [0]
+    return [
+        _measure(recording, facts, run, positions[places[positions] == run], read_bytes // len(runs))
+        for run in runs
+    ]
+
+
+def _measure(
+    recording: Recording, facts: RecordingDescription, run: int, positions: Array, read_bytes: int
+) -> Measured:
     layout = recording.layout if recording.num_envs else None
-    rows = recording.index[positions]
+    rows, of_run = recording.index[positions], np.flatnonzero(recording.readable_places == run)
     measured = Measured(
-        recording.name, describe(recording), recording.readable_runs[0], recording.is_recorded, recording.index,
-        positions, layout, _metadata_numbers(recording, positions),
+        recording.name, facts, recording.readable_runs[run], recording.is_recorded, recording.index[of_run],
+        np.searchsorted(of_run, positions), layout, _metadata_numbers(recording, positions),
     )  # fmt: skip
     if layout is None:
         return measured

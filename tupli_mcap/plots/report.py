@@ -71,19 +71,20 @@ def report(
         subjects = list(subjects_once(source, episode_filter))
         if not subjects and episode_filter is None:
             raise RecordingError("expected a recording (.mcap), found none; give a path")
-        measured = []
+        runs: list[tuple[Subject, Measured]] = []
         for subject in subjects:
             if subject.error is not None:
                 raise subject.error
             with subject.open() as recording:
-                measured.append(measure(recording, subject.choose(recording), READ_BYTES // len(subjects)))
+                found = measure(recording, subject.choose(recording), READ_BYTES // len(subjects))
+            runs += [(subject, one) for one in found]
         if episode_filter is not None:
-            kept = [i for i, one in enumerate(measured) if len(one.rows)]
-            if not kept:
+            runs = [(subject, one) for subject, one in runs if len(one.rows)]
+            if not runs:
                 raise RecordingError(f"no episode matches {episode_filter}; use another filter")
-            subjects, measured = [subjects[i] for i in kept], [measured[i] for i in kept]
+        measured = [one for _, one in runs]
         _shorten_names(measured)
-        traces = _traces(subjects, measured, str(episode))
+        traces = _traces(runs, str(episode))
         return Report(measured, traces, _make_comparable(measured), x)
 
 
@@ -222,29 +223,36 @@ def _shorten_names(measured: Sequence[Measured]) -> None:
         one.name = name
 
 
-def _traces(subjects: Sequence[Subject], measured: Sequence[Measured], episode: str) -> Traces:
+def _traces(runs: Sequence[tuple[Subject, Measured]], episode: str) -> Traces:
     """The chosen episodes, step by step."""
-    filled = [i for i, one in enumerate(measured) if len(one.rows)]
+    filled = [(subject, one) for subject, one in runs if len(one.rows)]
     if not filled:
         return []
-    word, at = episode.strip().lower(), filled[0]
-    if len(filled) > 1 and word not in ("best", "worst", "first", "last"):
+    word, at = episode.strip().lower(), 0
+    several = len({id(subject) for subject, _ in filled}) > 1
+    if several and word not in ("best", "worst", "first", "last"):
         raise RecordingError(
-            f"expected best, worst, first or last of {len(measured)} recordings, found {episode[:40]!r}; "
+            f"expected best, worst, first or last of {len(filled)} recordings, found {episode[:40]!r}; "
             "give one recording to choose an episode by its number"
         )
     if word == "last":
-        at = filled[-1]
+        at = len(filled) - 1
     elif word in ("best", "worst"):
         sign = 1 if word == "best" else -1
-        at = max(filled, key=lambda i: np.nan_to_num(sign * measured[i].rows["return"], nan=-np.inf).max())
-    with subjects[at].open() as recording:
-        positions = named_positions(recording, subjects[at].choose(recording), episode)
+        highest = [np.nan_to_num(sign * one.rows["return"], nan=-np.inf).max() for _, one in filled]
+        at = int(np.argmax(highest))
+    subject = filled[at][0]
+    run_of = {number: one for of, one in filled if of is subject for number in one.rows["episode"].tolist()}
+    with subject.open() as recording:
+        positions = named_positions(recording, subject.choose(recording), episode)
         if len(positions) > _MOST_TRACES:
             raise RecordingError(
                 f"expected at most {_MOST_TRACES} episodes to show in full, found {len(positions)}"
             )
-        return [(measured[at], trace(recording, int(position), measured[at])) for position in positions]
+        chosen = [
+            (run_of[int(recording.index["episode"][position])], int(position)) for position in positions
+        ]
+        return [(one, trace(recording, position, one)) for one, position in chosen]
 
 
 def _make_comparable(measured: Sequence[Measured]) -> list[str]:

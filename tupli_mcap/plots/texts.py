@@ -42,7 +42,8 @@ def title_of(measured: Sequence[Measured]) -> str:
     """The environment, and the recording or how many there are."""
     environments = {one.facts.environment or "" for one in measured}
     parts = [*environments] if len(environments) == 1 else []
-    parts += [f"{len(measured)} recordings"] if len(measured) > 1 else []
+    files = len({one.facts.name for one in measured})
+    parts += [f"{files} recordings" if files > 1 else f"{len(measured)} runs"] if len(measured) > 1 else []
     return ": ".join(filter(None, parts)) or measured[0].name
 
 

@@ -194,7 +194,8 @@ def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
         scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
-            name = f"episode {number} · {run_title(item.recording, position)}"  # the viewer's list shows only the beginning
+            # the number first: the viewer's list shows only the beginning
+            name = f"episode {number} · {run_title(item.recording, position)}"
             part = ShownEpisodes(Chosen(item.recording, [position]), scene)
             text = _episode_told(item.recording, position)
             yield Plan(name, f"{item.recording.uuid}-{number}", [part], text, listed=several)
