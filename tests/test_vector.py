@@ -126,6 +126,7 @@ def test_every_autoreset_mode(tmp_path: Path, kind: str, mode: Any) -> None:
     assert {e.end for e in recording.episodes} == {"terminal", "timeout", "interrupted"}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("mode", MODES, ids=name_of)
 def test_long_enough_to_fill_halves(tmp_path: Path, mode: Any) -> None:
     with RecordEpisodes(make(SPACES["box"], mode), tmp_path / "r.mcap", chunk_size=1000) as env:
