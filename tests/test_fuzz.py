@@ -31,6 +31,7 @@ def fuzzer(tmp_path_factory: pytest.TempPathFactory) -> Fuzzer:
     return Fuzzer(list(SEEDS.values()), tmp_path_factory.mktemp("fuzz"))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("part", range(PARTS))
 def test_the_right_data_or_one_error(fuzzer: Fuzzer, part: int) -> None:
     findings = []
