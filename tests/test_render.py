@@ -94,6 +94,7 @@ REAL = [
 
 
 class TestRealEnvironments:
+    @pytest.mark.sampled(3)
     @pytest.mark.parametrize("name", REAL)
     def test_the_frames_are_those_that_recording_would_have_taken(self, tmp_path: Path, name: str) -> None:
         name = name if name in gym.registry else name[:-1] + str(int(name[-1]) + 1)
