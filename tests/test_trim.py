@@ -45,6 +45,7 @@ def steps_of(episode: Episode) -> list[Any]:
     ]
 
 
+@pytest.mark.sampled(14)
 @pytest.mark.parametrize("name", NAMES)
 def test_what_stays_is_what_it_was(name: str, tmp_path: Path) -> None:
     """Of every kind of recording: values, times, infos and frames of the steps that stay, and the state after them."""
