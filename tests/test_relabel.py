@@ -162,6 +162,7 @@ def reversed_arrays(column: Any) -> Any:
     return tuple(map(reversed_arrays, column)) if isinstance(column, tuple) else column[::-1]
 
 
+@pytest.mark.sampled(14)
 @pytest.mark.parametrize("name", NAMES)
 def test_states_of_every_kind_of_recording(name: str, tmp_path: Path) -> None:
     before = Recording(place(name, tmp_path))
