@@ -442,6 +442,7 @@ def test_a_journal_is_found_by_the_uuid_in_damaged_metadata(name: str, tmp_path:
     assert verify_recording(report.target or "").problems == []
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("kind", ["flip", "cut", "zero", "swap"])
 @pytest.mark.parametrize("name", ["bundle", "dict_with_images", "unfinished", "variable", "vector_same_step"])
 @pytest.mark.filterwarnings("ignore::UserWarning")
