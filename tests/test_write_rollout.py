@@ -79,6 +79,7 @@ NESTED = spaces.Dict(
 )
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("known", ["all", "none", "some"])
 @pytest.mark.parametrize(
     ("space", "reward"),
