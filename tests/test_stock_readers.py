@@ -47,7 +47,7 @@ def rerun_says(path: Path, out: Path) -> str:
     return done.stderr
 
 
-@pytest.mark.sampled(24)
+@pytest.mark.sampled(12)
 @pytest.mark.parametrize("space", SPACES, ids=space_id)
 def test_every_space_decodes_field_by_field(tmp_path: Path, space: gym.Space[Any]) -> None:
     path = tmp_path / "r.mcap"
