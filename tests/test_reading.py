@@ -64,6 +64,7 @@ def test_episodes_in_any_order(vector: Recording, by_episode: list[Any], data: s
             assert len(getattr(found, field)) == 0
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("shape", [(), (1,), (1, 1), (3,), (2, 0, 3), (2, 3)])
 @pytest.mark.parametrize("steps", [20, 3000])
 def test_values_of_any_shape(tmp_path: Path, shape: tuple[int, ...], steps: int) -> None:
