@@ -361,6 +361,7 @@ class Wide(gym.Env[Any, Any]):
 
 
 class TestVector:
+    @pytest.mark.sampled(3)
     @pytest.mark.parametrize("mode", list(AutoresetMode))
     @pytest.mark.parametrize("together", [False, True], ids=["apart", "together"])
     def test_no_step_is_lost(self, tmp_path: Path, mode: AutoresetMode, together: bool) -> None:
