@@ -97,6 +97,7 @@ def test_any_steps_in_any_order(recorded: list[Path], cache_bytes: int) -> None:
             assert same(at(columns[name], place), expected[row][name]), (name, row)
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize(
     ("pad", "stride", "history"), [("none", 1, 0), ("none", 3, 2), ("repeat", 2, 3), ("zero", 1, 1)]
 )
