@@ -33,7 +33,7 @@ from tupli_mcap.recording.write import writer
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 
-@pytest.mark.sampled(12)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("durability", ["step", "chunk", "os"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_was_synced_survives(kind: str, durability: str, tmp_path: Path) -> None:
