@@ -58,6 +58,7 @@ class TestMany:
         assert figures["steps acknowledged"] > 100
         assert figures["episodes in the end"] > 0
 
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize(
         ("harm", "match"),
         [
