@@ -243,6 +243,7 @@ def test_documents_in_a_file(bundle: Path, tmp_path: Path, attachment: str) -> N
     assert count > 5
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "key", ["library", "uuid", "benchmark_id", "created_ns", "rewritten", HOSTILE], ids=repr
 )
