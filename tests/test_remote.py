@@ -361,6 +361,7 @@ def test_commands_take_addresses(server: WebServer, large: Path, command: str) -
     assert json.loads(there).keys() == json.loads(near.stdout).keys()
 
 
+@pytest.mark.sampled(0, keep=["doctor-fetching-True", "verify-downloading-False"])
 @pytest.mark.parametrize(
     ("command", "what", "ranges"),
     [("doctor", b"fetching", True), ("verify", b"downloading", True), ("verify", b"downloading", False)],
