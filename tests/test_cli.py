@@ -1010,6 +1010,7 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.filterwarnings("ignore:.*has no journal")
 @pytest.mark.parametrize("kind", BAD_FILES)
 @pytest.mark.parametrize(
