@@ -564,7 +564,7 @@ def test_a_lost_journal_is_not_called_all_there(tmp_path: Path) -> None:
         assert _IN_JOURNAL not in " ".join(text.split())
 
 
-@pytest.mark.sampled(3)
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     "command", ["verify", "recover", "ls", "info", "episodes", "doctor", "trust", "import"]
 )
