@@ -167,6 +167,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     return _labs[0]
 
 
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_the_kth_call_on_a_storage_fails(tmp_path: Path, lab: Lab, name: str) -> None:
     calls = run_storage_case(name, lab, tmp_path / "whole", Case(-1, errno.EIO, False)).calls
