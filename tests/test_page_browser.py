@@ -118,7 +118,6 @@ def violations(page: Page, *rules: str) -> list[str]:
 
 
 class TestEverybody:
-    @pytest.mark.sampled(0, keep=["light"])
     @pytest.mark.parametrize("scheme", ["light", "dark"])
     def test_nothing_stands_in_the_way(self, chromium: Browser, lab: str, scheme: Any) -> None:
         of_colours = ("color-contrast", "link-in-text-block")
