@@ -34,6 +34,7 @@ from tupli_mcap import (
     Recording,
     RecordingError,
     TupliEnvWrapper,
+    merge_recordings,
     vector,
     write_recording,
 )
@@ -682,7 +683,7 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     )
     assert panel(made, "metadata: score") and panel(made, "info: distance")  # of episodes; step by step
     assert not {"metadata: constant", "info: k, mean of each episode"} & set(texts(made))  # all the same
-    assert made.notes == ["Infos without numbers are not shown: word."]
+    assert made.notes == ["Infos that are not single numbers are not shown: word."]
 
 
 def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -723,7 +724,7 @@ def test_infos_without_numbers_are_named(tmp_path: Path) -> None:
     )
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
     assert [note for note in made.notes if note.startswith("Infos")] == [
-        "Infos without numbers are not shown: contact, note."
+        "Infos that are not single numbers are not shown: contact, note."
     ]
     assert "info: force" in texts(made)
 
@@ -832,6 +833,29 @@ def test_groups_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
     assert sorted(names) == [
         "ppo (eval)", "ppo (train)", "sac (x)", "sac (y)", "td3 (lr=0.001)", "td3 (lr=0.1)",
     ]  # fmt: skip
+
+
+def test_the_runs_of_a_file_are_plotted_as_those_of_several(tmp_path: Path) -> None:
+    both, files = tmp_path / "both.mcap", [tmp_path / f"{seed}.mcap" for seed in range(2)]
+    for seed, file in enumerate(files):
+        for path in (both, file):
+            with RecordEpisodes(gym.make("CartPole-v1"), path, name=f"ppo-seed{seed}", mode="a") as env:
+                env.action_space.seed(seed)
+                roll(env, 60, seed=seed)
+    merged = tmp_path / "merged.mcap"
+    merge_recordings(files, merged)
+    wanted = report(files)
+    for path in (both, merged):
+        made = report(path)
+        assert made.title == "CartPole-v1: 2 runs"
+        assert [group.name for group in made.groups] == ["ppo"]
+        for mine, other in zip(made.groups[0].runs, wanted.groups[0].runs, strict=True):
+            assert mine.places("steps").tolist() == other.places("steps").tolist()
+            assert mine.places("episodes").tolist() == other.places("episodes").tolist()
+            assert mine.numbers("return").tolist() == other.numbers("return").tolist()
+    number = int(report(both).measured[1].rows["episode"][0])
+    ((of, _),) = report(both, episode=number).traces
+    assert of.name == "ppo-seed1"
 
 
 def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -139,6 +140,21 @@ def test_the_title_names_the_runs(tmp_path: Path) -> None:
         found = Rrd(viewer.save(paths[:count], tmp_path / f"{count}.rrd"))
         titles += found.rows("/__properties", "RecordingInfo:name")
     assert titles == [["run a"], ["run a, run b"], ["run a, run b, run c and 2 more"]]
+
+
+def test_the_runs_of_a_file_are_told_apart(tmp_path: Path) -> None:
+    path = tmp_path / "both.mcap"
+    for name in ("run a", "run b"):
+        with RecordEpisodes(Goes(), path, name=name, mode="a") as env:
+            for _ in range(12):
+                env.reset()
+                env.step(0)
+    found = Rrd(viewer.save(path, tmp_path / "b.rrd", filter='run.name = "run b"', episodes="best"))
+    assert found.rows("/__properties", "RecordingInfo:name") == [["run b"]]
+    assert "### both" in found.rows("/card", "TextDocument:text")[0][0]
+    found = Rrd(viewer.save(path, tmp_path / "both.rrd"))
+    assert found.rows("/__properties", "RecordingInfo:name") == [["run a, run b"]]
+    assert re.search("of run a; .* of run b", found.rows("/card", "TextDocument:text")[0][0])
 
 
 class Goes(gym.Env[Any, Any]):

@@ -1063,6 +1063,31 @@ def test_keys_are_texts(tmp_path: Path) -> None:
             change()
 
 
+def test_each_run_of_a_file_is_shown_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "both.mcap"
+    for seed in (0, 1):
+        record(path, 3, mode="a", name=f"ppo-seed{seed}", metadata={"lr": 0.5, "seed": seed})
+    first, second = Recording(path).runs
+    assert first.started < first.ended < second.started < second.ended
+    assert len(tupli_mcap.open(path).filter(f'run.ended < "{second.started}"')) == 3
+    told = json.loads(command("info", str(path), "--filter", 'run.name = "ppo-seed1"', "--json"))["result"]
+    assert told["runs"] == [{"name": "ppo-seed1", "episodes": 3, "metadata": {"lr": 0.5, "seed": 1}}]
+    assert told["run"]["name"] == "ppo-seed1"
+    assert "ppo-seed0 (3 episodes, lr=0.5, seed=0), ppo-seed1 (" in command("info", str(path))
+    # of two runs with one place, RUN says which is which, also where there is little room
+    monkeypatch.setenv("COLUMNS", "80")
+    assert [line.split()[1] for line in command("ls", str(path)).splitlines()] == [
+        "RUN",
+        "ppo-seed0",
+        "ppo-seed1",
+    ]
+    assert command("episodes", str(path), "--limit", "1").splitlines()[0].split()[:2] == ["EPISODE", "RUN"]
+    record(tmp_path / "other.mcap", 1, name="other")
+    title, line = command("episodes", str(tmp_path), "-e", "last").splitlines()
+    assert title.split()[:2] == ["ID", "RUN"]
+    assert line.split()[1] == "other"
+
+
 def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     for given in ({"name": "one", "metadata": {"lr": 1}}, {"name": "one", "metadata": {"lr": 1}}, {}):
@@ -1090,7 +1115,7 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
         ("killed", 3),
         ("two", 2),
     ]
-    with pytest.raises(RecordingError, match="has 3 runs; only a recording of one run"):
+    with pytest.raises(RecordingError, match="has 3 runs, and only a recording of one run"):
         edit_run(path, name="x")
     before = path.read_bytes()
     with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):

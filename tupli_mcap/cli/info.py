@@ -25,7 +25,7 @@ from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
     from typing import Any
 
     from tupli_mcap.dataset import Dataset
@@ -196,6 +196,12 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
     return facts
 
 
+def _run_text(run: Mapping[str, Any]) -> str:
+    """One of several runs: `ppo-seed1 (12 episodes, lr=0.001)`."""
+    facts = [counted(run["episodes"], "episode"), pairs_of(run["metadata"])]
+    return f"{run['name']} ({', '.join(filter(None, facts))})"
+
+
 def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
     from tupli_mcap.recording.about.success import success_text
 
@@ -207,7 +213,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         "are shown",
     }
     environment = d.environment or "none attached"
-    runs = [f"{run['name']} ({counted(run['episodes'], 'episode')})" for run in d.runs]
+    runs = [_run_text(run) for run in d.runs]
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
     return [
         ("recording", d.name),

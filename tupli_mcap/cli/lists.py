@@ -278,10 +278,21 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
     roomy = is_roomy()
+    tells_run = all(item.name in item.path for item in items) and len({item.path for item in items}) == len(
+        items
+    )
     names = ["recording", *["files"] * any(item.files > 1 for item in items)]
-    names += [*(["run", "environment"] * roomy), "episodes", "steps", "return"]
+    names += [
+        *(["run"] * (roomy or not tells_run)),
+        *(["environment"] * roomy),
+        "episodes",
+        "steps",
+        "return",
+    ]
     names += ["success"] * any(item.success is not None for item in items)
-    return [_COLUMNS[name] for name in [*names, *(["started"] * roomy), "size", "state"]]
+    names += ["started"] * roomy + ["size"] * (roomy or tells_run)
+    names += ["state"] * (roomy or tells_run or any(item.state != "complete" for item in items))
+    return [_COLUMNS[name] for name in names]
 
 
 def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
@@ -337,11 +348,13 @@ def episodes(
         with any_storage(paths[0]) as storage:
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
-    wanted = filter_of(filter_text)
-    headers = _headers_of(dataset_of(paths), wanted, sort)
+    from tupli_mcap.storage.listing import is_of_several
+
+    several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
+    found = headers = _headers_of(dataset_of(paths), wanted, sort)
     if (ids := _chosen_ids(paths, which, wanted)) is not None:
-        headers = [header for header in headers if header.id in ids]
-    _print_headers(headers[:limit], columns, as_json=as_json)
+        headers = [header for header in found if header.id in ids]
+    _print_headers(headers[:limit], columns, among=found, several=several, as_json=as_json)
 
 
 def list_stored(
@@ -361,7 +374,7 @@ def list_stored(
             _matching(open_dataset(storage), wanted)
     else:
         headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
-    _print_headers(headers, columns, as_json=as_json)
+    _print_headers(headers, columns, among=headers, several=True, as_json=as_json)
 
 
 def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
@@ -371,9 +384,17 @@ def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -
     return found.headers
 
 
-def _print_headers(headers: Sequence[EpisodeHeader], columns: str | None, *, as_json: bool) -> None:
+def _print_headers(
+    headers: Sequence[EpisodeHeader],
+    columns: str | None,
+    *,
+    among: Sequence[EpisodeHeader],
+    several: bool,
+    as_json: bool,
+) -> None:
+    """Prints some of the episodes that were found; `several`: in a place that may have several recordings."""
     if columns is None:
-        print_episodes(headers, as_json=as_json)
+        _print_episodes(headers, among, several=several, as_json=as_json)
     else:
         _print_keys(headers, [key.strip() for key in columns.split(",")], as_json=as_json)
 
@@ -411,7 +432,9 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     )
 
 
-def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
+def _print_episodes(
+    headers: Sequence[EpisodeHeader], among: Sequence[EpisodeHeader], *, several: bool, as_json: bool
+) -> None:
     if as_json:
         from tupli_mcap.schema import EpisodeHeader
         from tupli_mcap.schema.facts import filter_keys, path_in
@@ -419,9 +442,8 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
         fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
         print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])
         return
-    recordings = {header.recording for header in headers}
-    several = len(recordings) > 1
-    by_run = several and len({header.run.get("name", "") for header in headers}) == len(recordings)
+    names = {(header.recording, header.run.get("name", "")) for header in among}
+    by_run = len({name for _, name in names}) == len(names) > 0
     source = Column("RUN", shrink="end") if by_run else Column("RECORDING", shrink="start")
     roomy = is_roomy()
     several_envs = any(header.env for header in headers)
@@ -440,7 +462,11 @@ def print_episodes(headers: Sequence[EpisodeHeader], *, as_json: bool) -> None:
     rows = [  # a column without any value is not shown
         (
             short_ids(h.id) if several else str(h.episode),
-            "" if not several else h.run.get("name", "") if by_run else short_path(h.recording),
+            ""
+            if not several and len(names) == 1
+            else h.run.get("name", "")
+            if by_run
+            else short_path(h.recording),
             str(h.env) if several_envs else "",
             number(h.n_tuples),
             total,

@@ -89,7 +89,7 @@ class Measured:
             more = len(self.other_infos) - _MOST_NAMED
             names = ", ".join(key[:40] for key in self.other_infos[:_MOST_NAMED])
             notes.append(
-                f"Infos without numbers are not shown: {names}{f' and {more:,} more' if more > 0 else ''}."
+                f"Infos that are not single numbers are not shown: {names}{f' and {more:,} more' if more > 0 else ''}."
             )
         for leaf in self.leaves:
             notes += leaf.notes()

@@ -103,10 +103,13 @@ def card(recording: Recording) -> str:
     return "\n".join([f"### {plain(run_title(recording))}", "", lines[0], "|---|---|", *lines[1:]])
 
 
-def run_title(recording: Recording, position: int = 0) -> str:
-    """The name of an episode's run, else of the file; shortened, and without unprintable characters."""
-    place = recording.readable_places[position] if len(recording.index) else 0
-    name = recording.readable_runs[place].name or Path(recording.name).stem
+def run_title(recording: Recording, position: int | None = None) -> str:
+    """The name of an episode's run, or of the only run of a recording, else of the file; shortened, and without
+    unprintable characters."""
+    runs = recording.readable_runs
+    place = 0 if position is None else recording.readable_places[position]
+    known = position is not None or len(runs) == 1
+    name = (known and runs[place].name) or Path(recording.name).stem
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 
 

@@ -17,6 +17,7 @@ from tupli_mcap.errors import FormatError, plural
 from tupli_mcap.journal.file import recorded_journal
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.recording.about.run import Run
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import Contents
@@ -64,7 +65,7 @@ class RecordingDescription:
         environment: the name in its run, else in its benchmark; None if neither has one.
         signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
         run: the parts of its run, or of the first one, that are known.
-        runs: `name` and number of `episodes` of each run.
+        runs: `name`, number of `episodes` and `metadata` of each run that has some of them.
         made_of: the recordings it was made of; None if it was recorded.
         annotations: who said something (`by`) about how many `episodes`, and when (`at`, ISO 8601 in UTC).
         metadata_keys: keys of the episodes' metadata.
@@ -125,7 +126,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
     """
     positions = np.arange(len(recording.index)) if positions is None else positions
     said = successes(recording, positions)
-    rows, run = recording.index[positions], recording.readable_runs[0]
+    rows, runs = recording.index[positions], _runs(recording, positions)
+    run = runs[0][0]
     contents, seeds = recording.file.contents, recording.seeds
     table = contents.table
     chunks = table[table["offset"] < IN_MEMORY]
@@ -145,7 +147,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         environment=run.environment or named,
         signed_by=claimed_signer(recording),
         run={key: value for key, value in vars(run).items() if value},
-        runs=_runs(recording, positions),
+        runs=[{"name": one.name, "episodes": count, "metadata": one.metadata} for one, count in runs],
         made_of=recording.made_of,
         annotations=_annotations(recording, rows),
         metadata_keys=_metadata_keys(recording, positions),
@@ -183,10 +185,11 @@ def state_of(recording: Recording) -> str:
     return "incomplete"
 
 
-def _runs(recording: Recording, positions: Array) -> list[dict[str, Any]]:
+def _runs(recording: Recording, positions: Array) -> list[tuple[Run, int]]:
+    """The runs of some episodes, each with how many of these it has; without episodes, all runs."""
     runs = recording.readable_runs
     counts = np.bincount(recording.readable_places[positions], minlength=len(runs)).tolist()
-    return [{"name": run.name, "episodes": count} for run, count in zip(runs, counts, strict=True)]
+    return [pair for pair in zip(runs, counts, strict=True) if pair[1] or not len(positions)]
 
 
 def _annotations(recording: Recording, rows: Array) -> list[dict[str, Any]]:

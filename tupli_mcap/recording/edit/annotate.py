@@ -171,7 +171,8 @@ def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, 
     """The run of a recording, and its versions before edits."""
     if len(recording.runs) > 1:
         raise RecordingError(
-            f"{path} has {len(recording.runs)} runs; only a recording of one run can be edited"
+            f"{path} has {len(recording.runs)} runs, and only a recording of one run can be edited; write the run to a "
+            f"file of its own (tupli-mcap filter {path} 'run.name = \"{recording.run.name}\"' -o run.mcap), and edit it"
         )
     (said,) = recording.recorded_runs.runs
     return said, recording.recorded_runs.before
