@@ -332,6 +332,8 @@ def test_episodes_are_chosen_by_positions_or_a_mask(path: Path) -> None:
     for wrong in ([1.5], 2, mask[:-1], ["1"], slice(1, 2), recording.episodes[:2], [[0, 1]]):
         with pytest.raises(RecordingError, match="expected a list of positions from 0 to"):
             recording.read(wrong)
+    with pytest.raises(RecordingError, match="fields are given by name: fields="):
+        recording.read(["rewards"])
     assert np.array_equal(recording.read([]).states, expected[:0])
     assert np.array_equal(recording.read(fields="states").states, recording.read().states)
 

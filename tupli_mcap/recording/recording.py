@@ -311,9 +311,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         if chosen.dtype.kind == "b" and chosen.shape == (n,):
             return np.flatnonzero(chosen)
         if chosen.ndim != 1 or (len(chosen) and chosen.dtype.kind not in "iu"):
+            hint = "; fields are given by name: fields=…" if chosen.dtype.kind == "U" else ""
             raise RecordingError(
                 f"{self.name}: expected a list of positions from 0 to {n - 1}, or a mask of {n} bools, "
-                f"found {episodes!r:.100}"
+                f"found {episodes!r:.100}{hint}"
             )
         if len(chosen) and (chosen.min() < 0 or chosen.max() >= n):
             raise RecordingError(f"{self.name}: expected episodes from 0 to {n - 1}, found {episodes!r:.100}")
