@@ -634,7 +634,7 @@ class TestTimes:
             (F("name") == "ppo", r"unknown key 'name' \(did you mean 'run.name'\?\); the keys are"),
             (
                 F("info.force") > 1,
-                "unknown key 'info.force': it is of steps, which TupliDataset.with_tuple_filter chooses; the keys",
+                r"unknown key 'info.force': it is of steps, which TupliDataset.from_files\(path\).with_tuple_filter",
             ),
             (
                 F("reward") > 1,

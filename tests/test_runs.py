@@ -785,6 +785,12 @@ class TestCommands:
                     done = CliRunner().invoke(app, [*words, str(tmp_path), "--filter", text])
                     assert done.exit_code == 0
                     assert done.stderr == f"warning: no {key} is '{wrong}' (did you mean '{right}'?)\n"
+        for text, kinds in (
+            ("run.name = 3", "run.name is a text, such as ppo-seed0, and never a number"),
+            ("run.name in [true]", "run.name is a text, such as ppo-seed0, and never true or false"),
+        ):
+            done = CliRunner().invoke(app, ["ls", str(tmp_path), "--filter", text])
+            assert done.stderr == f"warning: {kinds}\n"
         far = CliRunner().invoke(
             app, ["ls", str(tmp_path), "--filter", "run.name = 'sac' or run.name = 'ppo-seed1' and steps < 0"]
         )

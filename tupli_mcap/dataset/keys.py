@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 from tupli_mcap.errors import FilterError, did_you_mean
+from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, format_key
 from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
 from tupli_mcap.schema.filters import FilterType
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
+
+_KINDS: Final = {bool: "true or false", int: "a number", float: "a number", str: "a text"}
 
 
 def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
@@ -68,14 +71,22 @@ def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
 
 
 def unlike_any(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> str:
-    """What a filter that matches no episode may mean, if it compares a key with a text that no episode has there, and
-    one has a text like it; else nothing."""
+    """What a filter that matches no episode may mean, if it compares a key with a value of a kind that no episode has
+    there, or with a text that is like one; else nothing."""
     for comparison in comparisons(wanted):
         path = path_in(comparison.key or "", EpisodeHeader)
-        known = {found for header in among if isinstance(found := look_up(header, path), str)}
-        texts = {FilterType.EQ: [comparison.value], FilterType.IN: comparison.value}
-        for text in texts.get(comparison.type, ()):
-            hint = did_you_mean(text, sorted(known)) if isinstance(text, str) and text not in known else ""
+        found = [value for header in among if (value := look_up(header, path)) not in (MISSING, None)]
+        kinds = {_KINDS.get(type(value)): value for value in found}
+        for value in comparison.value if comparison.type is FilterType.IN else [comparison.value]:
+            kind = _KINDS.get(type(value))
+            if kind and kinds and not kinds.keys() & {kind, None}:
+                (other, example), *_ = kinds.items()
+                return f"{comparison.key} is {other}, such as {spelled(example)}, and never {kind}"
+            texts = sorted({text for text in found if isinstance(text, str)})
+            exact = comparison.type in (FilterType.EQ, FilterType.IN)
+            hint = (
+                did_you_mean(value, texts) if exact and isinstance(value, str) and value not in texts else ""
+            )
             if hint:
-                return f"no {comparison.key} is {text!r}{hint}"
+                return f"no {comparison.key} is {value!r}{hint}"
     return ""
