@@ -600,11 +600,12 @@ def test_the_newest_steps_are_a_heat_map_in_rerun(tmp_path: Path) -> None:
     path, port = tmp_path / "r.mcap", free_port()
     inner = Sampler(spaces.Box(-1, 1, (60,)), spaces.Discrete(3))
     with receiver(port, tmp_path / "r.rrd"), RecordEpisodes(inner, path, live=url(port)) as env:
+        roll_until_shown(env, tmp_path / "r.rrd")
         roll(env, 600, 0.002)
     rows, tensors = shown(tmp_path / "r.rrd", "/state/heat_map", "Tensor:data")
     with Recording(path) as recording:
-        states = recording.read().states[200:]
-    assert rows[-1] == 599
+        assert rows[-1] == recording.index["length"].sum() - 1
+        states = recording.read().states[-400:]
     (tensor,) = tensors[-1]
     assert tensor["shape"] == [60, 400]
     found = np.array(tensor["buffer"]).reshape(60, 400).T

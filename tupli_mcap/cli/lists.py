@@ -394,7 +394,7 @@ def _print_headers(
 ) -> None:
     """Prints some of the episodes that were found; `several`: in a place that may have several recordings."""
     if columns is None:
-        _print_episodes(headers, among, several=several, as_json=as_json)
+        print_episodes(headers, among, several=several, as_json=as_json)
     else:
         _print_keys(headers, [key.strip() for key in columns.split(",")], as_json=as_json)
 
@@ -432,7 +432,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     )
 
 
-def _print_episodes(
+def print_episodes(
     headers: Sequence[EpisodeHeader], among: Sequence[EpisodeHeader], *, several: bool, as_json: bool
 ) -> None:
     if as_json:

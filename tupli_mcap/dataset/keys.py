@@ -76,7 +76,7 @@ def unlike_any(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> str:
     for comparison in comparisons(wanted):
         path = path_in(comparison.key or "", EpisodeHeader)
         found = [value for header in among if (value := look_up(header, path)) not in (MISSING, None)]
-        kinds = {_KINDS.get(type(value)): value for value in found}
+        kinds = {_KINDS.get(type(value)): value for value in reversed(found)}
         for value in comparison.value if comparison.type is FilterType.IN else [comparison.value]:
             kind = _KINDS.get(type(value))
             if kind and kinds and not kinds.keys() & {kind, None}:
