@@ -100,6 +100,7 @@ _COLUMNS = {
     ),
     "paths": _listed_by(attrgetter("paths"), Column("PATHS", shrink="end"), ", ".join),
 }
+_IN_TABLE: Final = [name for name in _COLUMNS if name not in ("split", "tags", "settings", "paths")]
 _MEANT = {
     "date": "started",
     "time": "started",
@@ -278,21 +279,19 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
     roomy = is_roomy()
-    tells_run = all(item.name in item.path for item in items) and len({item.path for item in items}) == len(
-        items
-    )
-    names = ["recording", *["files"] * any(item.files > 1 for item in items)]
-    names += [
-        *(["run"] * (roomy or not tells_run)),
-        *(["environment"] * roomy),
-        "episodes",
-        "steps",
-        "return",
-    ]
-    names += ["success"] * any(item.success is not None for item in items)
-    names += ["started"] * roomy + ["size"] * (roomy or tells_run)
-    names += ["state"] * (roomy or tells_run or any(item.state != "complete" for item in items))
-    return [_COLUMNS[name] for name in names]
+    paths = {item.path for item in items}
+    # whether the path of a run says which it is
+    by_path = len(paths) == len(items) and all(item.name in item.path for item in items)
+    shown = {
+        "files": any(item.files > 1 for item in items),
+        "run": roomy or not by_path,
+        "environment": roomy,
+        "success": any(item.success is not None for item in items),
+        "started": roomy,
+        "size": roomy or by_path,
+        "state": roomy or by_path or any(item.state != "complete" for item in items),
+    }
+    return [_COLUMNS[name] for name in _IN_TABLE if shown.get(name, True)]
 
 
 def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
@@ -445,6 +444,10 @@ def print_episodes(
     names = {(header.recording, header.run.get("name", "")) for header in among}
     by_run = len({name for _, name in names}) == len(names) > 0
     source = Column("RUN", shrink="end") if by_run else Column("RECORDING", shrink="start")
+
+    def source_of(header: EpisodeHeader) -> str:
+        return str(header.run.get("name", "")) if by_run else short_path(header.recording)
+
     roomy = is_roomy()
     several_envs = any(header.env for header in headers)
     returns = numbers([header.episode_return for header in headers])
@@ -462,11 +465,7 @@ def print_episodes(
     rows = [  # a column without any value is not shown
         (
             short_ids(h.id) if several else str(h.episode),
-            ""
-            if not several and len(names) == 1
-            else h.run.get("name", "")
-            if by_run
-            else short_path(h.recording),
+            "" if not several and len(names) == 1 else source_of(h),
             str(h.env) if several_envs else "",
             number(h.n_tuples),
             total,
