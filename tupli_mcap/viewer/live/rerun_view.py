@@ -17,7 +17,7 @@ from tupli_mcap.viewer.sdk import import_quickly, rerun_sdk
 
 _TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
 _PATIENCE = 0.5  # seconds for a viewer to take what it was sent
-_FAREWELL = 5.0  # the same for the rest, when the rollout is over
+_FAREWELL = 20.0  # the same for the rest, when the rollout is over: the recorder does not wait so long
 _STARTING = 20.0  # seconds for a viewer that we have started to answer
 
 
