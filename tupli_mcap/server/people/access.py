@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, Final, NamedTuple, TypeVar
 
-from sqlalchemy import Connection, FromClause, and_, not_, or_, select
+from sqlalchemy import Connection, FromClause, and_, literal, not_, or_, select, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import TupliError
@@ -147,14 +147,15 @@ def known_audiences(
     Nobody is told of groups that are gone. The owner knows the others; everybody else, their own and `global`, and with
     the right to read groups or users in `global`, the names of these.
     """
-    groups, users = (
-        set(connection.execute(select(table.c.name).where(table.c.name.in_(among))).scalars())
-        for table in (GROUP, USER)
-    )
-    there = {GLOBAL, *groups, *users}
-    known = there & {GLOBAL, *caller.rights}
-    known |= groups if caller.may(Right.GROUP_READ) else set()
-    known |= users if caller.may(Right.USER_READ) else set()
+    own = {GLOBAL, *caller.rights}
+    there, known = set(own), set(own)
+    if others := among - own:
+        kinds = {Right.GROUP_READ: GROUP.c.name, Right.USER_READ: USER.c.name}
+        named = (select(name, literal(right.value)).where(name.in_(others)) for right, name in kinds.items())
+        for name, right in connection.execute(union_all(*named)):
+            there.add(name)
+            if caller.may(Right(right)):
+                known.add(name)
 
     def shown(owner: str, names: Sequence[str]) -> list[str]:
         seen = there if owner == caller.name else known

@@ -6,12 +6,12 @@ import json
 import re
 import time
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from pwdlib import PasswordHash
 from pwdlib.hashers.argon2 import Argon2Hasher
-from sqlalchemy import Connection, Select, delete, insert, select, update
+from sqlalchemy import Connection, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import Right
@@ -117,7 +117,8 @@ def list_users(connection: Connection, caller: Caller) -> dict[str, dict[str, li
     """All users, oldest first, each with the roles by group, as from `memberships_of`, in the groups that the caller
     may see."""
     names = connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars()
-    found = _with_memberships(connection, list(names), select(*_MEMBERSHIPS))
+    every = connection.execute(select(*_MEMBERSHIPS).order_by(*_MEMBERSHIPS))
+    found = _with_memberships(list(names), every)
     seen = {GLOBAL, *(group["name"] for group in list_groups(connection, caller))}
     return {
         name: {group: roles for group, roles in held.items() if group in seen or group == name}
@@ -127,13 +128,16 @@ def list_users(connection: Connection, caller: Caller) -> dict[str, dict[str, li
 
 def caller_named(connection: Connection, name: str, *, may_write: bool = True) -> Caller | None:
     """A user as a caller; None if there is no such user."""
-    epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == name)).scalar()
-    if epoch is None:
+    both = USER.outerjoin(MEMBERSHIP, MEMBERSHIP.c.user == USER.c.name)
+    query = select(USER.c.epoch, *_MEMBERSHIPS).select_from(both).where(USER.c.name == name)
+    found = connection.execute(query.order_by(*_MEMBERSHIPS)).all()
+    if not found:
         return None
+    held = _with_memberships([name], (row[1:] for row in found if row.role is not None))
     rights: dict[str, frozenset[Right]] = {}
-    for group, roles in memberships_of(connection, name).items():
+    for group, roles in held[name].items():
         rights[group] = frozenset[Right]().union(*(_rights_of(connection, role) for role in roles))
-    return Caller(name, rights, may_write, epoch)
+    return Caller(name, rights, may_write, found[0].epoch)
 
 
 def guest(connection: Connection) -> Caller:
@@ -143,15 +147,14 @@ def guest(connection: Connection) -> Caller:
 
 def memberships_of(connection: Connection, name: str) -> dict[str, list[str]]:
     """The roles of a user by group, with the roles that every user has."""
-    of_user = select(*_MEMBERSHIPS).where(MEMBERSHIP.c.user == name)
-    return _with_memberships(connection, [name], of_user)[name]
+    of_user = select(*_MEMBERSHIPS).where(MEMBERSHIP.c.user == name).order_by(*_MEMBERSHIPS)
+    return _with_memberships([name], connection.execute(of_user))[name]
 
 
-def _with_memberships(
-    connection: Connection, names: Sequence[str], chosen: Select[Any]
-) -> dict[str, dict[str, list[str]]]:
+def _with_memberships(names: Sequence[str], rows: Iterable[Any]) -> dict[str, dict[str, list[str]]]:
+    """The roles of users by group, with the roles that every user has. `rows` are of `_MEMBERSHIPS`, in their order."""
     found = {name: {GLOBAL: list(_EVERYBODY_S_ROLES), name: list(_OWN_ROLES)} for name in names}
-    for user, group, role in connection.execute(chosen.order_by(*_MEMBERSHIPS)):
+    for user, group, role in rows:
         roles = found[user].setdefault(group, [])
         if role not in roles:
             roles.append(role)
