@@ -47,6 +47,34 @@ def test_a_door_names_every_room_and_module(folder: Path) -> None:
     assert len(names) <= 2 or folder.name == "versions" or not missing
 
 
+def imported_names(path: Path) -> list[tuple[str, str]]:
+    """(module, name) of what a module imports from the package."""
+    nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+    return [(node.module or "", alias.name) for node in nodes for alias in node.names]
+
+
+@pytest.mark.parametrize("folder", FOLDERS[1:], ids=name_of)
+def test_what_a_door_gives_is_imported_from_it(folder: Path) -> None:
+    door = ast.parse((folder / "__init__.py").read_text())
+    given = {
+        name.value
+        for node in door.body
+        if isinstance(node, ast.Assign) and "__all__" in ast.unparse(node.targets[0])
+        for name in ast.walk(node.value)
+        if isinstance(name, ast.Constant)
+    }
+    room = ".".join(folder.relative_to(PACKAGE.parent).parts)
+    behind = {(module, name) for module, name in imported_names(folder / "__init__.py") if name in given}
+    around = [
+        (name_of(path), module, name)
+        for path in PACKAGE.rglob("*.py")
+        if folder not in path.parents
+        for module, name in imported_names(path)
+        if (module, name) in behind and module.startswith(f"{room}.")
+    ]
+    assert not around
+
+
 @pytest.mark.parametrize("folder", FOLDERS, ids=name_of)
 def test_a_folder_can_be_looked_over(folder: Path) -> None:
     assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 14

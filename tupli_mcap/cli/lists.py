@@ -435,8 +435,8 @@ def print_episodes(
     headers: Sequence[EpisodeHeader], among: Sequence[EpisodeHeader], *, several: bool, as_json: bool
 ) -> None:
     if as_json:
-        from tupli_mcap.schema import EpisodeHeader
-        from tupli_mcap.schema.facts import filter_keys, path_in
+        from tupli_mcap.schema import EpisodeHeader, filter_keys
+        from tupli_mcap.schema.facts import path_in
 
         fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
         print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])

@@ -18,6 +18,7 @@ from tupli_mcap.errors import FormatError, RecordingError, asking
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
+    MergeReport,
     Part,
     Recording,
     RecoveryReport,
@@ -27,7 +28,7 @@ from tupli_mcap.recording import (
 )
 from tupli_mcap.recording.edit import merge, split
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.edit.merge import Excerpt, MergeReport, check_mergeable, merge_excerpts
+from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of

@@ -7,9 +7,8 @@ from typing import Any, Final
 
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.jsonvalue import spelled
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, format_key
-from tupli_mcap.schema.facts import comparisons, filter_keys, path_in
-from tupli_mcap.schema.filters import FilterType
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, FilterType, filter_keys, format_key
+from tupli_mcap.schema.facts import comparisons, path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
 

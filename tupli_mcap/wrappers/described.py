@@ -38,7 +38,8 @@ from tupli_mcap.environment import (
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import Stack, StepLayout, can_stack, stack_of
-from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording import Run
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns
 from tupli_mcap.recording.write.options import CaptureEnv, RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema.times import iso_utc

@@ -9,7 +9,7 @@ from typing import Any
 from alembic import op
 from sqlalchemy import BigInteger, Column, Integer, Text, bindparam, column, select, table, update
 
-from tupli_mcap.schema.keys import split_key
+from tupli_mcap.schema import split_key
 from tupli_mcap.storage.texts import unescape_text
 
 revision = "7"
