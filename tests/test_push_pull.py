@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 import os
-import re
 import shlex
 import sys
 import threading
@@ -214,10 +213,8 @@ def test_a_run_without_a_name_keeps_that_of_its_file(admin: TupliAPIClient, tmp_
         run("push", (tmp_path / name).parent if seed == 0 else tmp_path / name)
     fill(tmp_path / "more", 1)
     run("push", tmp_path / "more")
-    names = [
-        re.fullmatch(r"\d{8}T\d{6}-(.*)[0-9a-f]{12}", each.run["name"]) for each in admin.list_episodes()
-    ]
-    assert sorted(name[1] for name in names if name) == ["_-", "cart-", "my_r_w_d_ta_1-", "ppo-", "teleop-"]
+    names = sorted(each.run["name"] for each in admin.list_episodes())
+    assert names == ["_", "cart", "my_r_w_d_ta_1", "ppo", "teleop"]
     for header in admin.list_episodes():
         with admin.open_recording(header.recording) as recording:
             assert recording.run.name == header.run["name"]
@@ -629,7 +626,7 @@ def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path:
     run("delete", admin.url, "--filter", "episode = 1")
     told = "not copied: 1 episode that had been deleted there\n"
     for source, line in (
-        (path.parent, f"sent 0 episodes of 0 benchmarks to {admin.url}\n"),
+        (path.parent, f"sent 0 episodes to {admin.url}\n"),
         (path, f"already there: 2 episodes of {path} at {admin.url}\n"),
     ):
         result = CliRunner().invoke(app, ["push", str(source)])

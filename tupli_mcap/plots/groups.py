@@ -12,6 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+from tupli_mcap.recording.about.run import name_after
 
 X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
@@ -133,7 +134,7 @@ def _seedless(one: Measured) -> tuple[Any, ...] | None:
         return None
     if name == given and isinstance(seed, int):
         name = re.sub(rf"[-_. ]+s?{seed}(?!\d)", "", _STARTED.sub("", name), count=1)
-    own = one.run.name != path.stem
+    own = one.run.name != name_after(one.facts.name)
     folder = "" if own else _SEED.sub("", str(path.parent))
     return folder, name.strip("-_. "), one.run.environment, one.run.split, settings
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +11,7 @@ import numpy as np
 
 from tupli_mcap.dataset.chosen import Chosen
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.run import name_after
 from tupli_mcap.recording.about.success import success_text
 from tupli_mcap.recording.describe.description import describe, nan_text
 from tupli_mcap.spaces.leaves import Leaf
@@ -109,7 +109,7 @@ def run_title(recording: Recording, position: int | None = None) -> str:
     runs = recording.readable_runs
     place = 0 if position is None else recording.readable_places[position]
     known = position is not None or len(runs) == 1
-    name = (known and runs[place].name) or Path(recording.name).stem
+    name = (known and runs[place].name) or name_after(recording.name)
     return "".join(char for char in name[:_LONGEST_TITLE] if char.isprintable())
 
 

@@ -132,7 +132,7 @@ def _push_storage(
         uri = None if benchmark is None else full_id(storage, benchmark)
         brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run)
     ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
-    what = f"{counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')}"
+    what = _counts(episodes, ids)
     publish = ids[0][:8] if len(brought) == len(ids) == 1 else ""
     return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", ids, [], episodes, publish)
 
@@ -241,9 +241,15 @@ def pull(
     verb = "would fetch" if dry_run else "fetched"
     print_result(
         {**told, "artifacts": artifacts, "episodes": episodes},
-        f"{verb} {counted(episodes, 'episode')} of {counted(len(ids), 'benchmark')} into {storage_path}",
+        f"{verb} {_counts(episodes, ids)} into {storage_path}",
         as_json=as_json,
     )
+
+
+def _counts(episodes: int, benchmarks: Sequence[str]) -> str:
+    """How many episodes, and of how many stored benchmarks, if they are of any."""
+    of = f" of {counted(len(benchmarks), 'benchmark')}" if benchmarks else ""
+    return f"{counted(episodes, 'episode')}{of}"
 
 
 def _only(client: TupliAPIClient, episode: str) -> BaseFilter:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
 
@@ -27,6 +26,7 @@ from tupli_mcap.page.shelf import Shelf, find_episode, find_some
 from tupli_mcap.plots.measure import thinned_to
 from tupli_mcap.plots.statistics import drawable_numbers
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.run import name_after
 from tupli_mcap.schema import EpisodeHeader, parse_bound
 from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
@@ -106,9 +106,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
     first, numbers_of = shelf.ask(ask)
     if first is None:
         raise NotFoundError("no episode matches; choose others, or another filter")
-    name = files.as_file_name(str(first.run.get("name", ""))) or files.as_file_name(
-        Path(first.recording).stem
-    )
+    name = files.as_file_name(str(first.run.get("name", "")) or name_after(first.recording))
     count = sum(map(len, numbers_of.values()))
     what = f"episode-{first.episode}" if count == 1 else f"{count}-episodes"
     answer = recording_of(shelf, numbers_of)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 from functools import cached_property
-from pathlib import PurePosixPath
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +13,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, TupliError, warn
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME, MAX_ANNOTATIONS, Annotations
-from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, file_name
+from tupli_mcap.recording.about.run import MAX_RUN, RUN_NAME, RecordedRuns, Run, name_after
 from tupli_mcap.recording.opened import OpenedRecording
 
 MADE_OF_NAME: Final = "made_of.json"
@@ -36,7 +35,7 @@ class DescribedRecording(OpenedRecording):
         Raises:
             FormatError: `run.json` is damaged.
         """
-        said, name = self.recorded_runs.runs, PurePosixPath(file_name(self.name)).stem
+        said, name = self.recorded_runs.runs, name_after(self.name)
         ended = np.zeros(len(said), np.int64)
         np.maximum.at(ended, self.run_places, self.index["end_time"])
         environment = "" if all(run.environment for run in said) else self._environment_name
@@ -115,8 +114,7 @@ class DescribedRecording(OpenedRecording):
             return self.runs
         except FormatError as err:
             warn(f"{err}; the run is not known")
-            name = PurePosixPath(file_name(self.name)).stem
-            return [Run().known_as(name, "", self.created_ns, 0)]
+            return [Run().known_as(name_after(self.name), "", self.created_ns, 0)]
 
     @cached_property
     def readable_places(self) -> Array:

@@ -6,6 +6,7 @@ A run is one start of a program. All files of a series belong to the same run.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath, PurePosixPath
@@ -21,6 +22,8 @@ RUN_MEDIA_TYPE: Final = "application/json"
 MAX_RUN: Final = 1 << 20  # bytes of `run.json`
 _LISTS: Final = ("tags", "command")
 _TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host")
+OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}")
+"""What a storage calls the file of a recording, see `storage.base.new_name`."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,13 @@ def file_name(name: str) -> str:
     """The last part of a path, or of a URL without its query."""
     path = urlsplit(name).path if "://" in name else name
     return PurePosixPath(path).name
+
+
+def name_after(file: str) -> str:
+    """The name of a run that has none: that of its file, without what a storage puts around it."""
+    stem = PurePosixPath(file_name(file)).stem
+    made = OF_STORAGE.fullmatch(stem)
+    return (made["name"] if made else None) or stem
 
 
 class RecordedRuns(NamedTuple):

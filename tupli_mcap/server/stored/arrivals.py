@@ -16,6 +16,7 @@ from sqlalchemy import Connection, insert, select
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.about.run import OF_STORAGE
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audience, audit, settle
 from tupli_mcap.server.people.access import Caller, readable
@@ -33,7 +34,6 @@ from tupli_mcap.storage.texts import escape_text, is_hash, unescape_text
 
 _MOST_METADATA: Final = 64 << 10  # characters of JSON
 _PLAIN: Final = "plain"  # where recordings without a benchmark lie
-_OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}")  # see `new_name`
 _ODD: Final = re.compile(r"[^A-Za-z0-9._-]+")  # in URLs of buckets
 
 
@@ -66,7 +66,7 @@ def new_place(benchmark_id: str, file: str) -> str:
     """A new place for a recording of a stored benchmark, or of none. What is plain in the name of its file is part of
     it: a run without a name is named after its file."""
     stem = file.removesuffix(".mcap")
-    made = _OF_STORAGE.fullmatch(stem)
+    made = OF_STORAGE.fullmatch(stem)
     name = _ODD.sub("_", (made["name"] or "") if made else stem)
     return f"recordings/{benchmark_id or _PLAIN}/{new_name(name)}"
 
