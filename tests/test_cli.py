@@ -1109,6 +1109,21 @@ def test_an_empty_choice_of_episodes_is_refused(command: tuple[str, ...], cartpo
     assert not (here / "x.gif").exists()
 
 
+@pytest.mark.parametrize(
+    "command", [("delete",), ("edit", "--name", "x"), ("tag", "a=1"), ("trim", "--steps", "1:", "-o", "x.mcap")]
+)
+def test_changing_episodes_of_which_none_matches(command: tuple[str, ...], cartpole: Path, here: Path) -> None:
+    (here / "runs").mkdir()
+    path = Path(shutil.copy(cartpole, here / "runs" / "r.mcap"))
+    before = path.read_bytes()
+    for place in ("runs", "runs/r.mcap"):
+        told = fails(*command, place, "--filter", "steps > 9999")
+        assert told == f"there is no episode that matches steps > 9999 in {place}"
+        assert "no episode has metadata.lost" in fails(*command, place, "--filter", "metadata.lost", code=2)
+    assert path.read_bytes() == before
+    assert not (here / "x.mcap").exists()
+
+
 @pytest.mark.parametrize("command", [("edit", "--name", "x"), ("compact",), ("tag", "--undo"), ("info",)])
 def test_a_file_that_does_not_exist(command: tuple[str, ...], here: Path) -> None:
     assert "no.mcap does not exist; give" in fails(*command, "no.mcap")

@@ -99,6 +99,8 @@ def test_the_command_deletes_on_a_server(admin: TupliAPIClient, tmp_path: Path) 
     for words in (["--episodes", "3"], [str(tmp_path / "lab"), "--filter", "episode < 4"], ["--filter", ""]):
         refused = CliRunner().invoke(app, ["delete", admin.url, *words])
         assert refused.exit_code == 2
+    refused = CliRunner().invoke(app, ["delete", admin.url, "--filter", "episode < 2"])
+    assert (refused.exit_code, refused.output.count("no episode that matches")) == (1, 1)
     assert admin.count_episodes() == 10
 
 

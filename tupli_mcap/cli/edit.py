@@ -18,9 +18,11 @@ from tupli_mcap.cli.options import (
     Json,
     Output,
     Sources,
+    chosen_in,
     dataset_of,
     filter_of,
     local_path,
+    none_in,
     pair_of,
     recordings_of,
 )
@@ -175,12 +177,11 @@ def _note(
     dry_run: bool,
 ) -> dict[str, list[int]]:
     """Notes values of the chosen episodes; returns the numbers of these by recording."""
-    from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.recording import annotate_episodes
     from tupli_mcap.recording.edit.annotate import change_all
 
     gathered = Gathered()
-    named = numbers_in(places, episodes, filter_of(filter_text), gathered)
+    named = chosen_in(places, episodes, filter_text, gathered)
     chosen = {file: numbers for (file, _), numbers in named.items()}
     change_all(
         chosen,
@@ -188,14 +189,7 @@ def _note(
         dry_run=dry_run,
         gathered=gathered,
     )
-    if not chosen:
-        raise _nothing_in(places, "episode", filter_text)
     return chosen
-
-
-def _nothing_in(places: Sequence[Path], what: str, filter_text: str | None) -> RecordingError:
-    why = "" if filter_text is None else f" that matches {filter_text}"
-    return RecordingError(f"there is no {what}{why} in {', '.join(map(str, places))}")
 
 
 def _named_alone(places: Sequence[Path], change: str) -> Sequence[Path]:
@@ -271,8 +265,6 @@ def edit(
         return edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry)
 
     runs = change_all(files, change, dry_run=dry_run, gathered=gathered)
-    if not files:
-        raise _nothing_in(places, "recording" if filter_text is None else "episode", filter_text)
     if as_json:
         edited = zip(files, runs, strict=True)
         print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
@@ -293,13 +285,15 @@ def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
 
 
 def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathered) -> list[str]:
-    """The recordings of paths, or those that have an episode which matches; see `numbers_in`."""
-    from tupli_mcap.dataset.which import numbers_in
+    """The recordings of paths, or those that have an episode which matches; see `chosen_in`."""
     from tupli_mcap.storage.listing import find_recordings
 
     if filter_text is not None:
-        return [file for file, _ in numbers_in(places, None, filter_of(filter_text), gathered)]
-    return list(dict.fromkeys(str(file) for place in places for file in find_recordings(place)))
+        return [file for file, _ in chosen_in(places, None, filter_text, gathered)]
+    files = list(dict.fromkeys(str(file) for place in places for file in find_recordings(place)))
+    if not files:
+        raise RecordingError(f"there is no recording in {', '.join(map(str, places))}")
+    return files
 
 
 def filter_(
@@ -359,6 +353,8 @@ def trim(
         ids = chosen_ids(sources, episodes, wanted)
     else:
         ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
+        if not ids:
+            raise none_in(sources, filter_text)
     report = trim_dataset(dataset, kept, ids, output, overwrite=force, dry_run=dry_run)
     _print_made(report, dry_run=dry_run, as_json=as_json)
 

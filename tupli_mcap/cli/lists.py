@@ -20,8 +20,10 @@ from tupli_mcap.cli.options import (
     Sort,
     Sources,
     any_storage,
+    check_there,
     dataset_of,
     filter_of,
+    matching_in,
 )
 from tupli_mcap.cli.output import (
     Column,
@@ -36,7 +38,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import fail, is_roomy
-from tupli_mcap.errors import bytes_of, did_you_mean, warn
+from tupli_mcap.errors import bytes_of, did_you_mean
 from tupli_mcap.remote import is_server, is_url, path_of
 
 if TYPE_CHECKING:
@@ -149,7 +151,7 @@ def ls(
     ids = _chosen_ids(sources, which, wanted)
     listed = by_run(item for source in sources for item in _listed(source, wanted, ids))
     if wanted is not None and not listed:
-        _check_there(sources, wanted)
+        check_there(sources, wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).value, descending=sort.startswith("-"))
     good = [item for item in listed if item.error is None]
@@ -202,29 +204,6 @@ def _positions(recording: Recording, wanted: BaseFilter | None, ids: set[str] | 
         return found
     numbers = recording.index["episode"][found].tolist()
     return found[[episode_id(recording.uuid, number) in ids for number in numbers]]
-
-
-def _check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
-    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has;
-    warns of a text that none has there."""
-    from tupli_mcap.storage.listing import recordings_at
-
-    if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
-        return
-    is_one = is_server(sources[0])
-    found = sources if is_one else [str(file) for source in sources for file in recordings_at(source)]
-    if found:
-        _matching(dataset_of(found), wanted)
-
-
-def _matching(dataset: Dataset, wanted: BaseFilter) -> Dataset:
-    """The episodes that match. If there is none, a warning or a FilterError says what the filter may mean."""
-    from tupli_mcap.dataset.keys import unlike_any
-
-    found = dataset.filter(wanted)
-    if not len(found) and (meant := unlike_any(wanted, dataset.headers)):
-        warn(meant)
-    return found
 
 
 def _sorted(
@@ -370,14 +349,14 @@ def list_stored(
     if sort is None:  # the storage stops at the limit
         headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
         if wanted is not None and not headers and limit != 0:
-            _matching(open_dataset(storage), wanted)
+            matching_in(open_dataset(storage), wanted)
     else:
         headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
     _print_headers(headers, columns, among=headers, several=True, as_json=as_json)
 
 
 def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
-    found = dataset if wanted is None else _matching(dataset, wanted)
+    found = dataset if wanted is None else matching_in(dataset, wanted)
     if sort is not None:
         found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
     return found.headers

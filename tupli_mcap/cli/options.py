@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.errors import NotFoundError, StorageError, missing_extra
-from tupli_mcap.remote import is_server, is_url, path_of, shown
+from tupli_mcap.errors import Gathered, NotFoundError, RecordingError, StorageError, missing_extra, warn
+from tupli_mcap.remote import is_server, is_url, path_of, shown, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -138,6 +138,52 @@ def filter_of(text: str | None) -> BaseFilter | None:
     from tupli_mcap.schema import parse_filter
 
     return parse_filter(text)
+
+
+def check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
+    """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has;
+    warns of a text that none has there."""
+    from tupli_mcap.storage.listing import recordings_at
+
+    if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
+        return
+    is_one = is_server(sources[0])
+    found = sources if is_one else [str(file) for source in sources for file in recordings_at(source)]
+    if found:
+        matching_in(dataset_of(found), wanted)
+
+
+def matching_in(dataset: Dataset, wanted: BaseFilter) -> Dataset:
+    """The episodes that match. If there is none, a warning or a FilterError says what the filter may mean."""
+    from tupli_mcap.dataset.keys import unlike_any
+
+    found = dataset.filter(wanted)
+    if not len(found) and (meant := unlike_any(wanted, dataset.headers)):
+        warn(meant)
+    return found
+
+
+def chosen_in(
+    places: Sequence[Path], episodes: str | None, filter_text: str | None, gathered: Gathered
+) -> dict[tuple[str, str], list[int]]:
+    """The numbers of the episodes to change, as `numbers_in` returns them. RecordingError if there is none, FilterError
+    if no episode has what the filter names."""
+    from tupli_mcap.dataset.which import numbers_in
+
+    found = numbers_in(places, episodes, filter_of(filter_text), gathered)
+    if not found:
+        gathered.raise_all()
+        raise none_in(list(map(str, places)), filter_text)
+    return found
+
+
+def none_in(places: Sequence[str], filter_text: str | None) -> RecordingError:
+    """The error that no episode is there, or matches; raises FilterError if no episode has what the filter names."""
+    wanted = filter_of(filter_text)
+    if wanted is not None:
+        check_there(places, wanted)
+    why = "" if wanted is None else f" that matches {filter_text}"
+    return RecordingError(f"there is no episode{why} in {', '.join(map(shown_name, places))}")
 
 
 def pair_of(text: str) -> tuple[str, Any]:

@@ -3,9 +3,9 @@ declare-key."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -23,10 +23,12 @@ from tupli_mcap.cli.options import (
     Sort,
     StoragePath,
     any_storage,
+    chosen_in,
     dataset_of,
     filter_of,
     full_id,
     local_path,
+    none_in,
     open_storage,
 )
 from tupli_mcap.cli.output import (
@@ -44,9 +46,6 @@ from tupli_mcap.cli.output import (
 from tupli_mcap.cli.terminal import is_roomy, say
 from tupli_mcap.errors import Gathered, RecordingError, bytes_of
 from tupli_mcap.remote import is_server
-
-if TYPE_CHECKING:
-    from tupli_mcap.schema import BaseFilter
 
 
 def list_benchmarks(
@@ -155,17 +154,20 @@ def delete(
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
-    wanted = filter_of(filter_text)
     if any(map(is_server, places)):
+        wanted = filter_of(filter_text)
         if len(places) > 1 or episodes is not None or wanted is None:
             raise typer.BadParameter(
                 "name one server alone, and choose its episodes with --filter 'return < 10'"
             )
         chosen = dataset_of(places).filter(wanted)
         ids = [header.id for header in chosen.headers]
+        if not ids:
+            raise none_in(places, filter_text)
         count = chosen.delete(force=force, dry_run=dry_run)
     else:
-        ids, count = _delete_in_files(map(local_path, places), episodes, wanted, force, dry_run)
+        paths = list(map(local_path, places))
+        ids, count = _delete_in_files(paths, episodes, filter_text, force, dry_run)
     print_result(
         {"dry_run": dry_run, "episodes": ids},
         f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
@@ -174,24 +176,20 @@ def delete(
 
 
 def _delete_in_files(
-    paths: Iterable[Path], episodes: str | None, wanted: BaseFilter | None, force: bool, dry_run: bool
+    paths: Sequence[Path], episodes: str | None, filter_text: str | None, force: bool, dry_run: bool
 ) -> tuple[list[str], int]:
     """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.dataset.which import numbers_in
     from tupli_mcap.storage.base import episode_id
     from tupli_mcap.storage.listing import find_recordings
 
-    paths = list(paths)
     files = [str(file) for given in paths for file in find_recordings(given)]
     gathered = Gathered()
-    doomed = numbers_in(paths, episodes, wanted, gathered)
+    doomed = chosen_in(paths, episodes, filter_text, gathered)
     gathered.raise_all()
-    if wanted is not None and files and not doomed:
-        len(dataset_of(files).filter(wanted))  # raises FilterError if no episode has such a key
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
-    return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run) if files else 0
+    return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run)
 
 
 def restore(
