@@ -1110,9 +1110,12 @@ def test_an_empty_choice_of_episodes_is_refused(command: tuple[str, ...], cartpo
 
 
 @pytest.mark.parametrize(
-    "command", [("delete",), ("edit", "--name", "x"), ("tag", "a=1"), ("trim", "--steps", "1:", "-o", "x.mcap")]
+    "command",
+    [("delete",), ("edit", "--name", "x"), ("tag", "a=1"), ("trim", "--steps", "1:", "-o", "x.mcap")],
 )
-def test_changing_episodes_of_which_none_matches(command: tuple[str, ...], cartpole: Path, here: Path) -> None:
+def test_changing_episodes_of_which_none_matches(
+    command: tuple[str, ...], cartpole: Path, here: Path
+) -> None:
     (here / "runs").mkdir()
     path = Path(shutil.copy(cartpole, here / "runs" / "r.mcap"))
     before = path.read_bytes()

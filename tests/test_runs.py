@@ -880,13 +880,18 @@ class TestCommands:
         assert told == f"{runs}/deep/b.mcap: 2 episodes annotated: late=true\n"
         data = tupli_mcap.open(runs)
         assert [e.metadata.get("late") for e in data] == [None, None, True, True]
-        for words, code in ((["--filter", "episode > 9", "late=true"], 1), (["--undo"], 2)):
-            assert CliRunner().invoke(app, ["tag", runs, *words]).exit_code == code
+        assert CliRunner().invoke(app, ["tag", runs, "--filter", "episode > 9", "late=true"]).exit_code == 1
         sweep = record(tmp_path / "lr=0.1" / "run.mcap", 1)
         command("tag", str(sweep.parent), "--episodes", "all", "good=true")
         assert Recording(sweep).episodes[0].metadata == {"good": True}
-        command("tag", f"{runs}/deep/b.mcap", "--undo")
+        told = f"{runs}/deep/b.mcap: took late=true back from 2 episodes\n"
+        assert command("tag", runs, "--undo", "--dry-run") == told.replace("took", "would take")
+        assert CliRunner().invoke(app, ["tag", runs, "--undo", "--episodes", "1"]).exit_code == 2
+        none = CliRunner().invoke(app, ["tag", runs, "--undo", "--filter", 'recording ~ "a.mcap"'])
+        assert (none.exit_code, none.output) == (1, f"error: there is no note to take back in {runs}\n")
+        assert command("tag", runs, "--undo") == told
         assert not any(e.metadata for e in tupli_mcap.open(runs))
+        assert CliRunner().invoke(app, ["tag", runs, "--undo"]).exit_code == 1
 
     def test_edit_in_a_directory(self, tmp_path: Path) -> None:
         paths = [
@@ -898,8 +903,14 @@ class TestCommands:
         assert said == [("eval", ()), ("eval", ("long",))]
         command("edit", str(paths[0]), "--undo")  # which was edited once, although it was named twice
         assert [run.split for run in Recording(paths[0]).runs] == [""]
-        for words, code in ((["--filter", "episode > 9", "--tag", "x"], 1), (["--undo"], 2)):
-            assert CliRunner().invoke(app, ["edit", str(tmp_path / "runs"), *words]).exit_code == code
+        edit = ["edit", str(tmp_path / "runs")]
+        assert CliRunner().invoke(app, [*edit, "--filter", "episode > 9", "--tag", "x"]).exit_code == 1
+        command(*edit, "--undo", "--filter", "episode >= 1")
+        command(*edit, "--undo")  # a.mcap has no edit any more
+        assert [run for path in paths for run in Recording(path).recorded_runs.before] == []
+        assert [run.split for path in paths for run in Recording(path).runs] == ["", ""]
+        none = CliRunner().invoke(app, [*edit, "--undo"])
+        assert (none.exit_code, none.output) == (1, f"error: there is no edit to take back in {edit[1]}\n")
 
     @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
     @pytest.mark.parametrize("words", ["tag --episodes all good=true", "edit --name x"])

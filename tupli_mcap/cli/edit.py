@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -43,7 +44,7 @@ from tupli_mcap.errors import Gathered, RecordingError, bytes_of
 from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
-    from tupli_mcap.recording import RecoveryReport, Run
+    from tupli_mcap.recording import Recording, RecoveryReport, Run
 
 _NO_JOURNAL = {
     "missing": "their journal is not beside the file; if the file was cut off, also all after the cut",
@@ -132,7 +133,8 @@ def tag(
     Filters and tables use a note in place of recorded metadata of the same key. A value that
     is JSON is read as JSON, any other as text; KEY= removes a key. The file keeps who noted
     it and when. Its steps are not touched. A signature is dropped. If one recording cannot be
-    changed, none is.
+    changed, none is. With --undo, --filter chooses recordings that have an episode which
+    matches; of a directory, those without a note stay as they are.
     """
     from tupli_mcap.recording import undo_annotation
     from tupli_mcap.recording.about.success import KEYS, success_of
@@ -148,16 +150,21 @@ def tag(
         raise typer.BadParameter(
             "expected recordings or directories, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 good=true"
         )
+    if undo and episodes is not None:
+        raise typer.BadParameter("--undo takes a note back from all its episodes; leave out --episodes")
     if not undo and episodes is None and filter_text is None:
         raise typer.BadParameter(
             "say which episodes: --episodes 3,7, --filter 'return < 10' or --episodes all"
         )
     done: list[dict[str, Any]] = []
     if undo:
-        files = _named_alone(paths, "note")
-        lasts = change_all(files, lambda file, dry: undo_annotation(file, dry_run=dry), dry_run=dry_run)
+        gathered = Gathered()
+        files = _changed_in(paths, filter_text, "note", attrgetter("annotations.said"), gathered)
+        lasts = change_all(
+            files, lambda file, dry: undo_annotation(file, dry_run=dry), dry_run=dry_run, gathered=gathered
+        )
         for file, last in zip(files, lasts, strict=True):
-            done.append({"path": str(file), "episodes": last.episodes, "values": last.values})
+            done.append({"path": file, "episodes": last.episodes, "values": last.values})
     else:
         noted = _note(paths, episodes, filter_text, values, dry_run=dry_run)
         done = [{"path": file, "episodes": numbers, "values": values} for file, numbers in noted.items()]
@@ -192,16 +199,6 @@ def _note(
     return chosen
 
 
-def _named_alone(places: Sequence[Path], change: str) -> Sequence[Path]:
-    """Recordings of which `--undo` may take back the last change. BadParameter for a directory: the last changes of its
-    recordings may have nothing in common."""
-    if any(place.is_dir() for place in places):
-        raise typer.BadParameter(
-            f"name the recordings whose last {change} --undo takes back, not their directory"
-        )
-    return places
-
-
 def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
     from tupli_mcap.jsonvalue import spelled
 
@@ -234,7 +231,7 @@ def edit(
     run_split: Annotated[
         str | None, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")
     ] = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit of each recording.")] = False,
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
@@ -242,7 +239,8 @@ def edit(
 
     The recordings keep their ids, and their steps are not touched. A signature is dropped. If
     one recording cannot be changed, none is. With --filter, only the recordings are changed
-    that have an episode which matches.
+    that have an episode which matches. With --undo, recordings of a directory that were not
+    edited stay as they are.
     """
     from tupli_mcap.recording import edit_run, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
@@ -257,7 +255,10 @@ def edit(
             "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
         )
     metadata, gathered = dict(pair_of(text) for text in settings or ()), Gathered()
-    files = _files_in(_named_alone(places, "edit") if undo else places, filter_text, gathered)
+    if undo:
+        files = _changed_in(places, filter_text, "edit", attrgetter("recorded_runs.before"), gathered)
+    else:
+        files = _files_in(places, filter_text, gathered)
 
     def change(file: str, dry: bool) -> Run:
         if undo:
@@ -294,6 +295,28 @@ def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathere
     if not files:
         raise RecordingError(f"there is no recording in {', '.join(map(str, places))}")
     return files
+
+
+def _changed_in(
+    places: Sequence[Path],
+    filter_text: str | None,
+    what: str,
+    changes_of: Callable[[Recording], Sequence[object]],
+    gathered: Gathered,
+) -> list[str]:
+    """The recordings of `_files_in` whose last change is taken back: those that are named, and of directories those
+    that have one. RecordingError if none has."""
+    from tupli_mcap.recording import Recording
+
+    named, found = set(map(str, places)), []
+    for file in _files_in(places, filter_text, gathered):
+        with gathered.keep(), Recording(file) as recording:
+            if file in named or changes_of(recording):
+                found.append(file)
+    if not found:
+        gathered.raise_all()
+        raise RecordingError(f"there is no {what} to take back in {', '.join(map(str, places))}")
+    return found
 
 
 def filter_(
