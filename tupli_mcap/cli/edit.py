@@ -356,9 +356,10 @@ def trim(
     """Cut steps off the ends of episodes, into a new recording.
 
     10:-5 leaves out the first ten and the last five steps, :200 all steps from 200 on.
-    Episodes that are not chosen stay whole. An episode that loses its end is marked as
-    interrupted, the state after its last step becomes its final state, and its recorded
-    success is dropped. An episode that loses its beginning loses its seed. The new recording
+    Episodes that are not chosen stay whole, also those of other recordings, so all must have
+    the same spaces; to leave episodes out, filter them first. An episode that loses its end
+    is marked as interrupted, the state after its last step becomes its final state, and its
+    recorded success is dropped. An episode that loses its beginning loses its seed. The new recording
     has a new id, and no signature.
     """
     from tupli_mcap.dataset.chosen import chosen_ids
