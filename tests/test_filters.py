@@ -655,6 +655,15 @@ class TestTimes:
             with pytest.raises(FilterError, match=r"'metadata.day' holds no times: expected a text"):
                 F("metadata.day").isin([value])
 
+    def test_times_of_numpy(self) -> None:
+        key, moment = F("ended"), datetime.datetime(2026, 11, 21, 9, 30, 7, 5)
+        for unit in ("us", "ns"):
+            assert (key > np.datetime64(moment, unit)) == (key > moment)
+        day = datetime.date(2026, 11, 21)
+        assert (key == np.datetime64(day)) == (key == day)
+        assert key.isin(np.array([day, day], "M8")) == key.isin([day, day])
+        assert (key > np.datetime64("2026-11-21T09")) == (key > datetime.datetime(2026, 11, 21, 9))
+
 
 def base_row(metadata: dict[str, Any], number: float) -> dict[str, Any]:
     ret, seed = (number, None) if isinstance(number, float) else (None, number)
@@ -849,7 +858,8 @@ class TestConstruction:
             (lambda: FilterEQ(key="a", value=[1]), "can be compared with"),
             (lambda: F("a") == object(), "can be compared with"),
             (lambda: F("a") == 1j, "can be compared with"),
-            (lambda: F("a") == np.datetime64("2020-01-01"), "can be compared with"),
+            (lambda: F("a") == np.datetime64("2020-01-01"), "'a' holds no times"),
+            (lambda: F("ended") > np.datetime64("NaT"), "can be compared with"),
             (lambda: F("a") > True, "GT on 'a' orders numbers or text, found True"),
             (lambda: F("a") <= None, "LEQ on 'a' orders numbers or text, found None"),
             (lambda: F("a") < [1], "can be compared with"),

@@ -359,8 +359,8 @@ def trim(
     Episodes that are not chosen stay whole, also those of other recordings, so all must have
     the same spaces; to leave episodes out, filter them first. An episode that loses its end
     is marked as interrupted, the state after its last step becomes its final state, and its
-    recorded success is dropped. An episode that loses its beginning loses its seed. The new recording
-    has a new id, and no signature.
+    recorded success is dropped. An episode that loses its beginning loses its seed. The new
+    recording has a new id, and no signature.
     """
     from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.dataset.curate import trim_dataset

@@ -20,7 +20,7 @@ A filter is true or false for an item (nested mappings of JSON values), never un
   if it is true for one of its elements, and false for anything else.
 - **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is false.
 - **Times** (`created_at`, and an episode's `ended`, which is the same, `run.started` and `run.ended`, the `time` of a
-  step) compare as times of any zone, with dates and `datetime`s too: see `tupli_mcap.schema.times`.
+  step) compare as times of any zone, with dates, `datetime`s and `datetime64`s too: see `tupli_mcap.schema.times`.
 
 A filter without a meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
 anything but a number or a text, a field compared with a value of a kind that it never has.
@@ -47,7 +47,7 @@ from pydantic import (
 
 from tupli_mcap.errors import FilterError
 from tupli_mcap.schema.keys import join_key, split_key
-from tupli_mcap.schema.times import COMPARED_PATHS, text_of
+from tupli_mcap.schema.times import COMPARED_PATHS, date_of, text_of
 from tupli_mcap.schema.values import classify, tag_float
 
 
@@ -313,6 +313,8 @@ def _combined(cls: type[BaseFilter], type: FilterType, left: BaseFilter, right: 
 
 
 def _plain(value: Any, key: str | None) -> Any:
+    if isinstance(value, np.datetime64):
+        value = date_of(value) or value
     if isinstance(value, datetime.date):
         if key is None or split_key(key) not in COMPARED_PATHS:
             raise ValueError(

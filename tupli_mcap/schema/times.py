@@ -146,6 +146,13 @@ def text_of(value: datetime.date) -> str:
     return value.isoformat()
 
 
+def date_of(value: np.datetime64) -> datetime.date | None:
+    """The date in a `datetime64` in days, or the `datetime` (without a zone) in a finer one, to the microsecond; None
+    if there is none: NaT, or a year after 9999."""
+    found = (value if np.datetime_data(value)[0] == "D" else value.astype("datetime64[us]")).item()
+    return found if isinstance(found, datetime.date) else None
+
+
 def time_ns(text: object) -> int | None:
     """The time (ns) of an ISO 8601 text, in UTC if it has no zone; None if it is no time."""
     try:
