@@ -230,7 +230,7 @@ def _column(name: str) -> _Listed:
 
     if name.startswith(_SETTING):
         value = partial(_setting, name.removeprefix(_SETTING).split("."))
-        return _listed_by(value, Column(name), _text)
+        return _listed_by(value, Column(name.upper()), _text)
     key = LISTED_AS.get(name.lower(), name.lower())
     if key not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
