@@ -139,14 +139,15 @@ def _reads_otherwise(text: str) -> bool:
     return True
 
 
-def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH) -> str:
+def dumps_plain(value: Any, *, max_depth: int = MAX_DEPTH, name: str = "value") -> str:
     """Return JSON text for filters: NumPy scalars are numbers, arrays and tuples are lists.
 
     Values that JSON has no form for (NaN, infinities, bytes, sets, complex numbers, dates) are tagged as by `dumps`.
     Keys that are numbers, booleans or None become strings as in the standard library's `json`, unless two keys become
-    equal. `max_depth` is for text that is only printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does.
+    equal. `max_depth` is for text that is only printed: `loads` reads `MAX_DEPTH` levels. Raises as `dumps` does; its
+    TypeError calls the value by its `name`.
     """
-    return _text(_Encoder(None, plain=True, max_depth=max_depth), value)
+    return _text(_Encoder(None, plain=True, max_depth=max_depth), value, name)
 
 
 def loads(text: str | bytes) -> Any:
@@ -178,11 +179,11 @@ class _UnstorableError(TypeError):
         self.path: list[str] = []
 
 
-def _text(encoder: _Encoder, value: Any) -> str:
+def _text(encoder: _Encoder, value: Any, name: str = "value") -> str:
     try:
         tree = encoder.encode(value, 0)
     except _UnstorableError as err:
-        where = "value" + "".join(reversed(err.path))
+        where = name + "".join(reversed(err.path))
         kind = f"{err.found.__module__}.{err.found.__qualname__}"
         raise TypeError(f"{where} is a {kind}, which has no exact JSON form; convert it") from None
     return json.dumps(tree, ensure_ascii=False, allow_nan=False, separators=(",", ":"))

@@ -76,10 +76,13 @@ class Run(SaysWhatIsMeant):
             )
         try:
             plain = _plain(dict(metadata or {}))
+            jsonvalue.dumps_plain(plain, name="metadata")
         except RecursionError as err:
             raise RecordingError(
                 "metadata: expected values that JSON can hold, found some nested too deep"
             ) from err
+        except (TypeError, ValueError) as err:
+            raise RecordingError(f"metadata of the run: {err}") from err
         run = cls(name=name or "", metadata=plain, tags=tuple(tags), split=split)
         RecordedRuns([run]).to_json()
         return run
