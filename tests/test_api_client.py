@@ -157,7 +157,7 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
         done.output.split()
     )
     failed = CliRunner().invoke(app, ["info", url, "--episodes", "9"])
-    assert f"{url} has no episode '9'; see tupli-mcap episodes {url}" in failed.output
+    assert f"{url} has no episode 9; choose from 0 to 4" in failed.output
 
 
 def test_a_token_that_expires_during_a_push_is_renewed(admin: TupliAPIClient, tmp_path: Path) -> None:

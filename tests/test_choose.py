@@ -127,7 +127,7 @@ def test_a_number_out_of_range_names_the_range(file: Path) -> None:
 def test_each_number_must_exist_in_a_directory_too(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", RETURNS)
     with (
-        pytest.raises(RecordingError, match=r"has no episode '9'; see tupli-mcap episodes "),
+        pytest.raises(RecordingError, match=r"has no episode 9; choose from "),
         chosen_from(tmp_path, "3,9", None),
     ):
         pass

@@ -1069,7 +1069,9 @@ def test_keys_are_texts(tmp_path: Path) -> None:
     endless.append(endless)
     with pytest.raises(RecordingError, match="nested too deep"):
         record(tmp_path / "x.mcap", metadata={"x": endless})
-    with pytest.raises(RecordingError, match=r"^metadata of the run: metadata\['x'\]\[1\] is a builtins.object, "):
+    with pytest.raises(
+        RecordingError, match=r"^metadata of the run: metadata\['x'\]\[1\] is a builtins.object, "
+    ):
         record(tmp_path / "x.mcap", metadata={"x": [1, object()]})
     refused = CliRunner().invoke(app, ["tag", str(path), "--episodes", "all", "success=no"])
     assert refused.exit_code == 2 and "expected success=true or success=false, found 'no'" in refused.output

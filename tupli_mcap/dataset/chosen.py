@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union,
 
 import numpy as np
 
-from tupli_mcap.dataset.which import Positions, candidates, extreme, named_positions, places_of, positions_of
+from tupli_mcap.dataset.which import (
+    Positions,
+    candidates,
+    extreme,
+    named_places,
+    named_positions,
+    positions_of,
+)
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown_name
@@ -236,13 +243,7 @@ def _of_many(
     headers = source.episodes(filter)
     numbers = np.array([header.episode for header in headers])
     returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
-    named: dict[int, None] = {}
-    for item in (item.strip().lower() for item in text.split(",")):
-        places = places_of(item, text, numbers, returns)
-        if not places:
-            why = "" if filter is None else f" that matches {filter}"
-            raise RecordingError(f"{where} has no episode {item!r}{why}; see tupli-mcap episodes {where}")
-        named.update(dict.fromkeys(places))
+    named = named_places(where, numbers, returns, text, filter)
     by_recording = numbers_by_recording([headers[i] for i in named])
     if len(by_recording) > _MOST_OPEN:
         raise RecordingError(

@@ -13,7 +13,7 @@ import numpy as np
 
 from tupli_mcap.errors import FilterError, Gathered, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, format_filter
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """Words in place of an episode's number; best and worst are by return, the first of equal ones."""
@@ -76,24 +76,35 @@ def named_positions(
         RecordingError: there is no such episode, or none at all.
     """
     rows = recording.index[among]
-    places = _named(recording.name, rows["episode"], rows["return"], text, filter)
+    places = named_places(recording.name, rows["episode"], rows["return"], text, filter)
     return list(among[places].tolist())
 
 
-def _named(name: str, numbers: Any, returns: Any, text: str, filter: BaseFilter | None) -> list[int]:
-    """The places that a text names among episodes with these numbers and returns, in its order, each once."""
-    why = "" if filter is None else f" that matches {filter}"
+def named_places(
+    name: str, numbers: Any, returns: Any, text: str, filter: BaseFilter | None = None
+) -> list[int]:
+    """The places that a text names among the episodes of `name` with these numbers and returns, in its order, each
+    once. Raises as `named_positions`."""
+    why = "" if filter is None else f" that matches {_text_of(filter)}"
     if not len(numbers):
         raise RecordingError(f"{name} has no episode{why}")
     chosen: dict[int, None] = {}
     for item in (item.strip().lower() for item in text.split(",")):
-        places = places_of(item, text, numbers, returns)
+        places = _places_of(item, text, numbers, returns)
         if not places:
             raise RecordingError(
                 f"{name} has no episode {item}{why}; choose from {range_text(np.unique(numbers))}"
             )
         chosen.update(dict.fromkeys(places))
     return list(chosen)
+
+
+def _text_of(filter: BaseFilter) -> str:
+    """A filter as users write it in a text, or else as an expression."""
+    try:
+        return format_filter(filter)
+    except FilterError:
+        return str(filter)
 
 
 def numbers_in(
@@ -128,13 +139,13 @@ def numbers_in(
         with gathered.keep():
             chosen = list(range(len(files)))
             if text is not None:
-                chosen = _named(str(place), np.array(numbers), np.array(returns), text, filter)
+                chosen = named_places(str(place), np.array(numbers), np.array(returns), text, filter)
             for at in chosen:
                 found.setdefault(files[at], {})[numbers[at]] = None
     return {file: list(named) for file, named in found.items()}
 
 
-def places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
+def _places_of(item: str, text: str, numbers: Any, returns: Any) -> list[int]:
     """The places that one item of a text names, among episodes with these numbers and returns; none if there is none.
     FilterError if the item is no number, no range and no word."""
     if item not in WORDS:
