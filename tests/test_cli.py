@@ -193,6 +193,7 @@ class TestRecord:
         ]
         assert sorted(made) == made
         assert [Recording(path).n_steps for path in made] == [10, 10]
+        assert "ends in .mcap, or a directory, found new.d" in fails("record", "CartPole-v1", "-o", "new.d")
 
     def test_modes(self, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "a.mcap", "--steps", 40)

@@ -722,6 +722,25 @@ def test_a_directory_gets_a_new_file_each_time(tmp_path: Path, vector: bool) -> 
         assert len(Recording(path)) == (2 if vector else 1)
 
 
+@pytest.mark.parametrize("mode", ["x", "w", "a"])
+def test_a_new_file_of_another_suffix_is_refused(tmp_path: Path, mode: Any) -> None:
+    for name in ("f.foo", "runs.v2", "r.MCAP"):
+        with pytest.raises(
+            RecordingError, match=rf"ends in \.mcap, or a directory, found .*{name}; add \.mcap, or /"
+        ):
+            RecordEpisodes(gym.make("CartPole-v1"), tmp_path / name, mode=mode)
+    assert list(tmp_path.iterdir()) == []
+    with RecordEpisodes(gym.make("CartPole-v1"), f"{tmp_path}/runs.v2/", mode=mode) as env:
+        env.reset(seed=1)
+        env.step(0)
+    old = env.path.rename(tmp_path / "old.rec")
+    if mode == "a":
+        with RecordEpisodes(gym.make("CartPole-v1"), old, mode=mode) as env:
+            env.reset(seed=1)
+            env.step(0)
+        assert len(Recording(old)) == 2
+
+
 def test_workers_that_start_at_once_get_files_of_their_own(tmp_path: Path) -> None:
     code = (
         "import gymnasium as gym, sys, tupli_mcap\n"

@@ -49,7 +49,8 @@ class EpisodeWriter(Recorder):
     garbage collection or at the end of the interpreter ends as "interrupted", without a final state.
 
     Args:
-        path: the recording, or a directory, in which a new file is named by time. Missing directories are made.
+        path: the recording (.mcap), or a directory, in which a new file is named by run and time. Missing directories
+            are made.
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
         num_envs: None for one stream of episodes, or the number of streams in the file, like the sub-environments of a
             vector environment. Each stream runs an episode of its own; `env` in the calls selects the stream.

@@ -90,7 +90,7 @@ def write_rollout(
     a stream of episodes of its own. In lists, each entry is an episode: [T of this one, …].
 
     Args:
-        path: the recording, or a directory, in which a new file is named by `name` and time.
+        path: the recording (.mcap), or a directory, in which a new file is named by `name` and time.
         states: what the actions were chosen on. If there is one more than there are steps (T + 1), it is the state
             after the last one, unless `next_states` or `final_states` say it; if that step ended an episode and
             `autoreset` is "same-step" or "disabled", it is the first one of the next episode, and no final state.

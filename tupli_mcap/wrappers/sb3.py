@@ -49,7 +49,7 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
 
     Args:
         venv: `DummyVecEnv`, `SubprocVecEnv`, a wrapper around one, or a `VecEnv` of your own.
-        path: the recording, or a directory, in which a new file is named by environment and time.
+        path: the recording (.mcap), or a directory, in which a new file is named by run or environment, and time.
         options: those of `tupli_mcap.RecordEpisodes` and of `tupli_mcap.vector.RecordEpisodes`.
 
     Raises:

@@ -47,8 +47,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: any environment whose spaces are Gymnasium's own.
-        path: the recording, or a directory, in which a new file is named by environment and time. Missing
-            directories are made.
+        path: the recording (.mcap), or a directory, in which a new file is named by run or environment, and time.
+            Missing directories are made.
         mode: if the file exists, "x" refuses, "w" replaces it, and "a" continues it. "a" also makes a missing file.
         metadata_callback: called with every step (an RLTuple); the dict it returns at the last one is the episode's
             metadata. If it has a `reset()`, that is called before each episode. If the info of the step that ends an
@@ -99,7 +99,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     Raises:
         SpaceError: a space cannot be recorded; the message has the path of the leaf.
         MissingExtraError: the extra that `live` needs is not installed.
-        RecordingError: the file exists, is being written, or cannot be written; or it is a vector environment.
+        RecordingError: the file exists, is being written, or cannot be written; a new one does not end in .mcap; or it
+            is a vector environment.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """

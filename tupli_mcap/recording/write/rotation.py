@@ -1,7 +1,7 @@
 """A rollout in one file or several: what they are called, and when it is time for the next one.
 
 A directory gets a new file, `CartPole-v1_2026-11-23_16-55-03.mcap`; what the path lacks of directories is made. A path
-without a suffix, such as `runs`, is a directory.
+without a suffix, such as `runs`, is a directory. A new file's name ends in `.mcap`, or its directory would not show it.
 `run.mcap` is followed by `run_0001.mcap`, `run_0002.mcap`, …, an order that sorting by name keeps. Each is a recording
 of its own, with its benchmark and attachments.
 """
@@ -49,7 +49,8 @@ class Rotation:
         finished: called with each file that is left.
 
     Raises:
-        RecordingError: files of an earlier series would follow a new one.
+        RecordingError: the path is that of a new file that does not end in `.mcap`; or files of an earlier series would
+            follow it.
     """
 
     def __init__(
@@ -62,6 +63,8 @@ class Rotation:
         check_place(path)
         self._name = as_file_name(name) or "run"
         self._folder = Path(path) if _is_folder(path) else None
+        if self._folder is None and not (options.mode == "a" and os.path.lexists(path)):
+            _check_name(path)
         self._options, self._format_version = options, format_version
         self._limited, self._max_bytes, self._max_seconds = (
             options.has_limits,
@@ -187,6 +190,14 @@ def _is_folder(path: str | os.PathLike[str]) -> bool:
         return not Path(path).suffix and not os.path.lexists(path)
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
+
+
+def _check_name(path: str | os.PathLike[str]) -> None:
+    if Path(path).suffix != ".mcap":
+        raise RecordingError(
+            f"expected a name that ends in .mcap, or a directory, found {os.fspath(path)}; "
+            f"add .mcap, or {os.sep} for a directory"
+        )
 
 
 def _make_folders(path: Path) -> list[Path]:
