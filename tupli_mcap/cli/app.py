@@ -228,7 +228,8 @@ def _root(
     """Record reinforcement-learning episodes as MCAP files, look at them, share them.
 
     With --json, commands print results and errors as JSON. Exit codes: 0 (success), 1 (the
-    command failed, or found a problem), 2 (wrong usage), 130 (Ctrl-C).
+    command failed, or found a problem), 2 (wrong usage), 130 (interrupted by Ctrl-C; it is how
+    browse, serve and view --web end, with 0).
     """
     if context.invoked_subcommand is None:
         say(*context.get_help().split("\n"))
