@@ -148,6 +148,12 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     (listed,) = told("ls", "--filter", "seed > 1")
     assert (listed["run"], listed["episodes"], listed["size"], listed["error"]) == ("ppo", 3, None, None)
     assert listed["steps"] == sum(e["steps"] for e in told("episodes", "--filter", "seed > 1"))
+    for which in ("0,3-4", "best"):
+        (listed,) = told("ls", "--episodes", which)
+        steps = [e["steps"] for e in told("episodes", "--episodes", which)]
+        assert (listed["run"], listed["episodes"], listed["steps"]) == ("ppo", len(steps), sum(steps))
+    (listed,) = told("ls", "--episodes", "first", "--filter", "seed > 1")
+    assert (listed["episodes"], listed["files"]) == (1, 1)
     assert told("render", "--episodes", "0", "-o", str(tmp_path / "film.gif"))["ok"]
     for words in (["merge"], ["split", "--episodes", "1"]):
         done = CliRunner().invoke(app, [words[0], url, *words[1:], "-o", made])
