@@ -893,6 +893,36 @@ class TestCommands:
         assert not any(e.metadata for e in tupli_mcap.open(runs))
         assert CliRunner().invoke(app, ["tag", runs, "--undo"]).exit_code == 1
 
+    def test_annotating_a_dataset(self, tmp_path: Path) -> None:
+        for name, count in (("a", 1), ("deep/b", 3)):
+            record(tmp_path / f"{name}.mcap", count)
+        everything = tupli_mcap.open(tmp_path)
+        late = everything.filter("episode >= 1")
+        late.annotate(late=True, note=("a", 1))
+        expected = [{}, {}, {"late": True, "note": ["a", 1]}, {"late": True, "note": ["a", 1]}]
+        assert [header.metadata for header in tupli_mcap.open(tmp_path).headers] == expected
+        assert [header.metadata for header in late.headers] == expected[2:]
+        assert [episode.metadata for episode in late] == expected[2:]
+        everything.annotate(note=None)
+        assert [header.metadata for header in everything.filter("metadata.late = true").headers] == [
+            {"late": True}
+        ] * 2
+        assert len(Recording(tmp_path / "deep/b.mcap").annotations.said) == 2
+        late[:0].annotate(x=1)  # of no episode
+        for values in ({}, {"x": object()}):
+            with pytest.raises(RecordingError, match=r"expected episodes and values|no exact JSON form"):
+                late.annotate(**values)
+
+    def test_annotating_all_recordings_of_a_dataset_or_none(self, tmp_path: Path) -> None:
+        whole, cut = record(tmp_path / "a.mcap"), record(tmp_path / "b.mcap")
+        cut.write_bytes(cut.read_bytes()[:-300])  # not finished
+        with pytest.warns(UserWarning, match=r"b\.mcap"):
+            dataset = tupli_mcap.open(tmp_path)
+            _ = dataset.headers
+        with pytest.raises(RecordingError, match=r"b\.mcap is not finished"):
+            dataset.annotate(good=True)
+        assert not any(episode.metadata for episode in Recording(whole))
+
     def test_edit_in_a_directory(self, tmp_path: Path) -> None:
         paths = [
             record(tmp_path / "runs" / f"{name}.mcap", count) for name, count in (("a", 1), ("deep/b", 3))

@@ -27,6 +27,7 @@ from tupli_mcap.recording import (
     trim_recording,
 )
 from tupli_mcap.recording.edit import merge, split
+from tupli_mcap.recording.edit.annotate import change_all
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
@@ -303,6 +304,20 @@ def relabel(
     _check_new(dataset, target, overwrite=overwrite)
     relabel_excerpts(_excerpts(dataset), target, function, fields)
     return target
+
+
+def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
+    """See `Dataset.annotate`."""
+
+    def change(name: str, dry: bool) -> Recording:
+        recording = dataset._open(name)
+        recording.annotate(dataset._chosen[name], values, dry_run=dry)
+        return recording
+
+    changed = change_all(dataset._chosen, change, dry_run=False)
+    noted = {name: one.annotations for name, one in zip(dataset._chosen, changed, strict=True)}
+    for header in dataset.headers:
+        header.metadata = noted[header.recording].applied(header.episode, header.metadata)
 
 
 def delete(

@@ -492,6 +492,20 @@ class Dataset(RandomAccess):
         """
         return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
 
+    def annotate(self, **values: Any) -> None:
+        """Adds metadata to the episodes, in their files: `ds.filter("return > 100").annotate(success=True)`.
+
+        Values take precedence over the metadata that were recorded; None removes a key. `tupli-mcap tag PATH --undo`
+        takes them back. If one recording cannot be changed, none is. The episodes of this dataset have the values; one
+        that was listed apart from it has to be opened again.
+
+        Raises:
+            RecordingError: there are no values, JSON cannot hold one, or a recording is at a URL or on a server, is not
+                finished, or cannot be written.
+            FormatError: a recording is damaged.
+        """
+        curate.annotate(self, values)
+
     def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
         """Deletes the episodes where they are stored: `ds.filter("return < 0").delete()`; returns their number.
 

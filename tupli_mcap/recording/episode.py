@@ -184,7 +184,7 @@ class Episode(GymnasiumNames):
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episode, in its file: `annotate(success=True, note="gripper slipped")`.
 
-        Values take precedence over the metadata that were recorded; None removes a key. `annotate_episodes` does this
+        Values take precedence over the metadata that were recorded; None removes a key. `Dataset.annotate` does this
         for many episodes at once.
         """
         self._recording.annotate([self.number], values)

@@ -78,8 +78,12 @@ class Recording(DescribedRecording, DatasetVerbs):
         """The episodes of both, those of this recording first."""
         return self.dataset + other
 
-    def annotate(self, episodes: Sequence[int] | None, values: Mapping[str, Any]) -> None:
+    def annotate(
+        self, episodes: Sequence[int] | None, values: Mapping[str, Any], *, dry_run: bool = False
+    ) -> None:
         """Gives episodes (their numbers; None: all) metadata that take precedence over the recorded ones.
+
+        `dry_run` only raises the errors.
 
         Raises:
             RecordingError: the recording has no path, or another one is there now. Other errors are those of
@@ -92,7 +96,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         with Recording(self.path) as there:
             if there.uuid != self.uuid:
                 raise RecordingError(f"{self.path} is another recording now; open it again")
-        annotate_episodes(self.path, values, episodes)
+        annotate_episodes(self.path, values, episodes, dry_run=dry_run)
         with Recording(self.path) as changed:
             self.annotations = changed.annotations
 
