@@ -209,7 +209,9 @@ def test_frames_are_a_field(pictures: tupli_mcap.Dataset) -> None:
     step = mixed.transitions(fields=["frames", "states"])[3]
     assert step.frames[0, 0, 0] == step.states
     with Recording(pictures[0].recording.name) as recording:
-        np.testing.assert_array_equal(recording.read([1], "frames").frames[:, 0, 0, 0], range(10, 15))
+        np.testing.assert_array_equal(
+            recording.read("frames", episodes=[1]).frames[:, 0, 0, 0], range(10, 15)
+        )
     assert pictures.head(0).read("frames").frames.shape == (0, 0, 0, 3)
 
 

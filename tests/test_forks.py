@@ -356,7 +356,7 @@ class TestForkedChildren:
 
         def read() -> None:
             while not done.is_set():
-                recording.read([0, 1, 2])
+                recording.read(episodes=[0, 1, 2])
 
         thread = threading.Thread(target=read)
         thread.start()

@@ -84,7 +84,7 @@ class TestRecording:
         record(tmp_path / "r.mcap", [6, 6])
         with Recording(tmp_path / "r.mcap") as recording:
             for episode in recording.episodes:
-                times = recording.read([episode.number], fields=["times"]).times
+                times = recording.read(episodes=[episode.number], fields=["times"]).times
                 assert episode.start_time <= episode.frames.times[0] <= times[0]
                 assert (episode.frames.times[1:] >= times).all()
                 assert (episode.frames.times[1:-1] <= times[1:]).all()

@@ -80,7 +80,7 @@ def assert_like(path: Path, whole: Path, *, firsts: int) -> None:
         found, index = recording.index, wanted.index
         assert len(found) == len(index) >= firsts
         assert (found[FACTS] == index[FACTS]).all()
-        times = [wanted.read([i], fields=["times"]).times for i in range(len(index))]
+        times = [wanted.read(episodes=[i], fields=["times"]).times for i in range(len(index))]
         assert (found["start_time"][:firsts] == [each[0] for each in times[:firsts]]).all()
         assert (found["start_time"][firsts:] == index["start_time"][firsts:]).all()
         lasts = np.array([each[-1] for each in times])
@@ -262,7 +262,7 @@ def test_other_holes_say_nothing(tmp_path: Path, field: str) -> None:
         with Recording(way()) as recording:
             assert [episode.final_state is None for episode in recording.episodes] == [True] * 9 + [False]
             for episode in recording.episodes:
-                times = recording.read([episode.position], fields=["times"]).times
+                times = recording.read(episodes=[episode.position], fields=["times"]).times
                 assert (episode.start_time, episode.end_time) == (times[0], times[-1])
 
 

@@ -120,7 +120,7 @@ def record(
 
 def times_of(recording: Recording) -> list[list[int]]:
     """The times (ns) of the steps, by episode."""
-    return [recording.read([i], fields=["times"]).times.tolist() for i in range(len(recording))]
+    return [recording.read(episodes=[i], fields=["times"]).times.tolist() for i in range(len(recording))]
 
 
 def record_vector(path: Path, *, steps: int = 150, seed: int = 1, mode: Any = "x") -> Path:

@@ -44,7 +44,7 @@ def vector(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 @pytest.fixture(scope="module")
 def by_episode(vector: Recording) -> list[Any]:
     """The columns of each episode, read on its own."""
-    return [vector.read([i], fields=FIELDS, threads=1) for i in range(len(vector))]
+    return [vector.read(episodes=[i], fields=FIELDS, threads=1) for i in range(len(vector))]
 
 
 @settings(max_examples=40)
@@ -53,7 +53,7 @@ def test_episodes_in_any_order(vector: Recording, by_episode: list[Any], data: s
     some = st.lists(st.integers(0, len(vector) - 1), max_size=60)
     chosen = data.draw(st.one_of(some, st.just(list(range(len(vector)))), some.map(sorted)))
     fields = data.draw(st.lists(st.sampled_from(FIELDS), min_size=1, unique=True))
-    found = vector.read(chosen, fields=fields, threads=data.draw(st.integers(1, 2)))
+    found = vector.read(episodes=chosen, fields=fields, threads=data.draw(st.integers(1, 2)))
     for field in FIELDS:
         parts = [getattr(by_episode[i], field) for i in chosen]
         if field not in fields:

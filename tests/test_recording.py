@@ -57,7 +57,7 @@ def test_columns_are_the_episodes_one_after_another(path: Path, kind: str, threa
     columns = recording.read(fields=fields, threads=threads)
     assert columns.rewards.tolist() == [step[2] for step in taken]
     assert columns.episode_lengths.tolist() == [len(e) for e in recording.episodes]
-    chosen = recording.read([5, 2, 2], fields=fields, threads=threads)
+    chosen = recording.read(episodes=[5, 2, 2], fields=fields, threads=threads)
     expected = [*recording.episodes[5], *recording.episodes[2], *recording.episodes[2]]
     assert chosen.rewards.tolist() == [step.reward for step in expected]
     nested = chosen.next_states["x"] if kind in ("dict", "text") else chosen.next_states
@@ -74,7 +74,7 @@ def test_only_the_fields_asked_for(path: Path) -> None:
     with pytest.raises(RecordingError, match="expected fields from states, actions, .*, found 'reward'"):
         Recording(path).read(fields=["reward"])
     with pytest.raises(RecordingError, match="expected episodes from 0 to 8, found"):
-        Recording(path).read([9])
+        Recording(path).read(episodes=[9])
 
 
 def test_images_may_be_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,8 +132,8 @@ def test_opening_and_listing_touch_no_step_chunk(path: Path, monkeypatch: pytest
 def test_arrays_belong_to_the_caller(path: Path) -> None:
     record(path)
     recording = Recording(path)
-    recording.read([0]).states[:] = 99
-    assert (recording.read([0]).states != 99).all()
+    recording.read(episodes=[0]).states[:] = 99
+    assert (recording.read(episodes=[0]).states != 99).all()
 
 
 # ---- sources
@@ -326,15 +326,17 @@ def test_episodes_are_chosen_by_positions_or_a_mask(path: Path) -> None:
     recording = Recording(path)
     n = len(recording)
     mask = np.arange(n) % 2 == 1
-    expected = recording.read(np.flatnonzero(mask).tolist()).states
+    expected = recording.read(episodes=np.flatnonzero(mask).tolist()).states
     for chosen in (mask, mask.tolist(), np.flatnonzero(mask).astype(np.uint8), range(1, n, 2)):
-        assert np.array_equal(recording.read(chosen).states, expected)
+        assert np.array_equal(recording.read(episodes=chosen).states, expected)
     for wrong in ([1.5], 2, mask[:-1], ["1"], slice(1, 2), recording.episodes[:2], [[0, 1]]):
         with pytest.raises(RecordingError, match="expected a list of positions from 0 to"):
-            recording.read(wrong)
-    with pytest.raises(RecordingError, match="fields are given by name: fields="):
-        recording.read(["rewards"])
-    assert np.array_equal(recording.read([]).states, expected[:0])
+            recording.read(episodes=wrong)
+    for not_fields in ([0, 1], mask, np.arange(2), 1):
+        with pytest.raises(RecordingError, match="expected fields from states, actions"):
+            recording.read(not_fields)
+    assert np.array_equal(recording.read(["rewards"]).rewards, recording.dataset.read(["rewards"]).rewards)
+    assert np.array_equal(recording.read(episodes=[]).states, expected[:0])
     assert np.array_equal(recording.read(fields="states").states, recording.read().states)
 
 

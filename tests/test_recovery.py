@@ -373,7 +373,7 @@ def test_vector_recordings_are_finished_by_append(tmp_path: Path) -> None:
         env.step(env.action_space.sample())
     after = Recording(path)
     assert after.complete
-    assert np.array_equal(after.read(range(len(before.index))).states, states)
+    assert np.array_equal(after.read(episodes=range(len(before.index))).states, states)
     assert after.n_steps == before.n_steps + 2
 
 

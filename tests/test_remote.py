@@ -132,7 +132,7 @@ def test_a_dataset_of_urls(server: WebServer, large: Path) -> None:
 def test_save_copies_from_a_server(server: WebServer, large: Path, tmp_path: Path) -> None:
     tupli_mcap.open(server.url()).head(3).save(tmp_path / "few.mcap")
     few = Recording(tmp_path / "few.mcap")
-    assert np.array_equal(few.read().states, Recording(large).read([0, 1, 2]).states)
+    assert np.array_equal(few.read().states, Recording(large).read(episodes=[0, 1, 2]).states)
 
 
 def test_signatures_in_an_address_are_used_and_not_shown(server: WebServer) -> None:
@@ -175,7 +175,7 @@ def test_weak_tags_are_compared_and_not_sent(server: WebServer) -> None:
     server.tags["/r.mcap"] = 'W/"second"'
     source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
     with pytest.raises(RecordingError, match="has been changed"):
-        recording.read([3])
+        recording.read(episodes=[3])
 
 
 @pytest.mark.parametrize("status", [400, 403, 404, 405, 416, 500, 501])
@@ -325,7 +325,7 @@ def test_a_recording_that_was_cut_short_is_recovered(server: WebServer, large: P
 
 def _child(recording: Recording, answers: multiprocessing.Queue[str]) -> None:
     try:
-        recording.read([EPISODES // 2])
+        recording.read(episodes=[EPISODES // 2])
         answers.put("read")
     except RecordingError as err:
         answers.put(str(err))
@@ -333,7 +333,7 @@ def _child(recording: Recording, answers: multiprocessing.Queue[str]) -> None:
 
 def test_a_forked_process_says_what_to_do_and_does_not_hang(server: WebServer) -> None:
     recording = Recording(server.url())
-    recording.read([0])
+    recording.read(episodes=[0])
     context = multiprocessing.get_context("fork")
     answers = context.Queue()
     with warnings.catch_warnings():
@@ -546,7 +546,7 @@ _READS = """
 import sys, tupli_mcap
 with tupli_mcap.Recording(sys.argv[1]) as recording:
     for part in sys.argv[2:]:
-        print(recording.read(None if part == "all" else [int(part)], fields=["states"]).states.sum())
+        print(recording.read(["states"], episodes=None if part == "all" else [int(part)]).states.sum())
 """
 
 

@@ -138,7 +138,7 @@ class TestOutput:
             for a, b in zip(old.episodes, new.episodes, strict=True):
                 np.testing.assert_array_equal(a.states, b.states)
                 assert (a.seed, a.infos, a.end, a.start_time) == (b.seed, b.infos, b.end, b.start_time)
-            times = old.read([1], fields=["times"]).times
+            times = old.read(episodes=[1], fields=["times"]).times
             assert new.episodes[1].frames.times.tolist() == [old.episodes[1].start_time, *times]
 
     def test_frames_that_are_there_stay_or_are_replaced(self, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def naive(paths: list[Path]) -> list[list[dict[str, Any]]]:
     for path in paths:
         with Recording(path) as recording:
             for i in range(len(recording)):
-                columns = recording.read([i], fields=FIELDS)
+                columns = recording.read(episodes=[i], fields=FIELDS)
                 rows = range(len(columns))
                 found.append([{name: at(getattr(columns, name), row) for name in FIELDS} for row in rows])
     return found

@@ -198,7 +198,7 @@ def test_many_files_keep_few_open(tmp_path: Path) -> None:
     rows = np.random.default_rng(0).permutation(len(steps))
     found = steps.read(["states"], rows)["states"]
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 64 + 4
-    (one,) = (Recording(source).read([1, 3], fields=["states"]).states,)
+    (one,) = (Recording(source).read(episodes=[1, 3], fields=["states"]).states,)
     assert np.array_equal(found, np.tile(one, (200, 1))[rows])
 
 
@@ -462,7 +462,7 @@ def test_seconds_that_recordings_say_and_times_recorded(tmp_path: Path) -> None:
 def test_a_recording_that_is_open_stays_open(library: list[Path]) -> None:
     with Recording(library[0]) as recording, library[0].open("rb") as file:
         steps = steps_of(recording)
-        assert len(recording.read([1])) == 6
+        assert len(recording.read(episodes=[1])) == 6
         check(steps, library[:1])
         of_file = steps_of(Recording(file))
         check(of_file, library[:1])

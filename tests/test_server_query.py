@@ -206,7 +206,7 @@ def test_few_short_episodes_of_a_server_move_few_bytes(
     path = short_episodes(tmp_path / "a.mcap", 4000, 0)
     users.ann.push(path)
     best = list(range(7, 4000, 100))
-    expected = Recording(path).read(best)
+    expected = Recording(path).read(episodes=best)
     sent.clear()
     dataset = TupliDataset(users.ann).with_episode_filter(F("metadata.best") == True)  # noqa: E712
     dataset.load()

@@ -419,11 +419,11 @@ def test_everything_reads_as_if_it_was_stored_whole(
         assert one.layout.stacks == named("state", placed) and not other.layout.stacks
         assert same(one.read(threads=2).states, other.read().states)
         assert same(
-            one.read([3, 1], fields=["next_states"]).next_states,
-            other.read([3, 1], fields=["next_states"]).next_states,
+            one.read(episodes=[3, 1], fields=["next_states"]).next_states,
+            other.read(episodes=[3, 1], fields=["next_states"]).next_states,
         )
         shuffled = [4, 2, 0, 3, 1]
-        assert same(one.read(shuffled).states, other.read(shuffled).states)
+        assert same(one.read(episodes=shuffled).states, other.read(episodes=shuffled).states)
         assert same(one.final_states([2, 0]), other.final_states([2, 0]))
         for mine, theirs in zip(one.episodes, other.episodes, strict=True):
             assert same(mine.states, theirs.states)

@@ -63,8 +63,10 @@ def test_what_stays_is_what_it_was(name: str, tmp_path: Path) -> None:
         assert same(new.final_state, old.final_state if whole_end else old[stop].state)
         assert new.end == (old.end if whole_end else "interrupted")
         assert new.seed == (old.seed if start == 0 else None)
-        times = before.read([old.position], fields=["times"]).times
-        np.testing.assert_array_equal(after.read([new.position], fields=["times"]).times, times[start:stop])
+        times = before.read(episodes=[old.position], fields=["times"]).times
+        np.testing.assert_array_equal(
+            after.read(episodes=[new.position], fields=["times"]).times, times[start:stop]
+        )
         assert new.start_time == (old.start_time if start == 0 else times[start - 1])
         assert new.metadata == old.metadata
         frames = [(s - start, i) for i, s in enumerate(old.frames.steps.tolist()) if start <= s <= stop]

@@ -148,7 +148,7 @@ def main() -> None:
                 raise SystemExit("what came is not what is in the file")
             forget()
             episode = len(recording) // 2
-            cost("one episode", lambda: recording.read([episode]))
+            cost("one episode", lambda: recording.read(episodes=[episode]))
             row = local.index[episode]
             spans = local.file.store.spans(local.file.steps[0], int(row["first_row"]), int(row["length"]))
             print(f"{'':28} its chunks have {int(table['length'][[s.chunk for s in spans]].sum()):,} B")
@@ -156,7 +156,7 @@ def main() -> None:
                 forget()
                 count = max(1, len(recording) // 100)
                 some = np.sort(np.random.default_rng(seed).choice(len(recording), count, replace=False))
-                cost(f"{count} random episodes", lambda some=some: recording.read(some))
+                cost(f"{count} random episodes", lambda some=some: recording.read(episodes=some))
             drawn = ratios[-chosen.draws :]
             print(f"{'':28} median {statistics.median(drawn):.2f}, worst {max(drawn):.2f}")
             forget()

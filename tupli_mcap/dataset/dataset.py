@@ -320,7 +320,7 @@ class Dataset(RandomAccess):
             return found
         wanted = field_names(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
-            return example.read([], wanted)
+            return example.read(wanted, episodes=[])
         return Columns(self.lengths, **read_in_order(self._source, self.headers, wanted))
 
     @property

@@ -133,7 +133,7 @@ def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array
     if len(positions) == 1 and lengths[0] > most:
         columns = recording.read_steps(int(positions[0]), 0, most, fields, images=False)
     else:
-        columns = recording.read(positions, fields, images=False)
+        columns = recording.read(fields, episodes=positions, images=False)
     found = {leaf.name: column for _, leaf, column in numbers_of(layout, columns)}
     return found, len(columns), len(positions)
 

@@ -92,7 +92,7 @@ def blocks(
     for some in whole_episodes(lengths, limit):
         length = int(lengths[some].sum())
         if length <= limit:
-            columns = recording.read(positions[some], fields=_FIELDS, images=images)
+            columns = recording.read(episodes=positions[some], fields=_FIELDS, images=images)
             yield _block(recording, positions[some], columns, 0, True, finals)
             continue
         for first in range(0, length, limit):  # a single one

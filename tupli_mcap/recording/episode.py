@@ -223,7 +223,7 @@ class Episode(GymnasiumNames):
 
     @cached_property
     def _columns(self) -> Any:
-        return self._recording.read([self._position])
+        return self._recording.read(episodes=[self._position])
 
     @property
     def states(self) -> Any:
@@ -267,12 +267,12 @@ class Episode(GymnasiumNames):
     @cached_property
     def times(self) -> Any:
         """Wall clock when each step returned: int64 (steps,), ns."""
-        return self._recording.read([self._position], fields=["times"]).times
+        return self._recording.read(episodes=[self._position], fields=["times"]).times
 
     @cached_property
     def next_states(self) -> Any:
         """The state after each step, as `states`; after the last step, the final state, or its own state if unknown."""
-        return self._recording.read([self._position], fields=["next_states"]).next_states
+        return self._recording.read(episodes=[self._position], fields=["next_states"]).next_states
 
     @cached_property
     def final_state(self) -> Any:

@@ -186,7 +186,7 @@ class Recording(DescribedRecording, DatasetVerbs):
                 f"{self.name}: the final state of episode {unknown[0]} is not known; leave it out"
             )
         if not len(rows):
-            return self.read([], fields=["states"]).states
+            return self.read(["states"], episodes=[]).states
         columns = self._reader.final_columns(self._channel(FINAL_STATE), rows)
         return self.layout.nest_state(columns)
 
@@ -242,18 +242,18 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def read(
         self,
-        episodes: Sequence[int] | Array | None = None,
-        fields: Sequence[str] | None = None,
-        threads: int | None = None,
+        fields: Sequence[str] = FIVE,
         *,
+        episodes: Sequence[int] | Array | None = None,
+        threads: int | None = None,
         images: bool = True,
     ) -> Columns:
         """Columns of the given episodes (all by default), one after another in the order given.
 
         Args:
-            episodes: positions in `self.episodes`, or a bool for each of them.
             fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times", "infos" and
                 "frames"; the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
+            episodes: positions in `self.episodes`, or a bool for each of them.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
             images: False leaves the columns of image leaves empty and reads no image; not possible for `next_states`.
 
@@ -263,7 +263,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             RecordingError: an episode or a field does not exist.
             FormatError: a chunk is damaged.
         """
-        fields = FIVE if fields is None else field_names(fields)
+        fields = field_names(fields)
         if not images and "next_states" in fields:
             raise RecordingError("expected images=True for next_states, found False; read states instead")
         positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
@@ -315,10 +315,9 @@ class Recording(DescribedRecording, DatasetVerbs):
         if chosen.dtype.kind == "b" and chosen.shape == (n,):
             return np.flatnonzero(chosen)
         if chosen.ndim != 1 or (len(chosen) and chosen.dtype.kind not in "iu"):
-            hint = "; fields are given by name: fields=…" if chosen.dtype.kind == "U" else ""
             raise RecordingError(
                 f"{self.name}: expected a list of positions from 0 to {n - 1}, or a mask of {n} bools, "
-                f"found {episodes!r:.100}{hint}"
+                f"found {episodes!r:.100}"
             )
         if len(chosen) and (chosen.min() < 0 or chosen.max() >= n):
             raise RecordingError(f"{self.name}: expected episodes from 0 to {n - 1}, found {episodes!r:.100}")

@@ -57,7 +57,7 @@ def recorded_values(recording: Recording, positions: Sequence[int]) -> Iterator[
 
 
 def _together(recording: Recording, positions: Sequence[int]) -> Iterator[RecordedValues]:
-    layout, columns, start = recording.layout, recording.read(list(positions)), 0
+    layout, columns, start = recording.layout, recording.read(episodes=list(positions)), 0
     for position, length in zip(positions, columns.episode_lengths.tolist(), strict=True):
         part = slice(start, start + length)
         own = Columns(

@@ -268,7 +268,7 @@ class _Renderer(Certifier):
         if plan.number not in self._chosen:
             return lambda step: None
         number, length = plan.number, int(self._recording.index["length"][plan.position])
-        times = self._recording.read([plan.position], fields=["times"]).times.tolist()
+        times = self._recording.read(episodes=[plan.position], fields=["times"]).times.tolist()
         self._frames.begin(number, [int(self._recording.index["start_time"][plan.position]), *times])
 
         def watch(step: int) -> None:

@@ -179,7 +179,7 @@ def _read_block(
     recorded = [field for field in fields if field != "steps"]
     # None for all episodes is cheaper than a list of them: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
-    found = recording.read(None if everything else positions, fields=recorded)
+    found = recording.read(recorded, episodes=None if everything else positions)
     columns = {field: getattr(found, field) for field in recorded}
     now = found.episode_lengths
     if "steps" in fields:

@@ -172,7 +172,7 @@ def _rewards(recording: Recording, positions: Array) -> tuple[Any, str]:
     leaf = recording.layout.reward[0]
     if leaf.size != 1 or leaf.kind == "variable":
         return None, ""
-    return np.asarray(leaf.get(recording.read(positions, ["rewards"]).rewards)).reshape(-1), "reward"
+    return np.asarray(leaf.get(recording.read(["rewards"], episodes=positions).rewards)).reshape(-1), "reward"
 
 
 def _first_state(recording: Recording, positions: Array) -> tuple[Any, str]:
@@ -181,5 +181,5 @@ def _first_state(recording: Recording, positions: Array) -> tuple[Any, str]:
     )
     if leaf is None:
         return None, ""
-    column = leaf.get(recording.read(positions, ["states"], images=False).states)
+    column = leaf.get(recording.read(["states"], episodes=positions, images=False).states)
     return np.asarray(column).reshape(len(column), -1)[:, 0], element_names(leaf, recording.labels, [0])[0]

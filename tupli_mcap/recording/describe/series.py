@@ -149,7 +149,7 @@ def _pieces(recording: Recording, positions: Array) -> Iterator[Columns]:
     constant = recording.layout.constant
     most = READ_BYTES // step_bytes(recording.layout, images=False)
     if total <= most and constant:
-        yield recording.read(positions, fields=_FIELDS, images=False)
+        yield recording.read(episodes=positions, fields=_FIELDS, images=False)
         return
     places, each = (_PLACES, _AT_EACH) if constant else (_VARIABLE_PLACES, _VARIABLE_AT_EACH)
     each = max(1, min(each, most // places))
