@@ -539,7 +539,7 @@ class TestLook:
             "ls", "runs", "-e", "0-3", "--filter", f"return < {np.min(returns) + 0.5}", "--json"
         ).json
         assert told["return"] == np.min(returns)
-        assert "no episode '9'" in fails("ls", "runs", "--episodes", "9")
+        assert "no episode 9; choose from 0 to 3" in fails("ls", "runs", "--episodes", "9")
 
     def test_ls_counts_no_episode_of_a_run_twice(self, here: Path) -> None:
         record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)

@@ -727,7 +727,7 @@ class TestCommands:
             "run,run.metadata.lr,run.metadata.x",
         ).splitlines()
         assert [line.split() for line in lines] == [
-            ["RUN", "run.metadata.lr", "run.metadata.x"], ["run-0", "1.0"], ["run-1", "0.1"], ["run-2", "0.01"],
+            ["RUN", "RUN.METADATA.LR", "RUN.METADATA.X"], ["run-0", "1.0"], ["run-1", "0.1"], ["run-2", "0.01"],
         ]  # fmt: skip
         found = json.loads(command("ls", str(tmp_path), "--columns", "run.metadata.lr,Run", "--json"))[
             "result"
