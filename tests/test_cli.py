@@ -628,7 +628,9 @@ class TestLook:
         assert facts["benchmark"] == "none"
         assert facts["action"] == "one of 2: 0 Push cart to the left, 1 Push cart to the right"
         assert facts["observation"] == "4 numbers (float32)"
-        assert re.search(r"^ +Cart Position +-4\.8 … 4\.8\n +Cart Velocity +-inf … inf$", out, re.MULTILINE)
+        assert re.search(
+            r"^ +state\.Cart Position +-4\.8 … 4\.8\n +state\.Cart Velocity +-inf … inf$", out, re.MULTILINE
+        )
         assert re.search(r"compressed \d+\.\d : 1", facts["size"])
         assert "/step           tupli_mcap/msg/Step" in out
         assert "benchmark.json" in out
@@ -919,7 +921,7 @@ class TestLook:
         with pytest.warns(UserWarning, match="float64"), RecordEpisodes(env, "r.mcap") as recorder:
             recorder.reset()
             recorder.step(0)
-        assert "observation  q: 7 numbers (float64, declared float32)\n" in ok("info", "r.mcap")
+        assert "observation  state.q: 7 numbers (float64, declared float32)\n" in ok("info", "r.mcap")
 
     def test_info_of_texts_counts_their_characters(self, here: Path) -> None:
         space = gym.spaces.Dict({"say": gym.spaces.Text(20), "bit": gym.spaces.Text(1, charset="01")})
@@ -927,8 +929,8 @@ class TestLook:
         episode = EpisodeData(states, [0], [1.0], [True], [False])
         write_recording("r.mcap", [episode], observation_space=space, action_space=gym.spaces.Discrete(2))
         out = ok("info", "r.mcap")
-        assert "observation  bit: Text(1..1, 2 characters)\n" in out
-        assert "             say: Text(1..20, 62 characters)\n" in out
+        assert "observation  state.bit: Text(1..1, 2 characters)\n" in out
+        assert "             state.say: Text(1..20, 62 characters)\n" in out
 
     def test_episodes_of_a_file(self, cartpole: Path, here: Path) -> None:
         header, *rows = ok("episodes", cartpole).splitlines()

@@ -173,10 +173,10 @@ def test_not_finite(tmp_path: Path, check: str, value: float, words: str, dtype:
     space = spaces.Dict({"arm": spaces.Box(-np.inf, np.inf, (2, 3), dtype)})
     diagnosis = examine(scripted(tmp_path / "a.mcap", observe, space))
     finding = found(diagnosis, check)
-    assert (finding.severity, finding.leaf, finding.dimensions) == (ERROR, "state['arm']", ((1, 2),))
+    assert (finding.severity, finding.leaf, finding.dimensions) == (ERROR, "state.arm", ((1, 2),))
     assert (finding.count, finding.total) == (6, 3 * 11 * 6)
     assert places(finding) == [(0, 4), (1, 4), (2, 4), (0, 10), (1, 10)]
-    assert f"6 of 198 values are {words} in dimension (1, 2)" == finding.message
+    assert f"6 of 198 values are {words} in state.arm[1,2]" == finding.message
     assert diagnosis.worst is ERROR and not diagnosis.healthy
     assert {other.check for other in diagnosis.at_least(WARNING)} == {check, "duplicate-episodes"}
 
@@ -204,7 +204,7 @@ def test_not_finite_in_values_of_variable_size(tmp_path: Path) -> None:
         return {"points": (point,) * (n % 3)}
 
     finding = found(examine(scripted(tmp_path / "a.mcap", observe, space)), "nan")
-    assert (finding.leaf, finding.count, finding.total) == ("state['points']", 3, 33)
+    assert (finding.leaf, finding.count, finding.total) == ("state.points", 3, 33)
     assert places(finding) == [(0, 2), (1, 2), (2, 2)]
 
 
@@ -274,7 +274,7 @@ def test_constant_dimensions(tmp_path: Path) -> None:
     path = scripted(tmp_path / "a.mcap", observe, episodes=10)
     finding = found(examine(path), "constant-dimension")
     assert (finding.severity, finding.leaf, finding.dimensions) == (WARNING, "state", ((0,),))
-    assert finding.message == "dimension 0 is always 0.5 in 110 values"
+    assert finding.message == "state[0] is always 0.5 in 110 values"
     assert examine(path, thresholds={"constant-dimension": {"min_steps": 101}}).of("constant-dimension") == ()
     assert examine(scripted(tmp_path / "b.mcap", episodes=10)).of("constant-dimension") == ()
 
@@ -303,7 +303,9 @@ def test_constant_integers_among_others_are_no_warning(tmp_path: Path) -> None:
     path = scripted(tmp_path / "a.mcap", lambda n: np.uint8([n, 7, 7, 7, 7, 7, 7, n]), space, episodes=10)
     finding = found(examine(path), "constant-dimension")
     assert (finding.severity, finding.count, finding.total) == (INFO, 6, 8)
-    assert finding.message == "6 of 8 dimensions (1, 2, 3, 4, ...) never change in 110 values"
+    assert finding.message == (
+        "6 of 8 dimensions (state[1], state[2], state[3], state[4], ...) never change in 110 values"
+    )
 
 
 def test_a_dimension_of_one_value_is_as_declared(tmp_path: Path) -> None:
@@ -853,7 +855,7 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert out.startswith(
         "error    nan · state\n"
         "         a.mcap:\n"
-        "         3 of 99 values are NaN in dimension 2\n"
+        "         3 of 99 values are NaN in state[2]\n"
         "         at episode:step 0:4, 1:4, 2:4\n"
         "         also in b.mcap\n"
         "         → drop these episodes, and find the division or sensor that made NaN\n\n"
@@ -871,7 +873,7 @@ def test_command_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         "check": "nan",
         "severity": "error",
         "path": "a.mcap",
-        "message": "3 of 99 values are NaN in dimension 2",
+        "message": "3 of 99 values are NaN in state[2]",
         "suggestion": "drop these episodes, and find the division or sensor that made NaN",
         "leaf": "state",
         "dimensions": [[2]],

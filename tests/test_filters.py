@@ -908,9 +908,21 @@ class TestConstruction:
             catalog.episodes(misspelt)
 
     @given(st.lists(st.text(max_size=4).filter(lambda text: text.isprintable()), min_size=1, max_size=3))
-    @example(["", ".", '"', "a.b", '"a"'])
+    @example(["", ".", '"', "a.b", '"a"', "a[0]", "a[0,1]", "[0]", "a[b]", "\ud800", "a\x1b[2J"])
     def test_keys_round_trip(self, segments: list[str]) -> None:
         assert split_key(join_key(segments)) == tuple(segments)
+        assert join_key(segments).isprintable()
+
+    def test_indexes_are_in_brackets(self) -> None:
+        name = 'state.arm."a.b"[3][1,2]'
+        assert join_key(["state", "arm", "a.b", 3, (1, 2)]) == name
+        assert split_key(name) == ("state", "arm", "a.b", "3", "1", "2")
+        parsed = parse_filter("state.arm[0].q[1, 2] > 1 and x in[1] and not action[0]")
+        assert parsed == parse_filter("state.arm.0.q.1.2 > 1 and x in [1] and not action.0")
+        assert format_filter(parsed) == "state.arm[0].q[1, 2] > 1 and x in [1] and not action[0] == true"
+        assert split_key("metadata.loss[a].w[0]x") == ("metadata", "loss[a]", "w[0]x")
+        with pytest.raises(FilterError, match="needs a name at character 6"):
+            split_key("state.[0]")
 
 
 def nested(depth: int) -> BaseFilter:
@@ -1025,6 +1037,7 @@ class TestColumns:
             (~(F("reward") > 0), [0, 0, 1, 1]),
             (F("terminal") == True, [0, 0, 0, 1]),  # noqa: E712
             (F("terminal") == 1, [0, 0, 0, 0]),
+            (F("state.pos[0]") < 2.5, [1, 1, 0, 0]),
             (F("state.pos.0") < 2.5, [1, 1, 0, 0]),
             (F("state.pos.1") >= 3, [0, 1, 1, 1]),
             (F("state.tag") == "x", [1, 0, 0, 1]),
@@ -1032,7 +1045,7 @@ class TestColumns:
             (F("action.0") > 300, [0, 0, 0, 0]),
             (F("action.0") >= -1, [1, 1, 1, 1]),
             (F("action.1.k") != 2, [1, 0, 1, 1]),
-            (F("action.1.k.1") == 6, [0, 0, 1, 0]),
+            (F("action[1].k[1]") == 6, [0, 0, 1, 0]),
             ((F("reward") > 0) & (F("action.0") > 0), [0, 1, 0, 0]),
             ((F("reward") < 0) | (F("action.0") == 0), [1, 0, 0, 1]),
             (FilterAND(filters=[]), [1, 1, 1, 1]),
@@ -1049,13 +1062,23 @@ class TestColumns:
     @pytest.mark.parametrize(
         ("filter", "message"),
         [
-            (F("rewards") > 0, "unknown key 'rewards': a step has reward, terminal, state, action"),
-            (F("state.vel") > 0, "unknown key 'state.vel': state has pos, tag"),
-            (F("state") > 0, "'state' names several values of a step"),
-            (F("state.pos") > 0, r"needs 1 positions for values of shape \(2,\), found 0"),
-            (F("state.pos.2") > 0, "needs a position from 0 to 1, found '2'"),
+            (
+                F("rewards") > 0,
+                r"'rewards' \(did you mean 'reward'\?\): a step has reward, terminal, state, action",
+            ),
+            (
+                F("state.vel") > 0,
+                r"unknown key 'state.vel' \(did you mean 'state.tag'\?\): state has pos, tag",
+            ),
+            (F("state.poss.1") > 0, r"unknown key 'state.poss.1' \(did you mean 'state.pos\[0\]'\?\)"),
+            (
+                F("state") > 0,
+                r"'state' names several values of a step; name one of them: state.pos\[0\], state.tag",
+            ),
+            (F("state.pos") > 0, r"values of shape \(2,\) have state.pos\[0\] to state.pos\[1\]"),
+            (F("state.pos[2]") > 0, r"'state.pos\[2\]' names no number: .* state.pos\[0\] to state.pos\[1\]"),
             (F("action.2") > 0, "action has 0, 1"),
-            (F("reward.0") > 0, r"needs 0 positions for values of shape \(\), found 1"),
+            (F("reward.0") > 0, r"'reward.0' names no number: values of shape \(\) have reward$"),
         ],
     )
     def test_errors_say_what_there_is(self, filter: BaseFilter, message: str) -> None:

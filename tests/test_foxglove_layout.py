@@ -90,15 +90,15 @@ def test_the_layout_names_what_is_there(space: gym.Space[Any], vector: bool, tmp
 def test_what_has_no_number_in_a_message_is_not_plotted(tmp_path: Path) -> None:
     with Recording(record(tmp_path / "r.mcap", SPACE)) as recording:
         panels = foxglove_layout(recording)["configById"]
-    assert "Plot!state['half']" not in panels  # stored as bits
-    assert "Plot!action['cam']" not in panels  # too wide
-    assert "Plot!state['on']" in panels
+    assert "Plot!state.half" not in panels  # stored as bits
+    assert "Plot!action.cam" not in panels  # too wide
+    assert "Plot!state.on" in panels
 
 
 def test_keys_that_utf_8_lacks(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap", spaces.Dict({"\ud800": spaces.Box(-1, 1, ())}))
     layout = json.loads(write_layout(source, tmp_path / "layout.json").read_text(encoding="utf-8"))
-    (path,) = layout["configById"]["Plot!state['\\ud800']"]["paths"]
+    (path,) = layout["configById"]['Plot!state."\\ud800"']["paths"]
     assert (path["value"], path["label"]) == ("/step.state", "?")
 
 

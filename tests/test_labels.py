@@ -66,7 +66,8 @@ def test_gymnasium_documents_its_environments(
 ) -> None:
     labels = record(gym.make(name), tmp_path / "r.mcap").labels
     assert labels == Labels(dimensions, values, pytest.approx(seconds))
-    Draft202012Validator(SCHEMA).validate(json.loads(labels.to_json()))
+    stored = Recording(tmp_path / "r.mcap").read_attachment(LABELS_NAME)
+    Draft202012Validator(SCHEMA).validate(json.loads(stored))
 
 
 def test_a_wrapper_may_change_what_a_dimension_is() -> None:
@@ -159,18 +160,21 @@ def test_what_an_environment_says_of_its_actions_counts_more(tmp_path: Path) -> 
 def test_names_may_be_chosen(joints: str, held: str, action: str, tmp_path: Path) -> None:
     given = {joints: ["shoulder", "elbow"], held: ["a", "b", "c"], action: ["x", "y"]}
     labels = record(Arm(), tmp_path / "r.mcap", labels=given).labels
-    assert labels.dimensions == {"state['joints']": ("shoulder", "elbow")}
-    assert labels.values == {"state['held']": ("a", "b", "c"), "action": ("x", "y")}
+    assert labels.dimensions == {"state.joints": ("shoulder", "elbow")}
+    stored = json.loads(Recording(tmp_path / "r.mcap").read_attachment(LABELS_NAME))
+    assert stored["dimensions"] == {"state['joints']": ["shoulder", "elbow"]}  # the format's spelling
+    assert labels.values == {"state.held": ("a", "b", "c"), "action": ("x", "y")}
 
 
 @pytest.mark.parametrize(
     ("given", "match"),
     [
         ({"action": ["a", "b"], "actions": ["a", "b"]}, "expected names for action once"),
-        ({"elbows": ["a", "b"]}, r"labels: expected one of \[.*state\['joints'\].*found 'elbows'"),
-        ({"state['joints']": ["a"]}, r"labels: expected 2 names for state\['joints'\] .* found 1"),
-        ({"state['held']": ["a", "b"]}, r"expected 1 or 3 names for state\['held'\]"),
-        ({"state['words']": ["a"]}, r"expected no names for state\['words'\]"),
+        ({"elbows": ["a", "b"]}, r"labels: expected one of \[.*state\.joints.*found 'elbows'"),
+        ({"state.joint": ["a", "b"]}, r"found 'state.joint' \(did you mean 'state.joints'\?\)"),
+        ({"state['joints']": ["a"]}, r"labels: expected 2 names for state\.joints .* found 1"),
+        ({"state['held']": ["a", "b"]}, r"expected 1 or 3 names for state\.held"),
+        ({"state['words']": ["a"]}, r"expected no names for state\.words"),
         ({"action": ["left", ""]}, "expected names of 1 to 200 characters for action"),
         ({"action": ["left", "ri\nght"]}, "expected names of 1 to 200 characters for action"),
     ],
@@ -278,7 +282,7 @@ def test_a_table_has_a_column_for_each_dimension(tmp_path: Path) -> None:
     ]  # fmt: skip
     dotted = spaces.Dict({"arm.x": spaces.Box(-1, 1, ()), "arm": spaces.Dict({"x": spaces.Box(-1, 1, ())})})
     assert columns(dotted, spaces.Dict({"action": spaces.Discrete(2)}), {}) == [
-        "state.arm.x", "state.arm.x (1)", "action.action"
+        "state.arm.x", 'state."arm.x"', "action.action"
     ]  # fmt: skip
     pair = spaces.Tuple([spaces.Discrete(2), spaces.Box(-1, 1, (1,))])
     assert columns(pair, spaces.Discrete(2), {"state[1]": ["x"]}) == ["state[0]", "state[1]: x", "action"]

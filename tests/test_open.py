@@ -376,7 +376,8 @@ def test_columns_are_found_by_name_as_in_a_dict(dataset: Dataset) -> None:
     assert "observations" in columns and "actions" not in columns
     with pytest.raises(TypeError, match="not iterable"):
         list(columns)
-    for name in ("actions", "state"):
+    assert columns["state"] is columns["observation"] is columns.states
+    for name in ("actions", "sates"):
         with pytest.raises(KeyError, match=f"expected one of .*states, rewards, found '{name}'"):
             columns[name]
 
@@ -415,8 +416,9 @@ def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
     states = dataset.read(["states"]).states.astype(np.float64)
     found = dataset.stats()
     assert len(repr(found)) < 800
-    assert set(found) == {"states", "actions", "rewards"}
-    state = found["states"]
+    assert set(found) == {"state", "action", "reward"}
+    state = found["state"]
+    assert found["states"] is found["observations"] is state and "observation" in found
     assert state.count.tolist() == [len(states)] * 4
     np.testing.assert_allclose(state.mean, states.mean(axis=0), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(state.std, states.std(axis=0), rtol=1e-6)
@@ -678,7 +680,7 @@ def test_an_episode_is_the_same_however_it_was_opened(dataset: Dataset, runs: Pa
 
 def test_statistics_of_what_follows_have_a_name_of_their_own(dataset: Dataset) -> None:
     found = dataset.stats(["states", "next_states"])
-    assert set(found) == {"states", "next_states"}
+    assert set(found) == {"state", "next_state"}
     next_states = dataset.read(["next_states"]).next_states
     np.testing.assert_allclose(
         found["next_states"].mean, next_states.mean(axis=0, dtype=np.float64), rtol=1e-6
@@ -732,8 +734,10 @@ def test_images_and_large_arrays_come_to_arrow(tmp_path: Path) -> None:
     assert np.array_equal(np.stack(list(frame["state.depth"])), dataset.read().states["depth"])
     assert frame["state.depth"][0].shape == (16, 32, 1)
     found = dataset.stats()
-    assert set(found) == {"states['depth']", "states['x']", "actions", "rewards"}
-    assert found["observations['x']"] is found["states['x']"]
+    assert set(found) == {"state.depth", "state.x", "action", "reward"}
+    assert found["observations.x"] is found["states.x"] is found["state.x"]
+    with pytest.raises(KeyError, match=r"found 'state.dept' \(did you mean 'state.depth'\?\)"):
+        found["state.dept"]
 
 
 def test_columns_without_a_common_type_come_to_arrow_as_json(tmp_path: Path) -> None:

@@ -226,11 +226,11 @@ class TestEpisodes:
             episode = recording.episodes[1]
             facts = told(web, f"/episode/{episode.id}", step=7)
             assert facts["reset"]["seed"] == 1
-            assert facts["cameras"] == [{"name": "wrist", "steps": list(range(20))}]
-            assert facts["step"]["state"]["joints[0]"] == f"{episode.states['joints'][7, 0]:.5g}"
-            assert facts["step"]["state"]["open the drawer"] == "open the drawer"
+            assert facts["cameras"] == [{"name": "state.wrist", "steps": list(range(20))}]
+            assert facts["step"]["state"]["state.joints[0]"] == f"{episode.states['joints'][7, 0]:.5g}"
+            assert facts["step"]["state"]["state.open the drawer"] == "open the drawer"
             assert facts["step"]["action"]["action"] == "open the drawer (1)"
-            assert facts["step"]["info"] == {"force": "3.5", "said": "open the drawer"}
+            assert facts["step"]["info"] == {"info.force": "3.5", "info.said": "open the drawer"}
             assert facts["step"]["reward"] == {"reward": "0.7", "return so far": "2.8"}
 
     def test_values_of_a_step(self, web: httpx.Client) -> None:
@@ -367,7 +367,7 @@ class TestChosen:
 
     def test_lines_beside_rows(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         sparks = web.get("/sparks", params={"episode": [e["id"] for e in best]}).json()
-        assert sparks["name"] == "Cart Position"  # the rewards are always the same
+        assert sparks["name"] == "state.Cart Position"  # the rewards are always the same
         assert set(sparks["lines"]) == {e["id"] for e in best}
         assert all(re.fullmatch(r"[ML0-9. -]+", line) for line in sparks["lines"].values())
 

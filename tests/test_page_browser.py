@@ -222,7 +222,7 @@ class TestPlayer:
         with opened(chromium, lab) as (page, seen):
             page.goto(f"/episode/{told[0]['id']}")
             slider, picture = page.get_by_label("Step", exact=True), page.locator(".films img")
-            value = page.locator("output[data-name='joints[0]']")
+            value = page.locator("output[data-name='state.joints[0]']")
             expect(value).to_have_text("0")
             slider.focus()
             for _ in range(4):

@@ -115,7 +115,9 @@ def test_values_are_those_of_the_whole_data(
     assert (reward.mean[0], reward.std[0], reward.values.shape) == (1.0, 0.0, (1, 400))
     assert found.read_steps == found.steps == 400
     assert found.notes() == []
-    assert state.names == ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
+    assert state.names == tuple(
+        f"state.{name}" for name in ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
+    )
 
 
 def test_nan_and_infinities_are_counted_and_left_out(tmp_path: Path) -> None:
@@ -400,9 +402,9 @@ def test_real_environments_are_drawn(tmp_path: Path, env_id: str) -> None:
 def test_what_is_not_shown_is_noted(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", Sampler(NESTED, spaces.Discrete(2)), 40)
     made = report(path)
-    assert "note is of variable size (Text) and not shown." in made.notes
-    assert "list is of variable size (Sequence) and not shown." in made.notes
-    assert "none has no elements (shape (0, 3))." in made.notes
+    assert "state.note is of variable size (Text) and not shown." in made.notes
+    assert "state.list is of variable size (Sequence) and not shown." in made.notes
+    assert "state.none has no elements (shape (0, 3))." in made.notes
     assert set(made.notes) <= {text.replace("\n", " ") for text in texts(made)}
 
 
@@ -415,7 +417,7 @@ def test_names_and_labels_are_in_the_picture(tmp_path: Path) -> None:
         for _ in range(5):
             recorded.step(2)
     found = texts(report(path))
-    assert {"height", "speed $^2$", "drag", "left", "stay", "right"} <= set(found)
+    assert {"state.height", "state.speed $^2$", "state.drag", "left", "stay", "right"} <= set(found)
     assert found.count(" never") == 2
 
 
@@ -671,36 +673,36 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     made = report(path)
     (one,) = made.measured
     np.testing.assert_array_equal(one.numbers["success"], [1, 0, 1, 0])
-    np.testing.assert_array_equal(one.numbers["metadata: score"], [9.5, np.nan, 4, np.nan])
-    np.testing.assert_array_equal(one.numbers["info: distance"], [1, 1.5, 2, 2.5])
+    np.testing.assert_array_equal(one.numbers["metadata.score"], [9.5, np.nan, 4, np.nan])
+    np.testing.assert_array_equal(one.numbers["info.distance"], [1, 1.5, 2, 2.5])
     assert dict(made.facts)["success"] == "50%"
     edit_run(path, name="ppo", metadata={"lr": 0.1, "algo": "p$o"}, split="eval")
     facts = dict(report(path).facts)
     assert (facts["run"], facts["settings"]) == ("ppo (eval)", "lr=0.1, algo=p$o")
     np.testing.assert_array_equal(panel(made, "success rate").lines[0].get_ydata(), [1, 0, 1, 0])
-    assert panel(made, "info: distance, mean of each episode") and panel(
-        made, "info: left, mean of each episode"
+    assert panel(made, "info.distance, mean of each episode") and panel(
+        made, "info.left, mean of each episode"
     )
-    assert panel(made, "metadata: score") and panel(made, "info: distance")  # of episodes; step by step
-    assert not {"metadata: constant", "info: k, mean of each episode"} & set(texts(made))  # all the same
-    assert made.notes == ["Infos that are not single numbers are not shown: word."]
+    assert panel(made, "metadata.score") and panel(made, "info.distance")  # of episodes; step by step
+    assert not {"metadata.constant", "info.k, mean of each episode"} & set(texts(made))  # all the same
+    assert made.notes == ["Infos that are not single numbers are not shown: info.word."]
 
 
 def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = scored(tmp_path / "r.mcap", [20] * 20)
     monkeypatch.setattr("tupli_mcap.plots.measure.INFO_STEPS", 100)
     made = report(path)
-    found = made.measured[0].numbers["info: distance"]
+    found = made.measured[0].numbers["info.distance"]
     assert "Infos are those of 80 of 400 steps." in made.notes
     assert np.isfinite(found).all() and len(set(found.tolist())) > 1
-    assert "info: distance" not in texts(made)  # of one episode, as not all of its infos are read
+    assert "info.distance" not in texts(made)  # of one episode, as not all of its infos are read
 
 
 def test_huge_numbers_of_infos_are_left_out(tmp_path: Path) -> None:
     huge = [10**400, -1e300, float("nan"), 5]
     env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {"k": huge[n % 4]}, length=4)
     path = record(tmp_path / "r.mcap", env, 8, record_info=True)
-    np.testing.assert_array_equal(measured(path).numbers["info: k"], [5, 5])
+    np.testing.assert_array_equal(measured(path).numbers["info.k"], [5, 5])
 
 
 def test_returns_that_overflow_are_drawn_without_warning(tmp_path: Path) -> None:
@@ -711,8 +713,8 @@ def test_returns_that_overflow_are_drawn_without_warning(tmp_path: Path) -> None
 def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
     env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n: {0: n, "x": 1}, length=4)  # type: ignore[dict-item]
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
-    np.testing.assert_array_equal(made.measured[0].numbers["info: 0"], [2.5, 2.5])
-    assert panel(made, "info: 0")
+    np.testing.assert_array_equal(made.measured[0].numbers["info.0"], [2.5, 2.5])
+    assert panel(made, "info.0")
 
 
 def test_infos_without_numbers_are_named(tmp_path: Path) -> None:
@@ -724,9 +726,9 @@ def test_infos_without_numbers_are_named(tmp_path: Path) -> None:
     )
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
     assert [note for note in made.notes if note.startswith("Infos")] == [
-        "Infos that are not single numbers are not shown: contact, note."
+        "Infos that are not single numbers are not shown: info.contact, info.note."
     ]
-    assert "info: force" in texts(made)
+    assert "info.force" in texts(made)
 
 
 def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:
@@ -734,7 +736,7 @@ def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", env, 8, record_info=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(measured(path).numbers["info: k"]) == 2
+        assert len(measured(path).numbers["info.k"]) == 2
 
 
 def test_runs_have_their_names_where_all_differ(tmp_path: Path) -> None:
@@ -1136,7 +1138,7 @@ def test_a_depth_image_does_not_hide_the_joints(tmp_path: Path) -> None:
     tupli_mcap.write_rollout(tmp_path / "r.mcap", states, np.zeros((9, 2)), np.zeros(9))
     with Recording(tmp_path / "r.mcap") as recording:
         names = [series.name for series in sketch(recording, 10).distributions]
-    assert names[1:4] == ["joints[0]", "joints[1]", "depth[0,0]"]
+    assert names[1:4] == ["state.joints[0]", "state.joints[1]", "state.depth[0,0]"]
 
 
 def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
@@ -1150,8 +1152,8 @@ def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     assert lengths.each == -(-len(rows) // 10)
     assert returns.values == lengths.values  # a reward of 1 a step
     by_name = {series.name: series for series in found.distributions}
-    assert list(by_name)[:2] == ["reward", "Cart Position"] and list(by_name)[-1] == "action"
-    for i, name in enumerate(("Cart Position", "Cart Velocity")):
+    assert list(by_name)[:2] == ["reward", "state.Cart Position"] and list(by_name)[-1] == "action"
+    for i, name in enumerate(("state.Cart Position", "state.Cart Velocity")):
         np.testing.assert_array_equal(by_name[name].values, np.histogram(states[:, i], 10)[0])
     assert (found.sampled, found.hidden, found.error) == (400, 0, "")
 
@@ -1215,7 +1217,9 @@ def test_info_where_blocks_cannot_be_printed(cartpole: Path) -> None:
         [TOOL, "info", str(cartpole)], capture_output=True, check=True, timeout=60,
         env={**os.environ, "PYTHONIOENCODING": "ascii"},
     )  # fmt: skip
-    (line,) = [line for line in done.stdout.decode("ascii").splitlines() if line.startswith("Pole Angle ")]
+    (line,) = [
+        line for line in done.stdout.decode("ascii").splitlines() if line.startswith("state.Pole Angle ")
+    ]
     assert set(line) & set(PLAIN)
 
 

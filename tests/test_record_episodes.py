@@ -293,7 +293,7 @@ def test_an_action_that_does_not_fit_names_the_leaf(tmp_path: Path) -> None:
     env = RecordEpisodes(Scripted(lambda step: 0, spaces.Discrete(1), space), tmp_path / "r.mcap")
     env.reset()
     env.step(space.sample())
-    with pytest.raises(StepError, match=r"action\['move'\]: expected shape \(2,\)"):
+    with pytest.raises(StepError, match=r"action\.move: expected shape \(2,\)"):
         env.step({"move": np.zeros(3, np.float32), "grip": 0})
     env.close()
 
@@ -319,7 +319,7 @@ def test_unknown_spaces_are_refused_before_a_file_is_made(tmp_path: Path) -> Non
 
     space = spaces.Dict({"ok": BOX, "mine": spaces.Tuple((MyBox(0, 1, (2,)),))})
     with pytest.raises(
-        SpaceError, match=r"state\['mine'\]\[0\]: expected a space of Gymnasium itself, found .*MyBox"
+        SpaceError, match=r"state\.mine\[0\]: expected a space of Gymnasium itself, found .*MyBox"
     ):
         RecordEpisodes(Scripted(lambda step: None, space), tmp_path / "r.mcap")
     with pytest.raises(

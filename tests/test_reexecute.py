@@ -603,7 +603,7 @@ def test_another_shape_is_a_divergence_at_its_key(tmp_path: Path) -> None:
     other.places = 1
     first = certify(path, env=other).first
     assert first is not None
-    assert (first.step, first.leaf, first.path) == (0, "state_pos", "state['pos']")
+    assert (first.step, first.leaf, first.path) == (0, "state_pos", "state.pos")
     assert "expected shape (2,), found shape (1,)" in first.found
     assert first.largest_difference is None
 

@@ -291,7 +291,7 @@ class Custom(gym.Space[Any]):
         ),
         (Dict(a=Text(3)), {}, r"^note: expected a dict with the keys \['a'\], found \[\]"),
         (Dict(a=Text(3)), ["x"], r"^note: expected a dict"),
-        (Dict(a=Tuple((Text(3),))), {"a": (3,)}, r"^note\['a'\]\[0\]: expected a string, found 3"),
+        (Dict(a=Tuple((Text(3),))), {"a": (3,)}, r"^note\.a\[0\]: expected a string, found 3"),
         (Tuple((Text(3),)), ["x"], r"^note: expected a tuple of 1, found \['x'\]"),
         (Tuple((Text(3),)), ("x", "y"), r"^note: expected a tuple of 1"),
         (OneOf([Text(3), Discrete(2)]), (1, "x"), r"^note\[1\]: expected int64"),

@@ -169,9 +169,9 @@ def courier(path: Path, episodes: int = 3) -> Path:
     noise = np.random.default_rng(2)
     labels = {
         **{f"state[{name!r}]": ("x", "y") for name in ("position", "velocity", "goal")},
-        "state['carrying']": ("empty", "loaded"),
-        "action['thrust']": ("x", "y"),
-        "action['gripper']": ("rest", "grasp", "release"),
+        "state.carrying": ("empty", "loaded"),
+        "action.thrust": ("x", "y"),
+        "action.gripper": ("rest", "grasp", "release"),
     }
     with RecordEpisodes(gym.wrappers.TimeLimit(Courier(), 200), path, labels=labels) as env:
         rollout(env, lambda state: head_for_goal(state, noise), episodes)

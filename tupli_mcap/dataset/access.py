@@ -61,9 +61,10 @@ class RandomAccess(SaysWhatIsMeant):
         """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
 
         See `Windows`: an index gives one window, an array of numbers gives a batch. The field "infos" gives a dict of
-        columns for all keys of the infos, "info.<key>" for one key; they are all read into memory. Numbers are
-        arrays, with NaN for steps without such an info; a list if they include both integers from 2**53 on and floats
-        or steps without one. The field "frames" gives the recorded pictures of the states.
+        columns for all keys of the infos, "info.<key>" for one key, and "info.contact.left" for a value in a dict; they
+        are all read into memory. Numbers are arrays, with NaN for steps without such an info; a list if they include
+        both integers from 2**53 on and floats or steps without one. The field "frames" gives the recorded pictures of
+        the states.
 
         Raises:
             SamplingError: no episode is long enough, or an argument is invalid.

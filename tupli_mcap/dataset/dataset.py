@@ -307,7 +307,7 @@ class Dataset(RandomAccess):
         Args:
             fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames; Gymnasium's
                 names (observations, terminations, truncations) mean the same. "infos" is a dict for each step;
-                "info.<key>" makes `infos` a dict of columns, as in `windows`.
+                "info.<key>" makes `infos` a dict of columns, as in `windows`. "info.contact.left" is a value in a dict.
 
         Raises:
             DatasetError: a field is unknown.
@@ -391,10 +391,10 @@ class Dataset(RandomAccess):
     def stats(
         self, fields: Sequence[str] = ("states", "actions", "rewards")
     ) -> Mapping[str, FieldStatistics]:
-        """Count, mean, std, min, max and quantiles of each leaf (`states`, or `states['arm']`; `actions`, `rewards`).
+        """Count, mean, std, min, max and quantiles of each leaf by name: `state`, or `state.arm`; `action`, `reward`.
 
-        Gymnasium's names find them, too. Steps are read once, one block after the other, and the result is kept.
-        Images, and leaves of variable size (texts, graphs), have no statistics.
+        The names of columns (`states.arm`) and Gymnasium's find them, too. Steps are read once, one block after the
+        other, and the result is kept. Images, and leaves of variable size (texts, graphs), have no statistics.
 
         Raises:
             DatasetError: a field has no numbers, or there is no step.
@@ -410,8 +410,9 @@ class Dataset(RandomAccess):
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
         """One row per step or per episode, one column per dimension, with its label if the recordings agree on one.
 
-        Infos and metadata have a column for each key: `info.x`, `metadata.score`. An image, or an array of more than
-        500 numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
+        Infos and metadata have a column for each key: `info.x`, `metadata.score`; an info that is an array of numbers
+        of one shape, or a dict of those and of numbers, has one for each number: `info.contact.left[0]`. An image, or
+        an array of more than 500 numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
 
         Raises:
             MissingExtraError: pandas is not installed.

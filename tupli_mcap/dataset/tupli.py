@@ -111,7 +111,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Args:
             filter_fcn: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time
                 (ns) and step (counted from 0 in each episode), or the names of their columns (states, times), or
-                Gymnasium's (observation, terminated, truncated), such as `F("state.0") > 1` or "info.force > 2", which
+                Gymnasium's (observation, terminated, truncated), such as `F("state[0]") > 1` or "info.force > 2", which
                 is evaluated on whole columns; or a function of one `RLTuple` that returns True or False, called for
                 every step that earlier filters chose.
 

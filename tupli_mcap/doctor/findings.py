@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
 
 MAX_PLACES = 5  # most examples that a finding names
@@ -56,8 +57,8 @@ class Finding:
     path: the recording; the first one, if several are affected.
     message: one sentence with numbers.
     suggestion: what to do about it.
-    leaf: the affected leaf by its keys in the space (`state['arm']['angle'][0]`, `action`), or the camera of recorded
-        frames (`camera 'render'`); None for findings about episodes or files.
+    leaf: the name of the affected leaf (`state.arm.angle[0]`, `action`), or the camera of recorded frames
+        (`camera 'render'`); None for findings about episodes or files.
     dimensions: the affected indexes inside the leaf; empty for the whole leaf, and for a scalar.
     count, total: how many values, steps or episodes (the message says which) are affected, and of how many.
     places: the first examples, at most `MAX_PLACES`.
@@ -161,13 +162,13 @@ def unravel(leaf: Leaf, mask: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def dimensions(leaf: Leaf, mask: Array) -> str:
-    """`dimension 3`, `3 of 17 dimensions (0, 4, 5)`; empty for a scalar or for all."""
+    """`state[3]`, `3 of 17 dimensions (state[0], state[4], state[5])`; empty for a scalar or for all."""
     indexes, count = unravel(leaf, mask), int(mask.sum())
     if not indexes:
         return ""
-    names = [str(index[0]) if len(index) == 1 else str(index) for index in indexes[:_NAMED]]
+    names = [name_within(leaf.path, index) for index in indexes[:_NAMED]]
     if count == 1:
-        return f"dimension {names[0]}"
+        return names[0]
     more = ", ..." if count > _NAMED else ""
     return f"{count:,} of {leaf.size:,} dimensions ({', '.join(names)}{more})"
 

@@ -10,13 +10,15 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.jsonvalue import spelled
+from tupli_mcap.messages.infos import with_text_keys
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.plots.measure import numbers_in, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.spaces.labels import Labels, short_path
+from tupli_mcap.schema.keys import name_within
+from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 
 SO_FAR: Final = "return so far"
@@ -111,8 +113,10 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     if _few_infos(recording):
         info = (episode.infos or [None] * len(episode))[step] or {}
         told["info"] = {
-            str(key): f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
-            for key, value in info.items()
+            name_within("info", key): f"{value:.5g}"
+            if isinstance(value, float | np.floating)
+            else spelled(value)
+            for key, value in with_text_keys(info).items()
         }
     return told
 
@@ -121,7 +125,7 @@ def _told(leaves: Sequence[Leaf], labels: Labels, columns: Any) -> dict[str, str
     told = {}
     for leaf in leaves:
         if leaf.kind == "variable":
-            told[short_path(leaf)] = spelled(leaf.get(columns)[0])
+            told[leaf.path] = spelled(leaf.get(columns)[0])
         elif not leaf.apart:
             values = LeafValues(leaf, labels, np.asarray(leaf.get(columns)).reshape(1, leaf.size))
             for name, value in zip(values.names, values.values, strict=False):
@@ -140,13 +144,11 @@ def _value_text(value: Any, of: LeafValues) -> str:
 def _tracks(field: str, leaf: Leaf, labels: Labels, column: Array, notes: list[str]) -> Iterator[Track]:
     values = LeafValues(leaf, labels, column)
     if values.kind == "picture":
-        notes.append(
-            f"{short_path(leaf)} is a picture ({' x '.join(map(str, leaf.shape))}) and has no curves."
-        )
+        notes.append(f"{leaf.path} is a picture ({' x '.join(map(str, leaf.shape))}) and has no curves.")
         return
     notes += values.notes()
     if len(values.elements) > _MOST_TRACKS:
-        notes.append(f"Of {short_path(leaf)}, {_MOST_TRACKS} curves are shown.")
+        notes.append(f"Of {leaf.path}, {_MOST_TRACKS} curves are shown.")
     at = np.arange(column.shape[0], dtype=np.float64)
     start = int(values.starts[0]) if values.counts and values.value_names else 0
     for i, name in enumerate(values.names[:_MOST_TRACKS]):
@@ -170,9 +172,9 @@ def _info_tracks(recording: Recording, episode: Episode, read: int, notes: list[
         return
     found: dict[str, Array] = {}
     for step, info in enumerate((episode.infos or [])[:read]):
-        for key, value in numbers_in(info):
-            if key in found or len(found) < _MOST_KEYS:
-                found.setdefault(key, np.full(read, np.nan))[step] = value
+        for name, value in numbers_in("info", info):
+            if name in found or len(found) < _MOST_KEYS:
+                found.setdefault(name, np.full(read, np.nan))[step] = value
     at = np.arange(read, dtype=np.float64)
-    for key, values in found.items():
-        yield _track("info", key, at, values)
+    for name, values in found.items():
+        yield _track("info", name, at, values)

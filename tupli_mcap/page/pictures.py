@@ -13,7 +13,6 @@ from tupli_mcap.errors import NotFoundError
 from tupli_mcap.messages.images.pictures import encode_pixels, format_of
 from tupli_mcap.recording import Episode
 from tupli_mcap.reexecute.recorded_film import as_picture
-from tupli_mcap.spaces.labels import short_path
 from tupli_mcap.spaces.leaves import Leaf
 
 _COARSE = 200  # pixels
@@ -48,7 +47,7 @@ def cameras_of(episode: Episode) -> list[Camera]:
     """The cameras with pictures of an episode."""
     recording = episode.recording
     found = [Camera(name, recording.frames(episode.position, name).steps) for name in recording.cameras]
-    found += [Camera(short_path(leaf), np.arange(len(episode)), leaf) for leaf in recording.layout.images]
+    found += [Camera(leaf.path, np.arange(len(episode)), leaf) for leaf in recording.layout.images]
     return [camera for camera in found if len(camera.steps)]
 
 

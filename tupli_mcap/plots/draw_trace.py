@@ -14,7 +14,6 @@ from tupli_mcap.plots.measure import Measured, Trace
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.plots.style import Cell, Page, cut, number_text
 from tupli_mcap.recording.describe.description import by_scale
-from tupli_mcap.spaces.labels import short_path
 
 _MOST_LINES, _LINES = 12, 6  # of all panels, of one panel
 _SAME_SCALE = 8  # lines of one panel differ by this factor at most
@@ -119,7 +118,7 @@ def _plot(trace: Trace, title: str, values: Array, steps: bool, axes: Any, **opt
 
 
 def _draw_lines(trace: Trace, leaf: LeafValues, chosen: Sequence[int], steps: bool, axes: Any) -> None:
-    name = short_path(leaf.leaf)
+    name = leaf.leaf.path
     for colour, i in zip(style.SERIES, chosen, strict=False):
         column = trace.values[leaf.leaf.name][:, i]
         _plot(trace, name, column, steps, axes, color=colour, label=cut(leaf.names[i], 22))
@@ -147,7 +146,7 @@ def _draw_table(trace: Trace, leaves: Sequence[LeafValues], scaled: bool, axes: 
         table = np.where(high > low, (table - low) / np.where(high > low, high - low, 1), 0.5)
     right = max(trace.length, 1) - 0.5
     style.heat_map(axes, table, "", rasterized=True, extent=(-0.5, right, len(table) - 0.5, -0.5))
-    names = ", ".join(short_path(leaf.leaf) for leaf in leaves)
+    names = ", ".join(leaf.leaf.path for leaf in leaves)
     scale = ", each from its smallest (0) to its largest value (1)" if scaled else ""
     axes.set(title=f"{cut(names, 40)}: {len(table)} dimensions{scale}", ylabel="dimension")
 

@@ -14,7 +14,6 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.plots import style
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, bin_edges, drawable_numbers
 from tupli_mcap.plots.style import COLUMNS, LEFT, SMALL, Cell, Page, cut, number_text
-from tupli_mcap.spaces.labels import short_path
 
 Leaves = Sequence[LeafValues]  # the same leaf of each group of recordings
 Dimension = tuple[Leaves, int]  # one of its elements
@@ -91,7 +90,7 @@ def _draw_quantiles(dimensions: Sequence[Dimension], axes: Any) -> None:
     axes.set_yticks(range(len(LEVELS)), [f"{level}%" for level in LEVELS], fontsize=7.5)
     # Several leaves get a line between them and a name below each; one leaf gets numbers.
     starts = [at for at, (_, i) in enumerate(dimensions) if i == 0]
-    names = [short_path(dimensions[start][0][0].leaf) for start in starts]
+    names = [dimensions[start][0][0].leaf.path for start in starts]
     if len(starts) == 1:
         axes.set_xlabel(f"dimension of {cut(names[0], 40)}")
         return
@@ -163,7 +162,7 @@ def _draw_counts(leaves: Leaves, i: int, axes: Any) -> None:
 
 def _draw_bits(leaves: Leaves, axes: Any) -> None:
     _draw_bars([np.array([leaf.share(i)[1] for i in range(len(leaf.counts))]) for leaf in leaves], 0, axes)
-    axes.set(title=cut(short_path(leaves[0].leaf), 60), ylim=(0, 100))
+    axes.set(title=cut(leaves[0].leaf.path, 60), ylim=(0, 100))
     axes.set_xlabel("bits that are 1", **SMALL)
 
 
@@ -172,7 +171,7 @@ def _draw_shares(leaf: LeafValues, axes: Any) -> None:
     shares = [leaf.share(i) for i in range(len(leaf.counts))]
     table = np.array(list(itertools.zip_longest(*shares, fillvalue=np.nan)))
     style.heat_map(axes, table, "% of steps", origin="lower", vmin=0)
-    title = f"values of each of the {len(shares)} elements of {cut(short_path(leaf.leaf), 40)}"
+    title = f"values of each of the {len(shares)} elements of {cut(leaf.leaf.path, 40)}"
     axes.set(title=title, xlabel="element", ylabel="value")
 
 

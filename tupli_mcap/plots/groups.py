@@ -161,7 +161,7 @@ def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
                 names.append(key)
         shown += names[:_MOST_NUMBERS]
         if len(names) > _MOST_NUMBERS:
-            notes.append(f"Of the {len(names)} numbers in {start.strip(': ')}, {_MOST_NUMBERS} are shown.")
+            notes.append(f"Of the {len(names)} numbers in {start.strip('.')}, {_MOST_NUMBERS} are shown.")
     if any(len(group.runs) > 1 for group in groups):
         notes.append(
             "Shades are 95% intervals of the mean over runs, as far as all of a group go (bootstrap)."

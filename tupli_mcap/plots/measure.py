@@ -18,6 +18,7 @@ from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import KEYS, success_of
 from tupli_mcap.recording.blocks import blocks, step_bytes
 from tupli_mcap.recording.describe.description import RecordingDescription, describe, nan_text
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
 
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
@@ -25,7 +26,7 @@ MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
 _INFO_PLACES, _MOST_KEYS, _MOST_NAMED = 40, 64, 8
 # a key of `Measured.numbers`, and how others begin
-SUCCESS, INFO, METADATA = "success", "info: ", "metadata: "
+SUCCESS, INFO, METADATA = "success", "info.", "metadata."
 _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 
 
@@ -35,9 +36,9 @@ class Measured:
 
     index: the index rows of all episodes. positions, rows: positions and rows of the chosen episodes. run: their run.
     is_recorded: see `Recording.is_recorded`.
-    numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata: key`, and `info: key`, the
+    numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata.key`, and `info.key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
-    other_infos: keys of infos that are never a finite number.
+    other_infos: names of infos that are never a finite number.
     read_episodes, read_steps: how many episodes and steps the values are from.
     states, actions, rewards: the values of their leaves. seeds: the different seeds of the chosen episodes, ascending.
     """
@@ -166,15 +167,16 @@ def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array
         if texts[position] == "{}":
             continue
         said = jsonvalue.loads(texts[position])
-        found = {SUCCESS: success_of(said), **{METADATA + key: value for key, value in numbers_in(said)}}
+        found = {SUCCESS: success_of(said), **dict(numbers_in("metadata", said))}
         for key, value in found.items():
             if value is not None and (key in numbers or len(numbers) < _MOST_KEYS):
                 numbers.setdefault(key, np.full(len(positions), np.nan))[at] = float(value)
     return numbers
 
 
-def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
-    """The entries of an info or of metadata that are numbers, except those for success."""
+def numbers_in(word: str, said: Any) -> Iterator[tuple[str, float]]:
+    """The entries of an info or of metadata (as `word` says) that are numbers, by their names (`info.key`), except
+    those for success."""
     for key, value in with_text_keys(said).items() if isinstance(said, Mapping) else ():
         if key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
             if isinstance(value, np.floating):
@@ -182,7 +184,7 @@ def numbers_in(said: Any) -> Iterator[tuple[str, float]]:
             # an integer may be too large for a float
             number = float(value) if -LARGEST <= value <= LARGEST else np.nan
             if np.isfinite(number):
-                yield key, number
+                yield name_within(word, key), number
 
 
 def _add_infos(recording: Recording, measured: Measured) -> None:
@@ -201,19 +203,19 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     decoder = InfoCodec.from_metadata(file.contents.channels[number].metadata)
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
     sums: dict[str, Array] = {}
-    keys, numbers = set[str](), set(KEYS)
+    names, numbers = set[str](), {name_within("info", key) for key in KEYS}
     for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
         for body in file.store.bodies(number, first, each):
             episode, _, info = decoder.decode(body)
             if episode not in at:
                 continue
-            keys.update(with_text_keys(info))
-            for key, value in numbers_in(info):
-                numbers.add(key)
-                if INFO + key in sums or len(sums) < _MOST_KEYS:
-                    sums.setdefault(INFO + key, np.zeros((2, len(at))))[:, at[episode]] += value, 1
+            names.update(name_within("info", key) for key in with_text_keys(info))
+            for name, value in numbers_in("info", info):
+                numbers.add(name)
+                if name in sums or len(sums) < _MOST_KEYS:
+                    sums.setdefault(name, np.zeros((2, len(at))))[:, at[episode]] += value, 1
     measured.info_steps, measured.read_infos = channel.messages, each * places
-    measured.other_infos = sorted(keys - numbers)
+    measured.other_infos = sorted(names - numbers)
     with np.errstate(invalid="ignore"):
         measured.numbers |= {key: total / count for key, (total, count) in sums.items()}
 
@@ -229,7 +231,7 @@ class Trace(NamedTuple):
     """One episode, step by step; of a long one, the smallest and the largest of every `thinned` (> 1) steps.
 
     values: leaf name -> (points, elements), float64, at the steps `at` (points); NaN for what cannot be drawn.
-    infos: key -> (points), as well; only where all infos of the recording are read.
+    infos: `info.key` -> (points), as well; only where all infos of the recording are read.
     totals: the running return. pictures: of each picture leaf, some frames (H x W or H x W x 1|3|4) and their titles.
     """
 
@@ -266,8 +268,8 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     infos: dict[str, Array] = {}
     if measured.info_steps and measured.read_infos == measured.info_steps:
         for step, info in enumerate(recording.infos(position) or ()):
-            for key, value in numbers_in(info):
-                infos.setdefault(INFO + key, np.full(length, np.nan))[step] = value
+            for name, value in numbers_in("info", info):
+                infos.setdefault(name, np.full(length, np.nan))[step] = value
     return Trace(
         int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
         recording.episode_start(position).seed_number, width, thinned(np.arange(steps)[:, None], width)[:, 0],

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.spaces.labels import Labels, element_names, short_path
+from tupli_mcap.spaces.labels import Labels, element_names
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import ElementStatistics
 
@@ -93,7 +93,7 @@ class LeafValues:
 
     def notes(self) -> list[str]:
         """Sentences about what is not shown of the leaf."""
-        name = short_path(self.leaf)
+        name = self.leaf.path
         if self.kind == "variable":
             return [f"{name} is of variable size ({type(self.leaf.space).__name__}) and not shown."]
         if self.kind == "empty":

@@ -44,7 +44,7 @@ class Divergence(_Model):
     kind: "value", "end" (a flag: the episode ended earlier or later), or "error" (the environment raised).
     episode, env: its number and its sub-environment. step: counts from 0; the episode's length for the final state, -1
         for an error in reset.
-    leaf, path: the field's name in the file, and its place with the space's own keys (`state['pos'][1]`).
+    leaf, path: the field's name in the file, and the name of the value (`state.pos[1]`).
     expected, found: the recorded value and the one of the new run, as text.
     largest_difference, largest_step: the largest difference of this leaf in the episode, and its step; None if it is no
         number.

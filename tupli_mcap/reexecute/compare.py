@@ -18,6 +18,7 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns
 from tupli_mcap.reexecute.reapply import Moment
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -192,7 +193,7 @@ class Checker:
         array = self._stored(leaf, dtype, found)
         differs = np.asarray(_bits(expected) != _bits(array))
         first = tuple(int(i) for i in np.argwhere(differs)[0])
-        path = leaf.path + (f"[{', '.join(map(str, first))}]" if first else "")
+        path = name_within(leaf.path, first) if first else leaf.path
         recorded, rerun = _text(expected[first]), _text(array[first])
         return Difference(step, leaf.name, path, recorded, rerun, _largest(expected[differs], array[differs]))
 

@@ -66,7 +66,7 @@ def film(
 
     Args:
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
-        camera: a camera, or an image in the states, such as `state['wrist']` or `wrist`. By default, the camera
+        camera: a camera, or an image in the states, such as `state.wrist` or `wrist`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
         fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`. A
             picture is shown for at most 10 minutes.

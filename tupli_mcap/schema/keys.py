@@ -1,6 +1,10 @@
-"""Filter keys: dotted paths into nested mappings, such as `metadata.score`.
+"""Names of values inside values, such as `metadata.score` and `state.arm.q[0]`: the keys of filters, and what tables,
+messages, plots and pages call a part of a step.
 
-A segment that holds a dot, a quote or nothing at all is written as a JSON string: `metadata."v1.0".score`.
+A name begins with a word (`state`, `metadata`). `.key` is an entry of a mapping, `[i]` an entry of a tuple or an
+element of an array, and `[i,j]` an element of an array of two dimensions. `.0` stands for `[0]` where a name is read.
+A key that holds a dot or what cannot be printed, begins with a quote, ends as an index does, or is empty, is written as
+a JSON string: `metadata."v1.0".score`.
 """
 
 from __future__ import annotations
@@ -9,16 +13,18 @@ import json
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 from tupli_mcap.errors import FilterError
 
+INDEX = r"\[-?[0-9]+(?:,[ ]?-?[0-9]+)*\]"
+_INDEX = re.compile(INDEX)
 _QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
-_PLAIN = re.compile(r'[^."][^.]*')
 
 
 @lru_cache(maxsize=4096)
 def split_key(key: str) -> tuple[str, ...]:
-    """The segments of a dotted path.
+    """The segments of a name; those of `state.q[0,1]` are state, q, 0 and 1.
 
     Raises:
         FilterError: A segment is empty, or a quoted one is not a JSON string; the message names the character.
@@ -27,18 +33,29 @@ def split_key(key: str) -> tuple[str, ...]:
     position = 0
     while True:
         quoted = _QUOTED.match(key, position)
-        match = quoted or _PLAIN.match(key, position)
-        if match is None:
+        begin = quoted.end() if quoted else position
+        stop = key.find(".", begin)
+        stop = len(key) if stop < 0 else stop
+        name, indexes = _without_indexes(key[begin:stop])
+        if quoted and name:
+            raise FilterError(f"filter key {key!r} needs a dot or its end at character {begin}")
+        if not quoted and name[:1] in ("", '"'):
             raise FilterError(
                 f"filter key {key!r} needs a name at character {position}, such as metadata.score"
             )
-        segments.append(_unquote(key, match.group()) if quoted else match.group())
-        position = match.end()
-        if position == len(key):
+        segments += [_unquote(key, quoted.group()) if quoted else name, *indexes]
+        if stop == len(key):
             return tuple(segments)
-        if key[position] != ".":
-            raise FilterError(f"filter key {key!r} needs a dot or its end at character {position}")
-        position += 1
+        position = stop + 1
+
+
+def _without_indexes(text: str) -> tuple[str, list[str]]:
+    """`q[0][1,2]` as q, and 0, 1, 2."""
+    end, found = len(text), list[str]()
+    while (begin := text.rfind("[", 0, end)) >= 0 and _INDEX.fullmatch(text, begin, end):
+        found.append(text[begin + 1 : end - 1])
+        end = begin
+    return text[:end], [index.strip() for several in reversed(found) for index in several.split(",")]
 
 
 def _unquote(key: str, quoted: str) -> str:
@@ -48,18 +65,30 @@ def _unquote(key: str, quoted: str) -> str:
         raise FilterError(f"filter key {key!r} holds {quoted}, which is not a JSON string") from err
 
 
-def join_key(segments: Sequence[str]) -> str:
-    """The dotted path of segments, quoting those that need it; `split_key` is its inverse.
+def name_within(name: str, *segments: Any) -> str:
+    """The name of a part of the value called `name`: `name_within("state.arm", "q", (0, 1))` is `state.arm.q[0,1]`.
+
+    Of the segments, a text is a key, which is quoted if need be; a tuple is the indexes of an element of an array; and
+    anything else is an index.
+    """
+    return name + "".join(map(_segment, segments))
+
+
+def join_key(segments: Sequence[Any]) -> str:
+    """The name of a value by its segments; `split_key` is its inverse, but gives indexes as texts.
 
     Raises:
         FilterError: No segments.
     """
     if not segments:
         raise FilterError("a filter key needs at least one segment")
-    return ".".join(_quote(segment) for segment in segments)
+    return name_within("", *segments).removeprefix(".")
 
 
-def _quote(segment: str) -> str:
-    if segment and "." not in segment and not segment.startswith('"'):
-        return segment
-    return json.dumps(segment, ensure_ascii=False)
+def _segment(segment: Any) -> str:
+    if not isinstance(segment, str):
+        return f"[{','.join(map(str, segment)) if isinstance(segment, tuple) else segment}]"
+    printable = segment.isprintable()
+    begins = printable and segment[:1] not in ("", '"')
+    plain = begins and "." not in segment and not _without_indexes(segment)[1]
+    return f".{segment if plain else json.dumps(segment, ensure_ascii=not printable)}"

@@ -9,9 +9,10 @@
                 | key
     value       = number | "text" | 'text' | true | false | null | nan | inf | -inf
 
-A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is true for lists that hold "x".
-`key ~ "x"` is true for texts that contain "x". Words are case-insensitive (`none` is `null`), keys are not; a name in
-a key that is no word is quoted: `metadata."a b"`.
+A key is a name such as `metadata.score` or `state.arm.q[0]`, as `tupli_mcap.schema.keys` has them; a part of it that
+is no word is quoted: `metadata."a b"`. A key alone stands for `key = true`, and `"x" in key` for `key = "x"`, which is
+true for lists that hold "x". `key ~ "x"` is true for texts that contain "x". Words are case-insensitive (`none` is
+`null`), keys are not.
 
 And, or, not and parentheses bind as in Python, so Python's parser finds the structure. It gets `k` for each key, `0`
 for each value and `<` for each sign, nothing else of the text; nothing is evaluated.
@@ -42,13 +43,15 @@ from tupli_mcap.schema.filters import (
     FilterType,
     path_of,
 )
+from tupli_mcap.schema.keys import INDEX
 
 _MAX_PARENTHESES: Final = 64
+_KEY: Final = rf"""[^\W\d][\w\-]*(?:{INDEX})*(?:\.(?:[\w\-]+|"(?:[^"\\]|\\.)*")(?:{INDEX})*)*"""
 _TOKEN: Final = re.compile(
-    r"""\s*(?:
+    rf"""\s*(?:
       (?P<number>[-+]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|(?:inf|nan)\b))(?=(?:and|or)\b|[\s()\[\],"'=<>!~]|\Z)
     | (?P<text>"(?:[^"\\]|\\.)*"|'(?:[^'\\]|\\.)*')
-    | (?P<word>[^\W\d][\w\-]*(?:\.(?:[\w\-]+|"(?:[^"\\]|\\.)*"))*)
+    | (?P<word>in(?=\[)|{_KEY})
     | (?P<sign>==|!=|>=|<=|[=<>~])
     | (?P<bracket>[()\[\],])
     | (?P<end>\Z)
@@ -266,7 +269,10 @@ def _format_key(filter: BaseFilter) -> str:
     first, *rest = path = path_of(filter)
     if not _PLAIN_KEY.fullmatch(first) or (first.lower() in _RESERVED and not rest):
         raise FilterError(f"filter key {filter.key!r} has no text: it does not start with a word")
-    return format_key(path)
+    given = str(filter.key)
+    return (
+        given if rest and re.fullmatch(_KEY, given) and first.lower() not in _RESERVED else format_key(path)
+    )
 
 
 def format_key(path: Sequence[str]) -> str:

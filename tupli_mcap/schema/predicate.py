@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pydantic import BaseModel
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FilterError
+from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
@@ -24,6 +24,7 @@ Predicate: TypeAlias = Callable[[Item], bool]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
 MISSING: Final = object()
+_NAMED: Final = 8  # most numbers of a step that an error names
 
 
 def compile_predicate(
@@ -117,7 +118,7 @@ def evaluate_columns(filter: BaseFilter, columns: Mapping[str, Any]) -> Mask:
     """A mask of the steps for which a filter is true.
 
     Args:
-        filter: Comparisons of step fields: `F("reward") > 0`, `F("state.0") < 1`, `F("state.pos.1") >= 2`.
+        filter: Comparisons of step fields: `F("reward") > 0`, `F("state[0]") < 1`, `F("state.pos[1]") >= 2`.
         columns: Field name to its column: an array of shape `(n, ...)`, a list of n values (leaves of
             variable size), or dicts and tuples of those, nested as the space is. Path segments after the
             field name go into dicts by key, into tuples by position, and then into the axes of an array.
@@ -170,41 +171,50 @@ def _length(column: Any) -> int:
 def _leaf(key: str, path: tuple[str, ...], columns: Mapping[str, Any]) -> Array | Sequence[Any]:
     """The column of one scalar per step that a path names."""
     column: Any = columns
-    for position, segment in enumerate(path):
-        if isinstance(column, Mapping):
-            choices = {str(name): value for name, value in column.items()}
-        elif isinstance(column, tuple):
-            choices = {str(index): value for index, value in enumerate(column)}
-        else:
-            return _inside(key, column, path[position:])
-        if segment not in choices:
-            where = join_key(path[:position]) if position else "a step"
-            raise FilterError(f"unknown key {key!r}: {where} has {', '.join(choices) or 'nothing'}")
-        column = choices[segment]
+    keys: list[Any] = []
+    for segment in path:
+        if not isinstance(column, Mapping | tuple):
+            break
+        known: list[Any] = list(column) if isinstance(column, Mapping) else list(range(len(column)))
+        found: Any = next((name for name in known if str(name) == segment), MISSING)
+        if found is MISSING:
+            where = join_key(keys) if keys else "a step"
+            hint = did_you_mean(join_key(path), _numbers(keys, column))
+            raise FilterError(
+                f"unknown key {key!r}{hint}: {where} has {', '.join(map(str, known)) or 'nothing'}"
+            )
+        keys.append(found)
+        column = column[found]
+    rest = path[len(keys) :]
     if isinstance(column, Mapping | tuple):
-        raise FilterError(
-            f"filter key {key!r} names several values of a step; add one of their names or positions"
-        )
-    return _inside(key, column, ())
-
-
-def _inside(key: str, column: Any, path: tuple[str, ...]) -> Array | Sequence[Any]:
+        such = ", ".join(_numbers(keys, column)[:_NAMED]) or "none"
+        raise FilterError(f"filter key {key!r} names several values of a step; name one of them: {such}")
     if not isinstance(column, np.ndarray):
-        return [_step_value(value, path) for value in column] if path else list(column)
+        return [step_value(value, rest) for value in column] if rest else list(column)
     shape = column.shape[1:]
-    if len(path) != len(shape):
-        raise FilterError(
-            f"filter key {key!r} needs {len(shape)} positions for values of shape {shape}, found {len(path)}"
-        )
-    for segment, size in zip(path, shape, strict=True):
-        if not (segment.isascii() and segment.isdigit() and int(segment) < size):
-            raise FilterError(f"filter key {key!r} needs a position from 0 to {size - 1}, found {segment!r}")
-    index: tuple[Any, ...] = (slice(None), *(int(segment) for segment in path))
+    if len(rest) != len(shape) or not all(map(_is_below, rest, shape)):
+        last = f" to {join_key([*keys, tuple(size - 1 for size in shape)])}" if shape else ""
+        (first,) = _numbers(keys, column)
+        raise FilterError(f"filter key {key!r} names no number: values of shape {shape} have {first}{last}")
+    index: Any = (slice(None), *map(int, rest))
     leaf: Array = column[index]
     return leaf
 
 
-def _step_value(value: Any, path: tuple[str, ...]) -> Any:
+def _is_below(index: str, size: int) -> bool:
+    return index.isascii() and index.isdigit() and int(index) < size
+
+
+def _numbers(keys: Sequence[Any], column: Any) -> list[str]:
+    """The names of all values in a column of steps, to which `keys` lead; of an array, that of its first element."""
+    if isinstance(column, Mapping | tuple):
+        parts = column.items() if isinstance(column, Mapping) else enumerate(column)
+        return [name for key, part in parts for name in _numbers([*keys, key], part)]
+    first = (0,) * (column.ndim - 1) if isinstance(column, np.ndarray) else ()
+    return [join_key([*keys, first] if first else keys)]
+
+
+def step_value(value: Any, path: tuple[str, ...]) -> Any:
     """A value inside one step of a column of variable size; every comparison is false for a missing one."""
     for segment in path:
         try:

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import StepError, warn
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
 
 _LONGEST = 120  # characters of a value in an error
@@ -138,22 +139,25 @@ def _equal(array: Array, cast: Array) -> bool:
     return bool(np.all(array.astype(object) == cast.astype(object)))
 
 
-def check_structure(space: gym.Space[Any], value: Any, path: str) -> None:
-    """Raises StepError unless `value` has dicts of the same keys and tuples of the same length as `space`."""
+def check_structure(space: gym.Space[Any], value: Any, root: str, keys: tuple[Any, ...] = ()) -> None:
+    """Raises StepError unless `value`, the part of `root` at `keys`, has dicts of the same keys and tuples of the same
+    length as `space`."""
     if type(space) is spaces.Dict:
-        keys = list(space.spaces)
-        if not isinstance(value, Mapping) or set(value) != set(keys):
+        own = list(space.spaces)
+        if not isinstance(value, Mapping) or set(value) != set(own):
             found = sorted(value, key=repr) if isinstance(value, Mapping) else shorten(value)
-            raise StepError(f"{path}: expected an entry for each of {shorten(keys)}, found {shorten(found)}")
+            raise StepError(
+                f"{name_within(root, *keys)}: expected an entry for each of {shorten(own)}, found {shorten(found)}"
+            )
         for key, sub in space.spaces.items():
-            check_structure(sub, value[key], f"{path}[{key!r}]")
+            check_structure(sub, value[key], root, (*keys, key))
     elif type(space) is spaces.Tuple:
         if not isinstance(value, tuple) or len(value) != len(space.spaces):
             raise StepError(
-                f"{path}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}"
+                f"{name_within(root, *keys)}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}"
             )
         for i, sub in enumerate(space.spaces):
-            check_structure(sub, value[i], f"{path}[{i}]")
+            check_structure(sub, value[i], root, (*keys, i))
 
 
 def structure_check(space: gym.Space[Any], path: str) -> Callable[[Any], None]:
@@ -194,6 +198,6 @@ def leaf_value(value: Any, leaf: Leaf) -> Any:
         try:
             value = value[key]
         except (KeyError, IndexError, TypeError) as err:
-            path = leaf.path.split("[", 1)[0] + "".join(f"[{before!r}]" for before in leaf.keys[:i])
+            path = name_within(leaf.root, *leaf.keys[:i])
             raise StepError(f"{path}: expected an entry {key!r}, found {shorten(value)}") from err
     return value

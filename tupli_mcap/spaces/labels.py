@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from tupli_mcap.errors import FormatError, SpaceError, warn
+from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError, SpaceError, did_you_mean, warn
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
 
 LABELS_NAME = "labels.json"
@@ -30,7 +32,7 @@ _OF_COLUMN = {
 class Labels(NamedTuple):
     """Names of dimensions and values; leaves without names are left out.
 
-    `dimensions`: leaf path (`state`, `state['arm']`, `action`) -> a name for each dimension of the flattened leaf.
+    `dimensions`: leaf path (`state`, `state.arm`, `action`) -> a name for each dimension of the flattened leaf.
     `values`: path of a Discrete leaf -> a name for each value, from the space's `start` on.
     `step_seconds`: time that passes in the environment during a step (s); None if unknown.
     """
@@ -47,8 +49,15 @@ class Labels(NamedTuple):
     def __bool__(self) -> bool:
         return bool(self.dimensions or self.values or self.step_seconds)
 
-    def to_json(self) -> bytes:
-        return json.dumps(self._asdict(), ensure_ascii=False, sort_keys=True).encode()
+    def to_json(self, leaves: Sequence[Leaf]) -> bytes:
+        """`labels.json` of a recording with these leaves, which has labels of no others."""
+        stored = {leaf.path: _stored_path(leaf) for leaf in leaves}
+        parts = {
+            "dimensions": {stored[path]: texts for path, texts in self.dimensions.items()},
+            "values": {stored[path]: texts for path, texts in self.values.items()},
+        }
+        document = {**parts, "step_seconds": self.step_seconds}
+        return json.dumps(document, ensure_ascii=False, sort_keys=True).encode()
 
     @classmethod
     def from_json(cls, data: bytes, leaves: Sequence[Leaf], where: str) -> Labels:
@@ -66,24 +75,22 @@ class Labels(NamedTuple):
         seconds = document.get("step_seconds")
         if seconds is not None and not _is_time(seconds):
             raise FormatError(f"{expected}, found {seconds!r:.80} as the seconds of a step")
-        parts = []
-        for key in ("dimensions", "values"):
+        found = cls({}, {}, None if seconds is None else float(seconds))
+        by_path = {_stored_path(leaf): leaf for leaf in leaves}
+        for key, count in (("dimensions", _dimensions), ("values", _values)):
             part = document.get(key, {})
             if not isinstance(part, dict) or not all(_are_texts(texts) for texts in part.values()):
                 raise FormatError(f"{expected}, found {part!r:.80} as {key!r}")
-            parts.append({path: tuple(texts) for path, texts in part.items()})
-        by_path = {leaf.path: leaf for leaf in leaves}
-        dimensions, values = ({p: t for p, t in part.items() if p in by_path} for part in parts)
-        for part, count in ((dimensions, _dimensions), (values, _values)):
-            for path, texts in part.items():
-                if len(texts) != count(by_path[path]):
-                    raise FormatError(f"{expected}, found {len(texts)} labels of {path}")
-        return cls(dimensions, values, None if seconds is None else float(seconds))
+            for leaf, texts in ((by_path[path], texts) for path, texts in part.items() if path in by_path):
+                if len(texts) != count(leaf):
+                    raise FormatError(f"{expected}, found {len(texts)} labels of {leaf.path}")
+                getattr(found, key)[leaf.path] = tuple(texts)
+        return found
 
 
 def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], known: Labels) -> Labels:
     """`known`, replaced by `given` where it has names: leaf -> names of its dimensions, or of its values. Each name of
-    `leaves_by_name` will do; it may begin with the name of a column: `states['pos']` is the leaf `state['pos']`.
+    `leaves_by_name` will do; it may begin with the name of a column: `states.pos` is the leaf `state.pos`.
 
     Raises:
         SpaceError: no leaf has the name, or the leaf has another number of dimensions or values.
@@ -94,8 +101,9 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
         root, *rest = re.split(r"(?=[\[.])", str(key), maxsplit=1)
         leaf = by_name.get(str(key)) or by_name.get("".join([_OF_COLUMN.get(root, root), *rest]))
         if leaf is None:
+            known_paths = sorted(leaf.path for leaf in leaves)
             raise SpaceError(
-                f"labels: expected one of {sorted(leaf.path for leaf in leaves)}, found {key!r:.80}"
+                f"labels: expected one of {known_paths}, found {key!r:.80}{did_you_mean(key, known_paths)}"
             )
         path = leaf.path
         if path in named:
@@ -155,38 +163,35 @@ def _is_time(seconds: Any) -> bool:
     return isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 < seconds < math.inf
 
 
-def short_path(leaf: Leaf) -> str:
-    """`arm.x[0]` for `state['arm']['x'][0]`; without keys, and before an index, the name of the root."""
-    if not leaf.keys:
-        return leaf.path
-    text = "" if isinstance(leaf.keys[0], str) else re.split(r"\W", leaf.path, maxsplit=1)[0]
-    for key in leaf.keys:
-        text += f".{key}" if isinstance(key, str) else f"[{key}]"
-    return text.removeprefix(".")
+def _stored_path(leaf: Leaf) -> str:
+    """What `labels.json` calls a leaf: `state['arm'][0]`."""
+    return leaf.root + "".join(f"[{key!r}]" for key in leaf.keys)
 
 
 def leaves_by_name(leaves: Sequence[Leaf]) -> dict[str, Leaf]:
-    """Leaves by each of their names: the path, `state['arm']['x']`; that of columns and filters, `state.arm.x`; and
-    `arm.x`, as `short_path` has it, unless it could mean another leaf."""
-    shorts = [short_path(leaf) for leaf in leaves]
-    pairs = list(zip(shorts, leaves, strict=True))
-    found = {short: leaf for short, leaf in pairs if shorts.count(short) == 1}
-    found |= {f"{leaf.path.partition('[')[0]}.{short}": leaf for short, leaf in pairs}
-    return found | {leaf.path: leaf for leaf in leaves}
+    """Leaves by each of their names: the path, `state.arm.x`; `state['arm']['x']`; and `arm.x`, unless it could mean
+    another leaf."""
+    shorts = [leaf.path.removeprefix(f"{leaf.root}.") for leaf in leaves]
+    found = {short: leaf for short, leaf in zip(shorts, leaves, strict=True) if shorts.count(short) == 1}
+    return found | {_stored_path(leaf): leaf for leaf in leaves} | {leaf.path: leaf for leaf in leaves}
 
 
 def element_names(leaf: Leaf, labels: Labels, elements: Sequence[int] | None = None) -> tuple[str, ...]:
-    """Names of some elements (C order; all by default): their labels, else their indexes in the leaf."""
+    """Names of some elements (C order; all by default): `state.q[0]`, with its label, if there is one, in place of the
+    index: `state.q: elbow`, or `state.Pole Angle` if the state is this leaf alone."""
     chosen = np.arange(leaf.size) if elements is None else np.asarray(elements, np.int64)
-    prefix = short_path(leaf)
     known = labels.dimensions.get(leaf.path)
-    if known is not None and len(known) == leaf.size:
-        own = f"{prefix}: " if leaf.keys else ""
-        return tuple(own + known[i] for i in chosen)
-    if leaf.shape == ():
-        return (prefix,) * len(chosen)
-    places = np.stack(np.unravel_index(chosen, leaf.shape), axis=1).tolist()
-    return tuple(f"{prefix}[{','.join(map(str, place))}]" for place in places)
+    if known is not None:
+        return tuple(f"{leaf.path}{': ' if leaf.keys else '.'}{known[i]}" for i in chosen)
+    return indexed_names(leaf.path, leaf.shape, chosen)
+
+
+def indexed_names(name: str, shape: tuple[int, ...], elements: Array) -> tuple[str, ...]:
+    """Names of some elements (C order) of an array of this name and shape; a scalar has the name itself."""
+    if shape == ():
+        return (name,) * len(elements)
+    places = np.stack(np.unravel_index(elements, shape), axis=1).tolist()
+    return tuple(name_within(name, tuple(place)) for place in places)
 
 
 def distinct(names: Sequence[str]) -> list[str]:

@@ -11,6 +11,7 @@ import re
 import string
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -19,6 +20,7 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import DType
 from tupli_mcap.errors import SpaceError
+from tupli_mcap.schema.keys import name_within
 
 # float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
 ROS_TYPES: dict[str, str] = {
@@ -47,7 +49,7 @@ class Leaf:
 
     Attributes:
         keys: lead to it from the root value.
-        path: the same for people, `state['pos'][1]`.
+        root: "state", "action" or "reward".
         name: its ROS field.
         space: its own space.
         kind: "scalar", "array", "image", "stack" or "variable".
@@ -56,13 +58,18 @@ class Leaf:
     """
 
     keys: tuple[Any, ...]
-    path: str
+    root: str
     name: str
     space: gym.Space[Any]
     kind: Literal["array", "scalar", "image", "stack", "variable"]
     dtype: DType | None
     shape: tuple[int, ...]
     frames_last: bool = False
+
+    @cached_property
+    def path(self) -> str:
+        """Its name for people: `state.pos[1]`."""
+        return name_within(self.root, *self.keys)
 
     @property
     def size(self) -> int:
@@ -137,16 +144,17 @@ def flatten_space(
     a space of another class, or a dtype no message can hold.
     """
 
-    def walk(space: gym.Space[Any], keys: tuple[Any, ...], path: str, name: str) -> Iterator[Leaf]:
+    def walk(space: gym.Space[Any], keys: tuple[Any, ...], name: str) -> Iterator[Leaf]:
+        path = name_within(root, *keys)
         if len(keys) > MAX_DEPTH:
             raise SpaceError(f"{path}: a space nested more than {MAX_DEPTH} deep cannot be recorded")
         if type(space) in (spaces.Dict, spaces.Tuple):
             for key, sub in subspaces(space):
-                yield from walk(sub, (*keys, key), f"{path}[{key!r}]", f"{name}_{key}")
+                yield from walk(sub, (*keys, key), f"{name}_{key}")
         elif type(space) in _VARIABLE:
-            yield Leaf(keys, path, names.take(name), space, "variable", None, ())
+            yield Leaf(keys, root, names.take(name), space, "variable", None, ())
         elif type(space) in _CONSTANT:
-            yield _constant_leaf(space, keys, path, names.take(name), images)
+            yield _constant_leaf(space, keys, root, names.take(name), images)
         else:
             raise SpaceError(
                 f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
@@ -154,7 +162,7 @@ def flatten_space(
                 "that makes a value of Gymnasium's own of it, and the space of such values"
             )
 
-    return list(walk(space, (), root, root))
+    return list(walk(space, (), root))
 
 
 def subspaces(space: Any) -> list[tuple[Any, gym.Space[Any]]]:
@@ -162,17 +170,18 @@ def subspaces(space: Any) -> list[tuple[Any, gym.Space[Any]]]:
     return list(space.spaces.items() if type(space) is spaces.Dict else enumerate(space.spaces))
 
 
-def _constant_leaf(space: Any, keys: tuple[Any, ...], path: str, name: str, images: bool) -> Leaf:
+def _constant_leaf(space: Any, keys: tuple[Any, ...], root: str, name: str, images: bool) -> Leaf:
     dtype = np.dtype(space.dtype)
     if dtype.name not in ROS_TYPES:
         raise SpaceError(
-            f"{path}: dtype {dtype.name!r} cannot be stored exactly in a message; use one of {', '.join(ROS_TYPES)}"
+            f"{name_within(root, *keys)}: dtype {dtype.name!r} cannot be stored exactly in a message; "
+            f"use one of {', '.join(ROS_TYPES)}"
         )
     shape = tuple(int(n) for n in space.shape)
     kind: Literal["array", "scalar", "image"] = "scalar" if type(space) is spaces.Discrete else "array"
     if images and dtype == np.uint8 and len(shape) == 3 and shape[2] in (1, 3, 4) and 0 not in shape:
         kind = "image"
-    return Leaf(keys, path, name, space, kind, np.dtype(dtype.name), shape)
+    return Leaf(keys, root, name, space, kind, np.dtype(dtype.name), shape)
 
 
 def own_space(space: gym.Space[Any]) -> gym.Space[Any]:

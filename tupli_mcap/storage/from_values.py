@@ -15,6 +15,7 @@ from tupli_mcap.errors import SpaceError, StorageError
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.schema import Benchmark, Episode, EpisodeHeader
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.storage.benchmark_json import declared_spaces, recording_attachments
 
 _NUMBERS = (bool, int, float, np.generic)
@@ -39,7 +40,9 @@ def infer_space(values: Sequence[Any], where: str = "value") -> gym.Space[Any]:
         return _dict_space(values, where)
     if isinstance(first, tuple):
         _check_all(values, lambda value: isinstance(value, tuple) and len(value) == len(first), first, where)
-        return spaces.Tuple([infer_space([v[i] for v in values], f"{where}[{i}]") for i in range(len(first))])
+        return spaces.Tuple(
+            [infer_space([v[i] for v in values], name_within(where, i)) for i in range(len(first))]
+        )
     if isinstance(first, str):
         _check_all(values, lambda value: isinstance(value, str), first, where)
         characters = "".join(sorted(set().union(*values))) or " "
@@ -175,7 +178,7 @@ def _dict_space(values: Sequence[Any], where: str) -> gym.Space[Any]:
     _check_all(
         values, lambda value: isinstance(value, Mapping) and value.keys() == first.keys(), first, where
     )
-    parts = [(key, infer_space([value[key] for value in values], f"{where}[{key!r}]")) for key in first]
+    parts = [(key, infer_space([value[key] for value in values], name_within(where, key))) for key in first]
     return spaces.Dict(parts)
 
 

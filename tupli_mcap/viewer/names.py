@@ -22,14 +22,12 @@ def escaped(text: str) -> str:
 
 def entity_of(leaf: Leaf) -> str:
     """The entity path of a leaf: `/state/arm/position`."""
-    root = leaf.path.partition("[")[0]
-    return "/".join(["", root, *(escaped(str(key)) for key in leaf.keys)])
+    return "/".join(["", leaf.root, *(escaped(str(key)) for key in leaf.keys)])
 
 
 def title_of(leaf: Leaf) -> str:
     """A leaf's name for people: `state · arm · position`."""
-    root = leaf.path.partition("[")[0]
-    return " · ".join([root, *(_text(key)[:_LONGEST] for key in leaf.keys)])
+    return " · ".join([leaf.root, *(_text(key)[:_LONGEST] for key in leaf.keys)])
 
 
 def dimension_names(leaf: Leaf, known: Sequence[str] | None) -> list[str]:

@@ -124,7 +124,9 @@ def with_labels(
 ) -> dict[str, tuple[str, bytes]]:
     """The attachments, and the labels that were given or are documented, if any."""
     labels = chosen_labels(given or {}, spaces.leaves, documented)
-    return {**attachments, **({LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json())} if labels else {})}
+    if not labels:
+        return dict(attachments)
+    return {**attachments, LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json(spaces.leaves))}
 
 
 def _is_plugin(record: EnvironmentRecord) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.errors import StepError
 from tupli_mcap.recording.write.options import Capture, Mode
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of
 
@@ -439,9 +440,11 @@ def _length(tree: Any) -> int:
 def _space(tree: Any, lead: int, name: str) -> gym.Space[Any]:
     """A space for the values in arrays, without their first `lead` axes."""
     if isinstance(tree, Mapping):
-        return gym.spaces.Dict({key: _space(value, lead, f"{name}[{key!r}]") for key, value in tree.items()})
+        return gym.spaces.Dict(
+            {key: _space(value, lead, name_within(name, key)) for key, value in tree.items()}
+        )
     if isinstance(tree, tuple):
-        return gym.spaces.Tuple([_space(value, lead, f"{name}[{i}]") for i, value in enumerate(tree)])
+        return gym.spaces.Tuple([_space(value, lead, name_within(name, i)) for i, value in enumerate(tree)])
     shape, dtype = tree.shape[lead:], tree.dtype
     if dtype.kind == "b":
         return gym.spaces.MultiBinary(shape) if shape else gym.spaces.Discrete(2)

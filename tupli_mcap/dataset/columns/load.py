@@ -21,7 +21,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIELDS, FIVE, OTHER_NAMES, OTHER_STEP_NAMES
+from tupli_mcap.recording.columns.fields import FIELD_OF, FIVE
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
@@ -275,18 +275,8 @@ class _FieldBuilder:
 # ---- tuple filters
 
 STEP_KEYS: Mapping[str, str] = {
-    "state": "states",
-    "action": "actions",
-    "reward": "rewards",
-    "terminal": "terminals",
-    "timeout": "timeouts",
-    "next_state": "next_states",
-    "info": "infos",
+    **{name: field for name, field in FIELD_OF.items() if field != "frames"},
     "step": "steps",
-    "time": "times",
-    **{field: field for field in FIELDS if field != "frames"},
-    **OTHER_NAMES,
-    **OTHER_STEP_NAMES,
 }
 """Name in an expression -> column; `step` counts from 0 within its episode."""
 _TIME_KEYS = [key for key, field in STEP_KEYS.items() if field == "times"]

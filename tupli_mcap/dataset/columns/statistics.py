@@ -12,6 +12,8 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.messages.shared_dtypes import field_leaves
+from tupli_mcap.recording.columns.fields import step_name
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import ElementStatistics
 
@@ -59,7 +61,7 @@ def statistics_of(steps: Steps, fields: Sequence[str]) -> dict[str, dict[str, Fi
     layout, total = steps.layout, len(steps)
     leaves = [(field, leaf) for field in fields for leaf in field_leaves(field, layout) or ()]
     leaves = [(field, leaf) for field, leaf in leaves if leaf.kind != "variable" and not leaf.apart]
-    names = [_name(field, leaf) for field, leaf in leaves]
+    names = [name_within(step_name(field), *leaf.keys) for field, leaf in leaves]
     known = {
         name: ElementStatistics(leaf, layout.dtypes[leaf.name])
         for name, (_, leaf) in zip(names, leaves, strict=True)
@@ -78,11 +80,6 @@ def statistics_of(steps: Steps, fields: Sequence[str]) -> dict[str, dict[str, Fi
     for name, (field, leaf) in zip(names, leaves, strict=True):
         found[field][name] = _of(leaf, known[name], np.concatenate(samples[name]))
     return found
-
-
-def _name(field: str, leaf: Leaf) -> str:
-    root = leaf.path.partition("[")[0]  # "state" of "state['arm']"
-    return field + leaf.path.removeprefix(root)
 
 
 def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:

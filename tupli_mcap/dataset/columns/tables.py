@@ -15,14 +15,14 @@ from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.labels import common_labels, distinct, element_names, short_path
+from tupli_mcap.spaces.labels import common_labels, distinct, element_names
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-    from tupli_mcap.messages.step import StepLayout
     from tupli_mcap.spaces.labels import Labels
+    from tupli_mcap.spaces.leaves import Leaf
 
 Level: TypeAlias = Literal["steps", "episodes"]
 _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is of no use to anybody
@@ -181,9 +181,9 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     if recording is not None:
         own = {name: dataset._open(name).labels for name in dataset._chosen}
         labels = common_labels(own or {recording.name: recording.labels})
-        columns |= _named(found.states, recording.layout, labels, "state")
-        columns |= _named(found.actions, recording.layout, labels, "action")
-        columns |= _named(found.rewards, recording.layout, labels, "reward")
+        columns |= _named(found.states, recording.layout.state, labels)
+        columns |= _named(found.actions, recording.layout.action, labels)
+        columns |= _named(found.rewards, recording.layout.reward, labels)
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
     columns |= _columns_of("info", found.infos)
     repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
@@ -197,18 +197,15 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     return columns
 
 
-def _named(column: Any, layout: StepLayout, labels: Labels, root: str) -> Mapping[str, Any]:
+def _named(column: Any, leaves: Sequence[Leaf], labels: Labels) -> Mapping[str, Any]:
     """A column for each element of each leaf; one of objects for images, large arrays, and values of variable size."""
     columns: list[tuple[str, Any]] = []
-    for leaf in {"state": layout.state, "action": layout.action, "reward": layout.reward}[root]:
+    for leaf in leaves:
         values = leaf.get(column)
-        begun = not isinstance(leaf.keys[0], str) if leaf.keys else leaf.path not in labels.dimensions
-        prefix = "" if begun else f"{root}."  # names of other leaves begin with the root
         if isinstance(values, list) or leaf.apart or leaf.size > _MOST_COLUMNS:
-            name = prefix + short_path(leaf) if leaf.keys else leaf.path
-            columns.append((name, _texts(list(values))))
+            columns.append((leaf.path, _texts(list(values))))
             continue
         flat = values.reshape(len(values), leaf.size)
-        columns += [(prefix + name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
+        columns += [(name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
     names = distinct([name for name, _ in columns])
     return {name: values for name, (_, values) in zip(names, columns, strict=True)}

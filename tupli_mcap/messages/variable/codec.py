@@ -49,6 +49,7 @@ from tupli_mcap.messages.variable.nested_codecs import (
     with_dummy,
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES, NameRegistry, camel, subspaces
 
 _NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -184,7 +185,7 @@ class _Builder:
             name = names.take(str(key) if is_dict else f"item_{key}")
             codec = make(sub, type_name + camel(name), f"{path}[{key!r}]", depth + 1)
             fields.append((codec.ros, name))
-            steps.append((key, f"[{key!r}]", codec.encode))
+            steps.append((key, name_within("", key), codec.encode))
             decoders.append(codec.decode)
         if not is_dict:
             return self._message(type_name, fields, encode_tuple(steps), decode_tuple(decoders))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
@@ -32,6 +33,22 @@ OTHER_STEP_NAMES = MappingProxyType(
 """Gymnasium's names for the values of one step -> column."""
 
 
+def step_name(field: str) -> str:
+    """What the value of a field in one step is called: `state` for `states`."""
+    return field.removesuffix("s")
+
+
+FIELD_OF = MappingProxyType(
+    {
+        **{step_name(field): field for field in FIELDS},
+        **{field: field for field in FIELDS},
+        **OTHER_NAMES,
+        **OTHER_STEP_NAMES,
+    }
+)
+"""Every name of a column, or of its value in one step -> column."""
+
+
 def field_names(
     fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
 ) -> list[str]:
@@ -44,9 +61,8 @@ def field_names(
         raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
     for written, name in zip(given, names, strict=True):
         if name not in known:
-            raise error(
-                f"expected fields from {', '.join(known)}, found {written!r:.80}{did_you_mean(name, known)}"
-            )
+            hint = did_you_mean(re.split(r"[.\[]", name)[0], known)
+            raise error(f"expected fields from {', '.join(known)}, found {written!r:.80}{hint}")
     return list(dict.fromkeys(names))
 
 
@@ -68,33 +84,33 @@ def described(column: Any) -> str:
 
 
 class ColumnDict(dict[str, Any]):
-    """Columns by name. Gymnasium's names find ours: `batch["observations"]` is `batch["states"]`; the keys are ours.
+    """Columns by name. A column and its value in a step find each other, also by Gymnasium's names: `states`, `state`,
+    `observations` and `observation` are one; the keys are ours.
 
-    A name may go on with a leaf, as in `stats["observations['arm']"]`. A KeyError names the keys there are.
+    A name may go on with a leaf, as in `stats["observations.arm"]`. A KeyError names the keys there are.
     """
 
     def __missing__(self, name: object) -> Any:
-        known = _own_name(name)
-        if known == name or not dict.__contains__(self, known):
-            raise KeyError(
-                f"expected one of {', '.join(self)}, found {name!r:.80}{did_you_mean(known, self)}"
-            )
+        known = self._own_name(name)
+        if known == name:
+            raise KeyError(f"expected one of {', '.join(self)}, found {name!r:.80}{did_you_mean(name, self)}")
         return self[known]
 
     def __contains__(self, name: object) -> bool:
-        return dict.__contains__(self, _own_name(name))
+        return dict.__contains__(self, self._own_name(name))
 
     def get(self, name: str, default: Any = None, /) -> Any:
         """The column, or the default if there is none."""
-        return dict.get(self, _own_name(name), default)
+        return dict.get(self, self._own_name(name), default)
 
-
-def _own_name(name: Any) -> Any:
-    """This package's name of a column, or of a leaf in it."""
-    if not isinstance(name, str):
-        return name
-    column, bracket, leaf = name.partition("[")
-    return OTHER_NAMES.get(column, column) + bracket + leaf
+    def _own_name(self, name: Any) -> Any:
+        """The key that a name means; the name itself if there is none."""
+        if dict.__contains__(self, name) or not isinstance(name, str):
+            return name
+        word, *leaf = re.split(r"(?=[.\[])", name, maxsplit=1)
+        field = FIELD_OF.get(word, word)
+        meant = ("".join([own, *leaf]) for own in (field, step_name(field)))
+        return next((key for key in meant if dict.__contains__(self, key)), name)
 
 
 class Parts(SaysWhatIsMeant):

@@ -24,7 +24,7 @@ from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.describe.series import MOST_INFOS, sampled_infos
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, Signed
-from tupli_mcap.spaces.labels import Labels, element_names, short_path
+from tupli_mcap.spaces.labels import Labels, element_names
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import element_bounds
 
@@ -248,7 +248,7 @@ def space_lines(leaves: Sequence[Leaf], labels: Labels, stored: Mapping[str, DTy
 
 
 def _leaf_lines(leaf: Leaf, labels: Labels, stored: DType | None) -> list[str]:
-    name = f"{short_path(leaf)}: " if leaf.keys else ""
+    name = f"{leaf.path}: " if leaf.keys else ""
     if leaf.kind == "variable":
         return [name + describe_space(leaf.space)]
     low, high = element_bounds(leaf)

@@ -16,6 +16,7 @@ from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
+from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -126,7 +127,7 @@ def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[tuple[str, S
     for key in dict.fromkeys(key for info in infos for key in info):
         found = [info[key] for info in infos if key in info]
         if all(isinstance(value, int | float | np.number | np.bool_) for value in found):
-            yield key, _distribution(None, f"info.{key}", np.array(found, np.float64), points)
+            yield key, _distribution(None, name_within("info", key), np.array(found, np.float64), points)
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:

@@ -410,7 +410,7 @@ def _attachments(sources: Sequence[Recording]) -> dict[str, tuple[str, bytes]]:
     labelled = [recording for recording in sources if LABELS_NAME in recording.attachments]
     if len({recording.read_attachment(LABELS_NAME) for recording in labelled}) > 1:
         labels = common_labels({recording.name: recording.labels for recording in labelled})
-        attachments[LABELS_NAME] = LABELS_MEDIA_TYPE, labels.to_json()
+        attachments[LABELS_NAME] = LABELS_MEDIA_TYPE, labels.to_json(labelled[0].layout.leaves)
     return attachments
 
 
