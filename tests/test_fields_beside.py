@@ -86,7 +86,7 @@ def test_a_copy_in_another_process_has_them(dataset: tupli_mcap.Dataset) -> None
 
 
 def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None:
-    with pytest.raises(SamplingError, match="did you mean 'force'"):
+    with pytest.raises(SamplingError, match="did you mean 'info.force'"):
         dataset.windows(2, fields=["infos.forse"])
     later = TupliDataset(tmp_path).with_tuple_filter(F("info.step") > 2)
     assert later.windows(3, fields=["info.step"])[0].infos["step"].tolist() == [3, 4, 5]
@@ -101,7 +101,7 @@ def test_says_what_there_is(dataset: tupli_mcap.Dataset, tmp_path: Path) -> None
 def test_a_filter_on_an_info_that_no_step_has(tmp_path: Path, dataset: tupli_mcap.Dataset, name: str) -> None:
     found = TupliDataset(tmp_path).with_tuple_filter(f"{name}.forse > 2 and step > 1")
     with pytest.warns(
-        UserWarning, match=rf"no step has {name}.forse \(did you mean 'force'\?\); infos have force, "
+        UserWarning, match=rf"no step has {name}.forse \(did you mean '{name}.force'\?\); {name} has force, "
     ) as said:
         assert len(found) == 0
     assert said[0].filename == __file__  # the line of the caller
@@ -113,7 +113,7 @@ def test_of_columns(dataset: tupli_mcap.Dataset) -> None:
     assert set(columns.infos) == {"step", "force"}
     np.testing.assert_array_equal(columns.infos["step"], columns.states[:, 0] + 1)
     assert dataset.read(["infos"]).infos[0]["name"] == "at 1"
-    with pytest.raises(SamplingError, match="did you mean 'force'"):
+    with pytest.raises(SamplingError, match="did you mean 'info.force'"):
         dataset.read("info.forse")
 
 
@@ -240,3 +240,57 @@ def test_frames_that_are_not_there(pictures: tupli_mcap.Dataset, tmp_path: Path)
     pictures_of_a_storage = TupliDataset(tmp_path)
     with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
         pictures_of_a_storage.windows(2, fields=["frames"])[0]
+
+
+@pytest.fixture
+def touching(tmp_path: Path) -> tupli_mcap.Dataset:
+    """Steps whose infos hold arrays, and dicts of them; the last one has none."""
+    box = gym.spaces.Box(-1, 1, (1,))
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", box, box) as writer:
+        writer.begin()
+        for n in range(4):
+            contact = {"left": np.array([n, 0.5]), "right": {"grip": n > 1}}
+            said = {"contact": contact, "grid": np.full((1, 2), n, np.int32), "a.b": n, "texts": {"x": "y"}}
+            ragged = {"ragged": np.zeros(n + 1), "list": [[n], [n, n]]}
+            writer.step(box.sample(), box.sample(), 1.0, info={**said, **ragged} if n < 3 else {})
+        writer.end(box.sample())
+    return tupli_mcap.open(tmp_path / "r.mcap")
+
+
+def test_tables_have_a_column_for_each_number_in_infos(touching: tupli_mcap.Dataset) -> None:
+    table = touching.to_pandas()
+    assert [name for name in table if name.startswith("info")] == [
+        "info.contact.left[0]", "info.contact.left[1]", "info.contact.right.grip", "info.grid[0,0]",
+        "info.grid[0,1]", 'info."a.b"', "info.texts", "info.ragged", "info.list",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(table["info.contact.left[0]"], [0, 1, 2, np.nan])
+    assert table["info.contact.right.grip"].tolist() == [False, False, True, None]
+    assert touching.to_arrow()["info.grid[0,1]"].to_pylist() == [0, 1, 2, None]
+    assert table["info.texts"][0] == {"x": "y"} and table["info.ragged"][1].shape == (2,)
+    assert touching.to_arrow()["info.list"].to_pylist()[1] == [[1], [1, 1]]
+
+
+def test_values_in_infos_are_fields(touching: tupli_mcap.Dataset, tmp_path: Path) -> None:
+    fields = [
+        "info.contact.left",
+        "info.contact.left[0]",
+        "infos.contact.right.grip",
+        "info.a.b",
+        "info.list",
+    ]
+    columns = touching.read(fields).infos
+    np.testing.assert_array_equal(columns["contact.left"][:, 0], [0, 1, 2, np.nan])
+    np.testing.assert_array_equal(columns["contact.left[0]"], columns["contact.left"][:, 0])
+    np.testing.assert_array_equal(columns["contact.right.grip"], [0, 0, 1, np.nan])
+    np.testing.assert_array_equal(columns["a.b"], [0, 1, 2, np.nan])
+    assert columns["list"][2] == [[2], [2, 2]]
+    assert touching.windows(2, fields=fields[:1])[1].infos["contact.left"].tolist() == [[1, 0.5], [2, 0.5]]
+    steps = TupliDataset(tmp_path)
+    assert len(steps.with_tuple_filter("info.contact.left[0] > 1 or info.contact.left.0 = 0")) == 2
+    with pytest.raises(SamplingError, match=r"did you mean 'info.contact.left'\?"):
+        touching.windows(2, fields=["info.contact.lefd"])
+    with pytest.warns(
+        UserWarning, match=r"\(did you mean 'info.contact.left'\?\); info.contact has left, right"
+    ):
+        assert len(steps.with_tuple_filter("info.contact.lefd[0] > 1")) == 0
+    assert len(steps.with_tuple_filter("info.contact.left[7] > 1")) == 0

@@ -6,7 +6,7 @@ A typed field of an entry that is missing or no float64 is marked absent; the JS
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,14 @@ _FIELD = struct.Struct("<d?7x")
 def with_text_keys(info: Mapping[Any, Any]) -> dict[str, Any]:
     """An info as people are shown it: an environment may have keys that are no text, such as the numbers of agents."""
     return {str(key): value for key, value in info.items()}
+
+
+def paths_in(info: Mapping[Any, Any], before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The keys, as texts, that lead to each entry of an info, and to each of the dicts in it."""
+    for key, value in info.items():
+        yield (path := (*before, str(key)))
+        if isinstance(value, dict):
+            yield from paths_in(value, path)
 
 
 class InfoCodec:

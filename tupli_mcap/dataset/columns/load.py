@@ -16,6 +16,7 @@ from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import EpisodeSource
 from tupli_mcap.errors import FilterError, SpaceError, did_you_mean, memory_for, warn
+from tupli_mcap.messages.infos import paths_in
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
@@ -25,6 +26,7 @@ from tupli_mcap.recording.columns.fields import FIELD_OF, FIVE
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
+from tupli_mcap.schema.keys import name_within
 
 _BLOCK_BYTES = 64 << 20
 
@@ -105,7 +107,7 @@ class _Reader:
         self._capacity = total if known is None else known.steps
         self._total = total
         self._done = 0  # listed steps read so far
-        self._info_keys: set[str] = set()
+        self._info_paths: set[tuple[str, ...]] = set()
         self._builders: dict[str, _FieldBuilder] = {}
         self._layout: StepLayout | None = None
         self._first_name = ""
@@ -137,7 +139,7 @@ class _Reader:
         if self._selector is None or self._mask is None:
             return None
         self._mask[block] = self._selector.mask(columns, layout)
-        self._info_keys.update(*columns.get("infos", ()))
+        self._info_paths.update(*map(paths_in, columns.get("infos", ())))
         return self._mask[block]
 
     def finish(self, headers: Sequence[EpisodeHeader]) -> tuple[dict[str, Any], Selected, StepLayout | None]:
@@ -150,7 +152,7 @@ class _Reader:
                 lengths = np.diff(wanted[ends])
             selected = Selected(lengths, self._mask)
             if self._selector is not None and self._done and not selected.steps:
-                _warn_of_unseen(self._selector.filters, self._info_keys)
+                _warn_of_unseen(self._selector.filters, self._info_paths)
         columns = {field: builder.finish() for field, builder in self._builders.items()}
         if self._layout is None:
             columns = {field: _empty_column(field) for field in self._fields}
@@ -322,14 +324,23 @@ class TupleSelector:
         return mask
 
 
-def _warn_of_unseen(filters: Sequence[TupleFilter], keys: Collection[str]) -> None:
-    """Warns of infos that an expression names and that no step has; `keys` are those that steps have."""
+def _warn_of_unseen(filters: Sequence[TupleFilter], seen: Collection[tuple[str, ...]]) -> None:
+    """Warns of infos that an expression names and that no step has; `seen` are the `paths_in` those that steps have."""
+    dicts = {path[:-1] for path in seen} | {()}
     expressions = (one for one in filters if isinstance(one, BaseFilter))
     for comparison in itertools.chain.from_iterable(map(comparisons, expressions)):
         name, *inside = path_of(comparison)
-        if STEP_KEYS[name] == "infos" and inside and inside[0] not in keys:
-            known = f"infos have {', '.join(sorted(map(str, keys)))}" if keys else "no infos are recorded"
-            warn(f"no step has {comparison.key}{did_you_mean(inside[0], keys)}; {known}")
+        parts = [tuple(inside[:end]) for end in range(len(inside) + 1)]
+        unseen = next((part for part in parts[1:] if part not in seen and part[:-1] in dicts), None)
+        if STEP_KEYS[name] == "infos" and unseen:
+            names = [name_within(name, *path) for path in seen]
+            known = sorted(path[-1] for path in seen if path[:-1] == unseen[:-1])
+            has = (
+                f"{name_within(name, *unseen[:-1])} has {', '.join(known)}"
+                if known
+                else "no infos are recorded"
+            )
+            warn(f"no step has {comparison.key}{did_you_mean(name_within(name, *unseen), names)}; {has}")
 
 
 def _flag(value: object) -> bool:

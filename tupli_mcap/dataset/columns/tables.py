@@ -12,10 +12,12 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.columns.load import steps_within
+from tupli_mcap.dataset.items.beside import info_column
 from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.spaces.labels import common_labels, distinct, element_names
+from tupli_mcap.schema.keys import name_within
+from tupli_mcap.spaces.labels import common_labels, distinct, element_names, indexed_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,22 +133,58 @@ def _whole_numbers(values: Sequence[int | None]) -> Any:
 def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A column for each key of any item, with None for items without the key."""
     keys = dict.fromkeys(key for item in items for key in item)
+    return {name_within(root, key): _column([item.get(key) for item in items]) for key in keys}
+
+
+def _column(values: list[Any]) -> Any:
+    """Values, None where there is none, as a column that tells what is missing from NaN."""
+    given = [value for value in values if value is not None]
+    numbers = all(isinstance(value, _REAL) and not isinstance(value, bool) for value in given)
+    if numbers and any(isinstance(value, float | np.floating) for value in given):
+        return _floats(values)
+    if numbers and len(given) < len(values):
+        return _whole_numbers(values)
+    # pandas would make a complex number of None
+    if len(given) < len(values) and any(isinstance(value, complex | np.complexfloating) for value in given):
+        return import_pandas().Series(values, dtype=object)
+    return _texts(values)
+
+
+def _info_columns(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A column for each key of any info; for each element, if all values are arrays of numbers of one shape; and for
+    each key of theirs, if all are dicts of such arrays and numbers."""
     columns: dict[str, Any] = {}
-    for key in keys:
-        values = [item.get(key) for item in items]
-        given = [value for value in values if value is not None]
-        numbers = all(isinstance(value, _REAL) and not isinstance(value, bool) for value in given)
-        if numbers and any(isinstance(value, float | np.floating) for value in given):
-            columns[f"{root}.{key}"] = _floats(values)
-        elif len(given) == len(values):
-            columns[f"{root}.{key}"] = _texts(values)
-        elif numbers:
-            columns[f"{root}.{key}"] = _whole_numbers(values)
-        elif any(map(np.iscomplexobj, given)):  # pandas would make a number of None
-            columns[f"{root}.{key}"] = import_pandas().Series(values, dtype=object)
-        else:
-            columns[f"{root}.{key}"] = _texts(values)
+    for key in dict.fromkeys(key for info in infos for key in info):
+        name, values = name_within("info", key), [info.get(key) for info in infos]
+        columns |= _numbers(name, values) or {name: _column(values)}
     return columns
+
+
+def _numbers(name: str, values: list[Any]) -> dict[str, Any] | None:
+    """A column for each number in the values; None if they are not the same numbers in all that are there, or many."""
+    given = [value for value in values if value is not None]
+    if given and all(isinstance(value, dict) for value in given):
+        columns: dict[str, Any] = {}
+        for key in dict.fromkeys(key for value in given for key in value):
+            parts = _numbers(
+                name_within(name, key), [value if value is None else value.get(key) for value in values]
+            )
+            if parts is None or len(columns) > _MOST_COLUMNS:
+                return None
+            columns |= parts
+        return columns
+    if given and all(isinstance(value, np.ndarray) for value in given):
+        column = info_column(values)
+        if isinstance(column, list) or not 0 < column[0].size <= _MOST_COLUMNS:
+            return None
+        flat = column.reshape(len(column), column[0].size)
+        if len(given) < len(values):
+            flat = np.ma.masked_array(flat)
+            flat[[value is None for value in values]] = np.ma.masked
+        names = indexed_names(name, column.shape[1:], np.arange(column[0].size))
+        return {own: flat[:, i] for i, own in enumerate(names)}
+    alike = given and all(isinstance(value, (*_REAL, np.bool_)) for value in given)
+    return {name: _column(values)} if alike else None
 
 
 def _floats(values: Sequence[Any]) -> Any:
@@ -185,7 +223,7 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.actions, recording.layout.action, labels)
         columns |= _named(found.rewards, recording.layout.reward, labels)
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
-    columns |= _columns_of("info", found.infos)
+    columns |= _info_columns(found.infos)
     repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,8 +10,12 @@ import numpy as np
 
 from tupli_mcap.arrays import Array, are_floats
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, following, pick, rows_of_runs
-from tupli_mcap.errors import did_you_mean
+from tupli_mcap.errors import FilterError, did_you_mean
+from tupli_mcap.messages.infos import paths_in
 from tupli_mcap.recording.frames import Frames, gathered
+from tupli_mcap.schema import split_key
+from tupli_mcap.schema.keys import name_within
+from tupli_mcap.schema.predicate import MISSING, step_value
 
 INFOS, FRAMES = BESIDE = ("infos", "frames")
 
@@ -91,7 +96,7 @@ def info_keys(fields: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None = None) -> dict[str, Any]:
-    """A column for each of `keys`, by default for all keys.
+    """A column for each of `keys`, by default for all keys. `contact.left[0]` is an element of an array in a dict.
 
     Numbers, and arrays of one shape, become an array of shape (steps, ...) with their dtype; if some steps lack the
     key it is float64, with NaN for them. Other values, and integers that would lose digits as floats, become a list,
@@ -101,16 +106,31 @@ def info_columns(infos: Sequence[Mapping[str, Any]], keys: Sequence[str] | None 
         SamplingError: no step has one of the keys.
     """
     known = list(dict.fromkeys(key for info in infos for key in info))
-    for key in keys or ():
-        if key not in known:
-            raise SamplingError(f"no info of these steps has the key {key!r:.80}{did_you_mean(key, known)}")
-    return {key: _column([info.get(key) for info in infos]) for key in (known if keys is None else keys)}
+    if keys is None:
+        return {key: info_column([info.get(key) for info in infos]) for key in known}
+    return {key: info_column(_values_of(key, infos, known)) for key in keys}
 
 
-def _column(values: list[Any]) -> Any:
+def _values_of(key: str, infos: Sequence[Mapping[str, Any]], known: Sequence[str]) -> list[Any]:
+    if key in known:
+        return [info.get(key) for info in infos]
+    with contextlib.suppress(FilterError):  # it is no name
+        path = split_key(key)
+        values = [step_value(info, path) for info in infos]
+        if any(value is not MISSING for value in values):
+            return [None if value is MISSING else value for value in values]
+    names = {path: name_within("info", *path) for info in infos for path in paths_in(info)}
+    hint = did_you_mean(f"info.{key}", names.values())
+    raise SamplingError(f"no info of these steps has the key {key!r:.80}{hint}")
+
+
+def info_column(values: list[Any]) -> Any:
+    """Values of infos as one column; see `info_columns`."""
+    if any(isinstance(value, list | tuple | dict) for value in values):
+        return values
     there = [np.asarray(value) for value in values if value is not None]
     alike = len({value.shape for value in there}) == 1 and all(value.dtype.kind in "biuf" for value in there)
-    if not alike or any(isinstance(value, list | tuple) for value in values):
+    if not alike:
         return values
     if len(there) == len(values):
         column = np.stack(there)
