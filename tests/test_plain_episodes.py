@@ -30,7 +30,7 @@ EXACT = ("first_row", "length", "return", "seed", "final_row", "episode", "env",
 
 
 class Uneven(gym.Env[Any, Any]):
-    """Episodes of 1 to 9 steps; rewards that do not add up exactly; now and then an info at the reset."""
+    """Episodes of 1 to 9 steps; rewards that do not add up exactly; now and then an info at the reset, or a success."""
 
     observation_space = gym.spaces.Box(-1, 1, (3,), np.float64)
     action_space = gym.spaces.Discrete(5)
@@ -48,7 +48,8 @@ class Uneven(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.left -= 1
         done, timeout = self.left <= 0, bool(self.np_random.random() < 0.3)
-        return self._state(), float(self.np_random.random()), done and not timeout, done and timeout, {}
+        info = {"success": not timeout} if done and self.np_random.random() < self.infos else {}
+        return self._state(), float(self.np_random.random()), done and not timeout, done and timeout, info
 
     def _state(self) -> Any:
         self.newest = self.np_random.uniform(-1, 1, 3)

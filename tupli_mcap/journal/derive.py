@@ -79,6 +79,10 @@ class EpisodeDeriver:
         facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
         self._waiting[end.env], self._waits[end.env] = facts, True
 
+    def unwritten(self, env: int) -> int:
+        """The episode that runs or waits for its final state, whose end was not derived; -1 if there is none."""
+        return int(self._waiting[env]["episode"] if self._waits[env] else self.running[env])
+
     def derive(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
         """Derives the starts, ends and final states of new rows.
 

@@ -181,7 +181,7 @@ class SingleRows:
             over: the last row has ended its episode, and the running one has its final state.
 
         Returns:
-            The running episode; None before its first step.
+            The episode whose end is not written; None before its first step.
         """
         events = self._events
         if events is None:
@@ -190,7 +190,7 @@ class SingleRows:
         row = (self._offset() - half) // self._area.row_size
         self._derive(half, row, {0: self.pending_state()} if over else None)
         self._events = None
-        number = int(self._episodes.running[0])
+        number = self._episodes.unwritten(0)
         return None if number < 0 else events.take_back(number)
 
     def _derive(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
