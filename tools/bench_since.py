@@ -25,11 +25,15 @@ from gymnasium import spaces
 from tupli_mcap.arrays import Array
 
 ROOT = Path(__file__).resolve().parent.parent
-KINDS = {
-    "22 steps": (22, 1),
-    "1000 steps": (1000, 1),
-    "64 x 22 steps": (22, 64),
-    "64 x 1000 steps": (1000, 64),
+SAME_STEP, NEXT_STEP = gym.vector.AutoresetMode.SAME_STEP, gym.vector.AutoresetMode.NEXT_STEP
+# steps of an episode, sub-environments, and how they start the next one: how `n` reset, or whether one has a seed
+KINDS: dict[str, tuple[int, int, Any]] = {
+    "22 steps": (22, 1, False),
+    "22 seeded steps": (22, 1, True),
+    "1000 steps": (1000, 1, False),
+    "64 x 22 steps": (22, 64, SAME_STEP),
+    "64 x 22 next": (22, 64, NEXT_STEP),
+    "64 x 1000 steps": (1000, 64, SAME_STEP),
 }
 TURN = 6400  # steps, those of all sub-environments together
 WARM_UP = 10  # rounds that do not count
@@ -43,6 +47,7 @@ class Nothing(gym.Env[Any, Any]):
 
     def __init__(self, length: int) -> None:
         self.length, self.state = length, np.zeros(4, np.float32)
+        super().reset(seed=1)  # or every reset draws a seed, for all that the recorder knows
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.t = 0
@@ -56,7 +61,7 @@ class Nothing(gym.Env[Any, Any]):
 class Nothings(gym.vector.VectorEnv[Any, Any, Any]):
     """`n` sub-environments of that kind, which all end and reset in the same step."""
 
-    def __init__(self, length: int, n: int) -> None:
+    def __init__(self, length: int, n: int, mode: gym.vector.AutoresetMode) -> None:
         self.length, self.num_envs = length, n
         self.single_observation_space, self.single_action_space = (
             Nothing.observation_space,
@@ -64,7 +69,8 @@ class Nothings(gym.vector.VectorEnv[Any, Any, Any]):
         )
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, n)
         self.action_space = gym.vector.utils.batch_space(self.single_action_space, n)
-        self.metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+        self.metadata = {"autoreset_mode": mode}
+        self.period = length + (mode == NEXT_STEP)  # a reset is a step, too
         self.states, self.rewards = np.zeros((n, 4), np.float32), np.ones(n)
         self.no, self.yes = np.zeros(n, np.bool_), np.ones(n, np.bool_)
 
@@ -74,19 +80,20 @@ class Nothings(gym.vector.VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.t += 1
-        if self.t % self.length:
+        if self.t % self.period != self.length % self.period:
             return self.states, self.rewards, self.no, self.no, {}
-        return self.states, self.rewards, self.yes, self.no, {"final_obs": self.states}
+        infos = {} if self.period > self.length else {"final_obs": self.states}
+        return self.states, self.rewards, self.yes, self.no, infos
 
 
-def turn_of(length: int, n: int, path: Path | None) -> Callable[[], None]:
+def turn_of(length: int, n: int, how: Any, path: Path | None) -> Callable[[], None]:
     """A function that makes the steps of one turn, recorded to `path` or not."""
     import tupli_mcap
     import tupli_mcap.vector
 
     kwargs: Any = {"mode": "w", "attachments": {}}
     if n > 1:
-        env: Any = Nothings(length, n)
+        env: Any = Nothings(length, n, how)
         env = env if path is None else tupli_mcap.vector.RecordEpisodes(env, path, **kwargs)
         actions = np.ones(n, np.int64)
         env.reset(seed=1)
@@ -98,13 +105,13 @@ def turn_of(length: int, n: int, path: Path | None) -> Callable[[], None]:
         return steps
     env = Nothing(length)
     env = env if path is None else tupli_mcap.RecordEpisodes(env, path, **kwargs)
-    action = np.int64(1)
+    action, seed = np.int64(1), 1 if how else None
     env.reset(seed=1)
 
     def step() -> None:
         for _ in range(TURN):
             if env.step(action)[2]:
-                env.reset()
+                env.reset(seed=seed)
 
     return step
 
