@@ -130,6 +130,10 @@ def test_sub_environments(tmp_path: Path, seed: int, infos: float) -> None:
             for _ in range(2500):
                 if chance.random() < 0.003:
                     env.reset(seed=chance.choice([None, 5]))
+                if chance.random() < 0.01:  # other episodes go on, or have just ended or begun
+                    mask = np.array([chance.random() < 0.5 for _ in range(3)])
+                    mask[chance.randrange(3)] = True
+                    env.reset(options={"reset_mask": mask})
                 if chance.random() < 0.003:
                     env.flush()
                 env.step(np.array([chance.randrange(5) for _ in range(3)]))
@@ -209,7 +213,7 @@ def test_it_is_used(tmp_path: Path) -> None:
             if terminal or timeout:
                 env.reset()
         rows, events = env._writer.rows, env._writer.events
-        assert isinstance(rows, SingleRows) and rows.derives
+        assert isinstance(rows, SingleRows) and rows.events is events
         assert events is not None and sum(events.sequences.values()) == 1
         assert env._writer.next_episode > 10
     with Recording(tmp_path / "r.mcap") as recording:

@@ -74,12 +74,12 @@ MOMENTS = {
         ),
         Moment(
             "told",
-            ("SingleRows._derive", "VectorRows._derive", "EpisodeLog.extend"),
+            ("SingleRows.derive_pending", "VectorRows._derive", "EpisodeLog.extend"),
             times=3,
             told=True,
             flushes=True,
         ),
-        Moment("settled", ("SingleRecorder._write_pending", "VectorRecorder._write_pending"), times=4),
+        Moment("settled", ("SingleRecorder._derive_pending", "VectorRecorder._derive_pending"), times=4),
         Moment(
             "episode log",
             ("EventLog.append", "EpisodeLog.start", "EpisodeLog.end", "EventLog.drop_last"),

@@ -7,7 +7,7 @@ in `/episode_start`, `/episode_end` and `/final_state` are derived from these.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.logs import STATE
 from tupli_mcap.mcap.records import HOLE
-from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT, EpisodeEnd
+from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 
 LAST_ROW = HOLE - 1  # of a channel: `sequence` has 32 bits
 
@@ -29,7 +29,7 @@ ENDS = np.dtype(
 
 
 class StartedEpisode(NamedTuple):
-    """An episode whose start is written."""
+    """An episode whose start is written; or derived later, if `start_row` is -1."""
 
     number: int
     env: int
@@ -62,26 +62,17 @@ class EpisodeDeriver:
         self._n = num_envs
         self._state = slice(STATE, state_end)
         self._began = np.zeros(num_envs, np.uint64)  # time of the last reset
-        self.begin([None] * num_envs)
-
-    def begin(self, started: Sequence[StartedEpisode | None]) -> None:
-        """Says whose first rows come next: episodes whose starts are written; None if a start has to be derived."""
-        self.running = np.array([-1 if one is None else one.number for one in started])
-        self._first_rows = np.array([0 if one is None else one.first_row for one in started])
-        self._lengths = np.zeros(self._n, np.int64)
-        self.totals = np.zeros(self._n)
+        self._begun: dict[int, tuple[int, int]] = {}  # what `begin` said since the last batch
+        self.running = np.full(num_envs, -1)
+        self._first_rows, self._lengths = np.zeros((2, num_envs), np.int64)
+        self.totals = np.zeros(num_envs)
         # ends whose final state comes with the next batch, by sub-environment
-        self._waiting: Array = np.zeros(self._n, ENDS)
-        self._waits = np.zeros(self._n, np.bool_)
+        self._waiting: Array = np.zeros(num_envs, ENDS)
+        self._waits = np.zeros(num_envs, np.bool_)
 
-    def wait_for(self, end: EpisodeEnd, time_ns: int) -> None:
-        """Says that the next row is a hole with the final state of the episode of `end`, which was not derived."""
-        facts = end.episode, end.env, end.first_row, end.length, end.episode_return, end.end, time_ns
-        self._waiting[end.env], self._waits[end.env] = facts, True
-
-    def unwritten(self, env: int) -> int:
-        """The episode that runs or waits for its final state, whose end was not derived; -1 if there is none."""
-        return int(self._waiting[env]["episode"] if self._waits[env] else self.running[env])
+    def begin(self, env: int, number: int, first_row: int) -> None:
+        """Says that the next row is the first one of an episode whose start is written; of none, if `number` is -1."""
+        self._begun[env] = number, first_row
 
     def derive(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
         """Derives the starts, ends and final states of new rows.
@@ -90,6 +81,10 @@ class EpisodeDeriver:
             rows: (num_envs, rows), in their order, with holes.
             pending: by sub-environment, the final state of an episode that the last one of `rows` ended.
         """
+        for env, (number, first_row) in self._begun.items():
+            self.running[env], self._first_rows[env] = number, first_row
+            self._lengths[env], self.totals[env], self._waits[env] = 0, 0.0, False
+        self._begun.clear()
         found = _Segments(rows["#sequence"], rows["terminal"] | rows["timeout"])
         going_on = found.is_first & (self.running[found.env] >= 0)
         rewards = np.where(found.hole, 0.0, rows["reward"]).reshape(-1)

@@ -73,7 +73,7 @@ class EpisodeLog(EventLog):
     ) -> None:
         self._start, self._final, self._end = ids = channels.start, channels.final_state, channels.end
         self._index = index
-        self._running: dict[int, StartedEpisode] = {}  # started; their ends will be derived
+        self.running: dict[int, StartedEpisode] = {}  # started and not ended, by number
         super().__init__(
             journal, name, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
         )
@@ -86,7 +86,8 @@ class EpisodeLog(EventLog):
         body += start_texts("" if seed is None else str(seed), options, info)
         row = self.sequences[self._start]
         time_ns = self.append(time_ns, (self._start, body))
-        return _new(StartedEpisode, (number, env, first_row, time_ns, seed, row))
+        self.running[number] = started = _new(StartedEpisode, (number, env, first_row, time_ns, seed, row))
+        return started
 
     def end(
         self,
@@ -104,6 +105,7 @@ class EpisodeLog(EventLog):
         Without a state `/episode_end` alone: the final state is row `final_row` of its channel, or not known (-1).
         """
         number, env, first_row, start_time, seed, start_row = episode
+        self.running.pop(number, None)
         has_final = state is not None or final_row >= 0
         body = END_FIELDS.pack(number, env, first_row, length, total, end, has_final) + end_texts(metadata)
         end_row = self.sequences[self._end]
@@ -115,14 +117,6 @@ class EpisodeLog(EventLog):
             now = self.append(now, (self._final, final), (self._end, body))
         row = first_row, length, total, start_time, now, seed, start_row, end_row, final_row, number, env, end
         self._index.add(row, metadata)
-
-    def expect_end(self, episode: StartedEpisode) -> None:
-        """Notes that the end of a started episode will be derived from its rows."""
-        self._running[episode.number] = episode
-
-    def take_back(self, number: int) -> StartedEpisode:
-        """Notes that the end of a running episode will be logged, and is not derived after all."""
-        return self._running.pop(number)
 
     def extend(self, batch: EpisodeBatch) -> None:
         """Adds `/episode_start`, `/final_state` and `/episode_end` of derived episodes."""
@@ -165,7 +159,7 @@ class EpisodeLog(EventLog):
         rows["start_time"][here] = begun["#log_time"][at[here]]
         rows["start_row"][here] = begun["#sequence"][at[here]]
         for i in np.flatnonzero(~here).tolist():
-            _, _, _, time_ns, seed, start_row = self._running.pop(int(ended["episode"][i]))
+            _, _, _, time_ns, seed, start_row = self.running.pop(int(ended["episode"][i]))
             rows["start_time"][i], rows["start_row"][i] = time_ns, start_row
             rows["seed"][i], rows["has_seed"][i] = indexed_seed(seed)
         self._index.extend(rows)
@@ -173,7 +167,7 @@ class EpisodeLog(EventLog):
         goes_on[at[here]] = False
         names = ["episode", "env", "first_row", "#log_time", "#sequence"]
         for number, env, first_row, time_ns, start_row in begun[goes_on][names].tolist():
-            self._running[number] = _new(StartedEpisode, (number, env, first_row, time_ns, None, start_row))
+            self.running[number] = _new(StartedEpisode, (number, env, first_row, time_ns, None, start_row))
 
     def _add(self, tables: dict[int, Array]) -> None:
         """Adds whole records by channel, all or none of them after a crash."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import StartedEpisode
-from tupli_mcap.messages.episodes import INTERRUPTED, EpisodeEnd
+from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
 from tupli_mcap.recording.write.episodes import ResetFacts
@@ -84,7 +84,7 @@ class SingleRecorder:
         self._earlier: list[ResetFacts] = []  # resets before it that no step followed
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step ended its episode, until that is written
-        self._rows: SingleRows | None = None  # if episodes can be derived from them
+        self._rows: SingleRows | None = None  # if episodes are derived from them
         self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_close = self._stop
@@ -104,7 +104,7 @@ class SingleRecorder:
         exactly."""
         if self._writer.closed:
             self._closed()
-        self._write_pending()
+        self._derive_pending()
         if self._reset is not None or self._episode is not None:
             self._keep_start_for(facts)
             self.end(INTERRUPTED)
@@ -137,39 +137,30 @@ class SingleRecorder:
         over, writer, rows = self._over, self._writer, self._rows
         if over is None or rows is None or writer.lost_streams:
             return False
-        if self._episode is not None:
-            self._start_deriving(rows, self._episode, over)
-        rows.put_next(writer.next_episode, state)
+        number = writer.next_episode
+        rows.put_next(number, state)
         writer.next_episode += 1
+        self._episode = StartedEpisode(number, 0, rows.count, 0, None, -1)
         self._over = None
         self.put = rows.put
         return True
 
-    def _start_deriving(self, rows: SingleRows, episode: StartedEpisode, end: int) -> None:
-        events = self._writer.events
-        if events is not None:
-            number, env, first_row = episode[:3]
-            length = rows.count - first_row
-            rows.start_deriving(
-                events, EpisodeEnd(number, env, first_row, length, rows.total, end, True, "{}"), episode
-            )
-            self._episode = None
-
-    def _write_pending(self) -> None:
+    def _derive_pending(self) -> None:
         """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
-        writer, rows = self._writer, self._rows
-        if rows is None or writer.closed:
+        writer, rows, episode = self._writer, self._rows, self._episode
+        if rows is None or writer.events is None or episode is None:
             return
         over, self._over = self._over, None
-        if self._episode is not None:
+        if episode.start_row >= 0:  # there is nothing but its end
             if over is not None:
                 self.end(over)
-        elif rows.derives:
-            self._episode = rows.stop_deriving(over=over is not None)
-            if self._episode is None and over is None:  # begun, and no step yet
-                writer.next_episode -= 1
-                facts = ResetFacts(None, None, "", "{}", time.time_ns())
-                self._episode = writer.start_episode(0, rows.count, facts)
+            return
+        rows.derive_pending(over=over is not None)
+        self._episode = writer.events.running.get(episode.number)
+        if episode.first_row == rows.count:  # begun, and no step yet
+            writer.next_episode -= 1
+            facts = ResetFacts(None, None, "", "{}", time.time_ns())
+            self._episode = writer.start_episode(0, rows.count, facts)
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -181,8 +172,7 @@ class SingleRecorder:
 
     def end(self, end: int, *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
-        if self._over is not None or self._episode is None:
-            self._write_pending()
+        self._derive_pending()
         episode, writer = self._episode, self._writer
         metadata, self.metadata = self.metadata, "{}"
         rows = writer.rows
@@ -197,6 +187,8 @@ class SingleRecorder:
         if final is not None:
             for sinks in writer.images:
                 final += sinks[0].pending()
+        if self._rows is not None:
+            self._rows.skip_pending()
         writer.end_episode(episode, end, length, rows.total, final, metadata)
         self.put = self._continue
 
@@ -242,8 +234,8 @@ class SingleRecorder:
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
         rows = writer.rows
-        if self.derives_episodes and isinstance(rows, SingleRows) and rows.can_derive and not writer.images:
-            self._rows = rows
+        if self.derives_episodes and isinstance(rows, SingleRows) and rows.can_derive:
+            self._rows, rows.events = rows, writer.events
         self._start_earlier()
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
@@ -260,7 +252,7 @@ class SingleRecorder:
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
-        self._write_pending()
+        self._derive_pending()
         if self.resets_itself:
             self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
             return
@@ -276,7 +268,7 @@ class SingleRecorder:
     def go_on_from(self, before: SingleRecorder, state: Any) -> None:
         """Takes over from the recorder of the file before, between episodes, with the environment at `state`: a step
         without a reset begins an episode there."""
-        before._write_pending()
+        before._derive_pending()
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = {0}
         if self.resets_itself and before._episode is None:

@@ -53,7 +53,7 @@ class VectorRecorder:
         derives_episodes: bool = False,
     ) -> None:
         self.derives_episodes = derives_episodes and autoreset.mode == "NextStep" and not autoreset.is_assumed
-        self._deriving: VectorRows | None = None  # the rows that starts and ends are derived from
+        self._deriving: VectorRows | None = None  # the rows, while starts and ends are derived from them
         self._writer = writer
         self._spaces = spaces
         self._n = num_envs
@@ -99,7 +99,7 @@ class VectorRecorder:
             raise StepError(
                 "the step before this reset could not be recorded; call env.reset() without a reset_mask to go on"
             )
-        self._write_pending()
+        self._derive_pending()
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
         self._end([(int(i), INTERRUPTED) for i in chosen])
@@ -152,8 +152,7 @@ class VectorRecorder:
             if any_done:
                 terminals, timeouts = self._plain(terminals, timeouts, done, flags)
             if any_done and infos and self._deriving and tells_success(infos):
-                self.derives_episodes = False  # ends have metadata, which rows do not tell
-                self._write_pending()
+                self._stop_deriving()  # ends have metadata, which rows do not tell
             finals = self._finals(done, states, infos) if any_done and (infos or not resets.is_plain) else {}
             holes = self._ended if self._any_ended and resets.mode == "NextStep" else None
             active = None if holes is None else ~holes
@@ -268,6 +267,8 @@ class VectorRecorder:
         store = self._writer.vector
         assert store is not None
         store.put_state(self._first)
+        if self.derives_episodes and isinstance(store, VectorRows) and store.can_derive:
+            self._deriving, store.events = store, self._writer.events
         self._first = None
         return store
 
@@ -283,8 +284,7 @@ class VectorRecorder:
                 self._encode_final(state) != self._encode_final(after[i]) for i, state in found.items()
             )
             if resets.resets_already(changed=changed):
-                self.derives_episodes = False
-                self._write_pending()
+                self._stop_deriving()
         if resets.mode != "SameStep":
             resets.note_ends(known=True)
             return {}
@@ -322,28 +322,17 @@ class VectorRecorder:
                     writer.start_episode(i, counts[i], earlier)
                     writer.keep_start()
                 self._earlier[i] = []
-            self._episodes[i] = writer.start_episode(i, counts[i], facts)
+            self._episodes[i] = episode = writer.start_episode(i, counts[i], facts)
+            if self._deriving:
+                self._deriving.begin_episode(episode)
         first = writer.next_episode - len(waiting)
         self._episode_numbers[waiting] = range(first, writer.next_episode)
         self._lengths[waiting] = 0
         self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
         self._any_waits = bool(self._waiting)
-        self._start_deriving()
 
     # ---- episodes derived from rows
-
-    def _start_deriving(self) -> None:
-        """From here on episodes are derived, if that is possible; where none is running, the next row is a hole."""
-        store, events = self._writer.vector, self._writer.events
-        if not self.derives_episodes or events is None or self._writer.images or self._deriving:
-            return
-        if not isinstance(store, VectorRows) or not store.can_derive or self._lengths.any():
-            return
-        store.start_deriving(events, self._episodes)
-        self._episodes = [None] * self._n
-        self._waiting.clear()
-        self._deriving, self._any_waits = store, False
 
     def _begin_derived(self, holes: Array, infos: Mapping[str, Any]) -> None:
         """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
@@ -351,23 +340,30 @@ class VectorRecorder:
         first, writer.next_episode = writer.next_episode, writer.next_episode + len(begun)
         self._episode_numbers[begun] = np.arange(first, writer.next_episode)
         self._lengths[begun] = 0
+        self._waiting.difference_update(begun.tolist())
+        self._any_waits = bool(self._waiting)
         if infos and any(infos_of(infos, begun.tolist(), self._n)):
-            self.derives_episodes = False
-            self._write_pending()
+            self._stop_deriving()
             self._note_resets(holes, infos)
 
-    def _write_pending(self) -> None:
+    def _stop_deriving(self) -> None:
+        """From here on starts and ends are written as they happen, for rows do not hold all that they say."""
+        self._derive_pending()
+        if self._deriving:
+            self._deriving.events = None
+        self._deriving, self.derives_episodes = None, False
+
+    def _derive_pending(self) -> None:
         """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
         late, self._late = self._late, []
         self._end(late)
         store, events = self._deriving, self._writer.events
         if store is None or events is None:
             return
-        self._deriving = None
         now = time.time_ns()
-        for i, (number, total) in enumerate(zip(*store.stop_deriving(self._ended), strict=True)):
-            if number >= 0:
-                self._episodes[i], self._totals[i] = events.take_back(number), total
+        for i, (number, total) in enumerate(zip(*store.derive_pending(self._ended), strict=True)):
+            self._episodes[i], self._totals[i] = events.running.get(number), total
+            if self._episodes[i] is not None or i in self._waiting:
                 continue
             self._waiting.add(i)
             self._any_waits = True
@@ -434,7 +430,7 @@ class VectorRecorder:
 
     def go_on_from(self, before: VectorRecorder, states: Any) -> None:
         """Takes over from the recorder of the file before, between episodes, with the sub-environments at `states`."""
-        before._write_pending()
+        before._derive_pending()
         self.derives_episodes = before.derives_episodes
         self._writer.layout = before._writer.layout
         self._writer.lost_streams = set(range(self._n))
@@ -450,14 +446,14 @@ class VectorRecorder:
         self._final_rows.clear()
         self._writer.lost_streams.update(range(self._n))
         if not self._writer.closed:
-            self._write_pending()
+            self._derive_pending()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
         if self._writer.closed:
             return
-        self._write_pending()
+        self._derive_pending()
         self._end([(i, INTERRUPTED) for i in range(self._n)])
         self._refused = True
         self._writer.close()

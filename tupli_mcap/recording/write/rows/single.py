@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.committed import RowDeriver, even_rows
-from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
+from tupli_mcap.journal.derive import EpisodeDeriver
 from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import STATE, Sink, seal
 from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.encode_rows import ImageSink, make_row_encoder
-from tupli_mcap.messages.episodes import EpisodeEnd
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
@@ -75,9 +74,8 @@ class SingleRows:
         self.put_next = encoder.put_next
         self.put_whole = encoder.put_whole
         self._offset = encoder.offset
-        # where derived episodes go; None while none are derived
-        self._events: EpisodeLog | None = None
-        self._derived = 0  # rows of the running half that episodes were derived from
+        self.events: EpisodeLog | None = None  # where derived episodes go; None: none are derived
+        self._derived = 0  # offset of the rows that no episodes were derived from yet
         self._episodes = EpisodeDeriver(1, encoder.state_end)
         self._state_end = encoder.state_end
         self._go_to(0)
@@ -94,10 +92,12 @@ class SingleRows:
         return self._encoder.total()
 
     def begin_episode(self, episode: int) -> None:
-        """The rows that follow belong to `episode`."""
+        """The rows that follow belong to `episode`, whose start is written."""
         start, prefix = self._offset(), self._header + NUMBERS.pack(episode, 0)
         self._encoder.begin(prefix)
         self._buffer[start : start + len(prefix)] = prefix
+        self._derived = start
+        self._episodes.begin(0, episode, self.count)
 
     # ---- many steps at once
 
@@ -159,48 +159,21 @@ class SingleRows:
     def can_derive(self) -> bool:
         """True if rows hold all that an episode is."""
         layout = self._layout
-        return not self._sealed and layout.reward_space is None and self._state_end > STATE
+        alone = layout.reward_space is None and not layout.images
+        return not self._sealed and alone and self._state_end > STATE
 
-    @property
-    def derives(self) -> bool:
-        """True while episodes are derived."""
-        return self._events is not None
+    def skip_pending(self) -> None:
+        """Says that the records of all episodes up to here are written."""
+        self._derived = self._offset()
+        self._episodes.begin(0, -1, 0)
 
-    def start_deriving(self, events: EpisodeLog, ended: EpisodeEnd, started: StartedEpisode) -> None:
-        """From here on episodes are derived and go to `events`, with the final state of the one that has just ended."""
-        self._events = events
-        self._derived = (self._offset() - self._starts[self._half]) // self._area.row_size
-        self._episodes.begin([None])
-        self._episodes.wait_for(ended, time.time_ns())
-        events.expect_end(started)
-
-    def stop_deriving(self, *, over: bool) -> StartedEpisode | None:
-        """Derives what is pending, and from here on nothing.
-
-        Args:
-            over: the last row has ended its episode, and the running one has its final state.
-
-        Returns:
-            The episode whose end is not written; None before its first step.
-        """
-        events = self._events
-        if events is None:
-            return None
-        half = self._starts[self._half]
-        row = (self._offset() - half) // self._area.row_size
-        self._derive(half, row, {0: self.pending_state()} if over else None)
-        self._events = None
-        number = self._episodes.unwritten(0)
-        return None if number < 0 else events.take_back(number)
-
-    def _derive(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
-        """Derives episodes from the rows of a half before `end`, as far as that is not done yet."""
-        if self._events is None:
-            return
-        size, begin = self._area.row_size, self._derived
-        self._derived = end
-        rows = np.frombuffer(self._buffer[half + begin * size : half + end * size], self._dtype)
-        self._events.extend(self._episodes.derive(rows[None], pending))
+    def derive_pending(self, *, over: bool = False) -> None:
+        """Derives episodes from all rows so far. `over`: the running row has the final state of the last episode."""
+        pending = {0: self.pending_state()} if over else None
+        begin, self._derived = self._derived, self._offset()
+        if self.events is not None:
+            rows = np.frombuffer(self._buffer[begin : self._derived], self._dtype)
+            self.events.extend(self._episodes.derive(rows[None], pending))
 
     def pending_state(self) -> bytes:
         """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
@@ -216,7 +189,7 @@ class SingleRows:
         """The half is full: go on in the other one, then write this one as a chunk."""
         area, half = self._area, self._half
         # before the other half's last row goes, whose hole may be here
-        self._derive(self._starts[half], area.rows)
+        self.derive_pending()
         spare = self._starts[half] + area.rows * area.row_size
         self._half = 1 - half
         # a power loss may leave a part of what is written over these rows, and not the chunk they are in
@@ -225,7 +198,7 @@ class SingleRows:
         self._buffer[start : start + self._state_end] = self._buffer[spare : spare + self._state_end]
         flushed, self._flushed = self._flushed, 0
         self._go_to(self._half)
-        self._derived = 0
+        self._derived = self._starts[self._half]
         self._emit(self._starts[half], flushed, area.rows)
 
     def _go_to(self, half: int) -> None:
@@ -239,7 +212,7 @@ class SingleRows:
         start = self._starts[self._half]
         rows = (self._offset() - start) // self._area.row_size
         flushed, self._flushed = self._flushed, rows
-        self._derive(start, rows)
+        self.derive_pending()
         self._emit(start, flushed, rows)
 
     def _emit(self, start: int, begin: int, end: int) -> None:

@@ -80,8 +80,7 @@ class VectorRows:
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
         self._make_views()
         self._fill_heads()
-        # where derived episodes go; None while none are derived
-        self._events: EpisodeLog | None = None
+        self.events: EpisodeLog | None = None  # where derived episodes go; None: none are derived
         self._derived = 0  # rows of the running half that episodes were derived from
         self._episodes = EpisodeDeriver(n, layout.state_end)
         self._state = [self._writer(leaf, 1) for leaf in layout.state if not leaf.apart]
@@ -212,19 +211,15 @@ class VectorRows:
     @property
     def can_derive(self) -> bool:
         """True if rows hold all that an episode is."""
-        return not self._sealed and self._layout.reward_space is None and self._state_end > STATE
+        alone = self._layout.reward_space is None and not self._layout.images
+        return not self._sealed and alone and self._state_end > STATE
 
-    def start_deriving(self, events: EpisodeLog, running: Sequence[StartedEpisode | None]) -> None:
-        """From here on episodes are derived, and go to `events`. `running` are those that have been started, by
-        sub-environment, and have no row yet."""
-        self._events, self._derived = events, self._row
-        self._episodes.begin(running)
-        for started in running:
-            if started is not None:
-                events.expect_end(started)
+    def begin_episode(self, episode: StartedEpisode) -> None:
+        """The next row of a sub-environment is the first one of an episode whose start is written."""
+        self._episodes.begin(episode.env, episode.number, episode.first_row)
 
-    def stop_deriving(self, over: Array) -> tuple[list[int], list[float]]:
-        """Derives what is pending, and from here on nothing.
+    def derive_pending(self, over: Array) -> tuple[list[int], list[float]]:
+        """Derives all episodes up to here.
 
         Args:
             over: where the last row has ended its episode, and the running one has its final state: bool (num_envs,).
@@ -233,14 +228,13 @@ class VectorRows:
             The numbers of the running episodes (-1: none), and their returns so far.
         """
         self._derive(self._half, self._row, {i: self.pending_state(i) for i in np.flatnonzero(over).tolist()})
-        self._events = None
         return self._episodes.running.tolist(), self._episodes.totals.tolist()
 
     def _derive(self, half: int, end: int, pending: Mapping[int, bytes] | None = None) -> None:
         """Derives episodes from the rows of a half before `end`, as far as that is not done yet."""
-        if self._events is not None:
+        if self.events is not None:
             begin, self._derived = self._derived, end
-            self._events.extend(self._episodes.derive(self._rows[half, :, begin:end], pending))
+            self.events.extend(self._episodes.derive(self._rows[half, :, begin:end], pending))
 
     def pending_state(self, i: int) -> bytes:
         """As `BatchStore.pending_state`."""
