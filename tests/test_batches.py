@@ -211,7 +211,7 @@ def test_the_quick_check_of_a_structure(space: Any) -> None:
     check(space.sample())
     for value in variants(space, space.sample()):
         said = ["", ""]
-        for i, each in enumerate((check, partial(check_structure, space, path="state"))):
+        for i, each in enumerate((check, partial(check_structure, space, root="state"))):
             try:
                 each(value)
             except StepError as err:

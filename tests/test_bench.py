@@ -148,7 +148,7 @@ class TestVectors:
         self, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """Resets are no steps; where one value differs, there is no time. Each contender is tried with another leaf."""
-        worker, path = Worker(name), str(tmp_path / "run.data")
+        worker, path = Worker(name), str(tmp_path / "run.mcap")
         worker._trials = [1.0, 1.0]  # how long it takes is not asked
         ask = {"do": "build", "work": workloads.VECTOR, "steps": 6400}
         answer = worker.answer({**ask, "path": path})
@@ -167,7 +167,7 @@ class TestVectors:
             return found
 
         monkeypatch.setattr(worker._contender, "read_vector", changed)
-        answer = worker.answer({**ask, "path": str(tmp_path / f"{leaf}.data")})
+        answer = worker.answer({**ask, "path": str(tmp_path / f"{leaf}.mcap")})
         assert answer["failed"].startswith("WrongResultError: other ")
 
 

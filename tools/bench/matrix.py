@@ -85,7 +85,7 @@ class Workbench:
         started = time.perf_counter()
         built: dict[str, Any] = {}
         cells: dict[str, dict[str, Cell]] = {operation: {} for operation in operations}
-        paths = {name: self.run.fresh(f"{work}-{number}.data") for number, name in enumerate(names)}
+        paths = {name: self.run.fresh(f"{work}-{number}.mcap") for number, name in enumerate(names)}
         steps = self.run.part(steps, 250)
         for name in names:
             try:
@@ -202,7 +202,7 @@ def grow(
             continue
         found[name] = []
         for steps in sizes:
-            path = bench.run.fresh(f"grow-{steps}.data")
+            path = bench.run.fresh(f"grow-{steps}.mcap")
             began = time.perf_counter()
             try:
                 found[name].append(process.ask("grow", 240, work="growth", path=str(path), steps=steps))

@@ -61,7 +61,7 @@ def field_names(
         raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
     for written, name in zip(given, names, strict=True):
         if name not in known:
-            hint = did_you_mean(re.split(r"[.\[]", name)[0], known)
+            hint = did_you_mean(re.split(r"[.\[]", str(name))[0], known)
             raise error(f"expected fields from {', '.join(known)}, found {written!r:.80}{hint}")
     return list(dict.fromkeys(names))
 
