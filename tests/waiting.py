@@ -8,7 +8,9 @@ import socket
 import time
 from collections.abc import Callable
 
-_PORTS = itertools.count(10_000 + 1009 * os.getpid() % 20_000)  # far from those of a process started beside it
+_PORTS = itertools.count(
+    10_000 + 1009 * os.getpid() % 20_000
+)  # far from those of a process started beside it
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
