@@ -6,6 +6,7 @@ import contextlib
 import gc
 import pickle
 import tempfile
+import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -151,7 +152,11 @@ def test_who_goes_away_is_not_sent_to(users: Users, tmp_path: Path) -> None:
     )
     name = users.ann.push(tmp_path / "large.mcap")
     url, headers = f"{users.url}/v1/query", token_of(users.ann)
-    with httpx.stream("POST", url, json={"recordings": [name]}, headers=headers) as answer:
+    small = httpx.HTTPTransport(socket_options=[(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)])
+    with (
+        httpx.Client(transport=small) as client,
+        client.stream("POST", url, json={"recordings": [name]}, headers=headers) as answer,
+    ):
         assert len(next(answer.iter_raw(1 << 16))) == 1 << 16
         assert any(thread.name == "tupli-stream" for thread in threading.enumerate())
     wait_for(lambda: not any(thread.name == "tupli-stream" for thread in threading.enumerate()))

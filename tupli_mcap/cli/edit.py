@@ -238,9 +238,8 @@ def edit(
     """Change the name, metadata, tags or split of runs.
 
     The recordings keep their ids, and their steps are not touched. A signature is dropped. If
-    one recording cannot be changed, none is. With --filter, only the recordings are changed
-    that have an episode which matches. With --undo, recordings of a directory that were not
-    edited stay as they are.
+    one recording cannot be changed, none is. With --filter, only recordings are changed that
+    have an episode which matches; with --undo, of a directory, only those that were edited.
     """
     from tupli_mcap.recording import edit_run, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
