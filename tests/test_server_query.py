@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import gc
 import pickle
-import tempfile
 import socket
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
