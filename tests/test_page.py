@@ -367,7 +367,7 @@ class TestChosen:
 
     def test_lines_beside_rows(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         sparks = web.get("/sparks", params={"episode": [e["id"] for e in best]}).json()
-        assert sparks["name"] == "state.Cart Position"  # the rewards are always the same
+        assert sparks["name"] == "Cart Position"  # the rewards are always the same
         assert set(sparks["lines"]) == {e["id"] for e in best}
         assert all(re.fullmatch(r"[ML0-9. -]+", line) for line in sparks["lines"].values())
 

@@ -115,9 +115,7 @@ def test_values_are_those_of_the_whole_data(
     assert (reward.mean[0], reward.std[0], reward.values.shape) == (1.0, 0.0, (1, 400))
     assert found.read_steps == found.steps == 400
     assert found.notes() == []
-    assert state.names == tuple(
-        f"state.{name}" for name in ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
-    )
+    assert state.names == ("Cart Position", "Cart Velocity", "Pole Angle", "Pole Angular Velocity")
 
 
 def test_nan_and_infinities_are_counted_and_left_out(tmp_path: Path) -> None:
@@ -417,7 +415,7 @@ def test_names_and_labels_are_in_the_picture(tmp_path: Path) -> None:
         for _ in range(5):
             recorded.step(2)
     found = texts(report(path))
-    assert {"state.height", "state.speed $^2$", "state.drag", "left", "stay", "right"} <= set(found)
+    assert {"height", "speed $^2$", "drag", "left", "stay", "right"} <= set(found)
     assert found.count(" never") == 2
 
 
@@ -1152,8 +1150,8 @@ def test_a_sketch_is_of_the_whole_data(cartpole: Path) -> None:
     assert lengths.each == -(-len(rows) // 10)
     assert returns.values == lengths.values  # a reward of 1 a step
     by_name = {series.name: series for series in found.distributions}
-    assert list(by_name)[:2] == ["reward", "state.Cart Position"] and list(by_name)[-1] == "action"
-    for i, name in enumerate(("state.Cart Position", "state.Cart Velocity")):
+    assert list(by_name)[:2] == ["reward", "Cart Position"] and list(by_name)[-1] == "action"
+    for i, name in enumerate(("Cart Position", "Cart Velocity")):
         np.testing.assert_array_equal(by_name[name].values, np.histogram(states[:, i], 10)[0])
     assert (found.sampled, found.hidden, found.error) == (400, 0, "")
 
@@ -1217,9 +1215,7 @@ def test_info_where_blocks_cannot_be_printed(cartpole: Path) -> None:
         [TOOL, "info", str(cartpole)], capture_output=True, check=True, timeout=60,
         env={**os.environ, "PYTHONIOENCODING": "ascii"},
     )  # fmt: skip
-    (line,) = [
-        line for line in done.stdout.decode("ascii").splitlines() if line.startswith("state.Pole Angle ")
-    ]
+    (line,) = [line for line in done.stdout.decode("ascii").splitlines() if line.startswith("Pole Angle ")]
     assert set(line) & set(PLAIN)
 
 

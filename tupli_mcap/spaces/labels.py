@@ -178,11 +178,12 @@ def leaves_by_name(leaves: Sequence[Leaf]) -> dict[str, Leaf]:
 
 def element_names(leaf: Leaf, labels: Labels, elements: Sequence[int] | None = None) -> tuple[str, ...]:
     """Names of some elements (C order; all by default): `state.q[0]`, with its label, if there is one, in place of the
-    index: `state.q: elbow`, or `state.Pole Angle` if the state is this leaf alone."""
+    index: `state.q: elbow`, or `Pole Angle` if the state is this leaf alone."""
     chosen = np.arange(leaf.size) if elements is None else np.asarray(elements, np.int64)
     known = labels.dimensions.get(leaf.path)
     if known is not None:
-        return tuple(f"{leaf.path}{': ' if leaf.keys else '.'}{known[i]}" for i in chosen)
+        own = f"{leaf.path}: " if leaf.keys else ""
+        return tuple(own + known[i] for i in chosen)
     return indexed_names(leaf.path, leaf.shape, chosen)
 
 

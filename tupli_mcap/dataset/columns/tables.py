@@ -244,6 +244,7 @@ def _named(column: Any, leaves: Sequence[Leaf], labels: Labels) -> Mapping[str, 
             columns.append((leaf.path, _texts(list(values))))
             continue
         flat = values.reshape(len(values), leaf.size)
-        columns += [(name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
+        own = f"{leaf.root}." if not leaf.keys and leaf.path in labels.dimensions else ""
+        columns += [(own + name, flat[:, i]) for i, name in enumerate(element_names(leaf, labels))]
     names = distinct([name for name, _ in columns])
     return {name: values for name, (_, values) in zip(names, columns, strict=True)}
