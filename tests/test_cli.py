@@ -628,9 +628,7 @@ class TestLook:
         assert facts["benchmark"] == "none"
         assert facts["action"] == "one of 2: 0 Push cart to the left, 1 Push cart to the right"
         assert facts["observation"] == "4 numbers (float32)"
-        assert re.search(
-            r"^ +state\.Cart Position +-4\.8 … 4\.8\n +state\.Cart Velocity +-inf … inf$", out, re.MULTILINE
-        )
+        assert re.search(r"^ +Cart Position +-4\.8 … 4\.8\n +Cart Velocity +-inf … inf$", out, re.MULTILINE)
         assert re.search(r"compressed \d+\.\d : 1", facts["size"])
         assert "/step           tupli_mcap/msg/Step" in out
         assert "benchmark.json" in out
