@@ -168,11 +168,12 @@ class Workbench:
     def _ask(self, name: str, operation: str, work: str, path: Path, steps: int) -> float:
         ask = self.processes[name].ask
         if operation == "record":
-            other = f"{path}-recorded"
+            other = str(path.with_name(f"recorded-{path.name}"))
             return float(ask("record", work=work, path=other, seconds=self.record_seconds, steps=steps))
         arguments: dict[str, Any] = {"work": work, "path": str(path)}
         if operation == "append":
-            return float(ask("append", copy=f"{path}-more", episodes=APPENDED[work], **arguments))
+            copy = str(path.with_name(f"more-{path.name}"))
+            return float(ask("append", copy=copy, episodes=APPENDED[work], **arguments))
         if operation.startswith("epoch"):
             return float(
                 ask("epoch", 90, workers=int(operation[-1]), seconds=self.record_seconds, **arguments)
