@@ -1134,9 +1134,8 @@ def test_a_file_that_does_not_exist(command: tuple[str, ...], here: Path) -> Non
 
 
 def test_episodes_of_what_is_missing(here: Path) -> None:
-    assert (
-        fails("episodes", "bad.mcap") == "there is no file 'bad.mcap'; give the path of a recording (.mcap)"
-    )
+    missing = "bad.mcap does not exist; give a recording (.mcap) or a directory of them"
+    assert fails("episodes", "bad.mcap") == missing
 
 
 # --- storages ---

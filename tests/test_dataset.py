@@ -723,15 +723,18 @@ def test_where_files_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert names(["b.mcap", Path("a.mcap"), "b.mcap"]) == ["b.mcap", "a.mcap"]
     assert names("deep/er/d [1].mcap") == ["d [1].mcap"]
     assert names(tmp_path / "deep" / "c.mcap") == ["c.mcap"]
+    assert names([tmp_path / "deep", "a.mcap"]) == ["c.mcap", "d [1].mcap", "a.mcap"]
 
 
 def test_files_that_are_no_recordings(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"no file matches .*runs/\*\.mcap"):
         TupliDataset.from_files(str(tmp_path / "runs/*.mcap"))
-    with pytest.raises(RecordingError, match=r"there is no file .*x\.mcap"):
+    with pytest.raises(RecordingError, match=r"x\.mcap does not exist; give"):
         TupliDataset.from_files(tmp_path / "x.mcap")
-    with pytest.raises(RecordingError, match="is a directory; give a pattern"):
+    with pytest.raises(RecordingError, match="expected at least one recording, found none"):
         TupliDataset.from_files(tmp_path)
+    with pytest.raises(RecordingError, match="expected a path, found an empty text"):
+        TupliDataset.from_files("")
     with pytest.raises(RecordingError, match="expected at least one recording"):
         TupliDataset.from_files([])
     with pytest.raises(RecordingError, match="expected the path of a recording or a pattern, found 3"):

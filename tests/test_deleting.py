@@ -216,6 +216,14 @@ def test_in_python_and_back(runs: Path) -> None:
         tupli_mcap.restore_episodes(runs / "none.mcap")
 
 
+def test_a_pattern_that_the_shell_has_left(runs: Path) -> None:
+    pattern = str(runs / "**" / "*.mcap")
+    assert "deleted 2 episodes" in run("delete", pattern, "--episodes", "0")
+    assert seeds(runs / "deep" / "b.mcap")[0] == 1
+    assert "restored 2 episodes" in run("restore", pattern)
+    assert "no file matches" in run("restore", str(runs / "x*.mcap"), code=1)
+
+
 def test_what_is_not_deleted_is_not_restored(runs: Path) -> None:
     file, other = runs / "a.mcap", runs / "deep" / "b.mcap"
     for words in (["delete"], ["restore"], ["restore", str(other)]):

@@ -98,8 +98,8 @@ def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("nowhere.mcap", "there is no file 'nowhere.mcap'"),
-        ("nowhere/", "there is no file or directory 'nowhere/'"),
+        ("nowhere.mcap", "nowhere.mcap does not exist; give a recording"),
+        ("nowhere/", "nowhere does not exist; give a recording"),
         ("nowhere*.mcap", "no file matches"),
         (3, "expected a path, a pattern"),
         ([3], "expected paths, patterns"),

@@ -286,11 +286,11 @@ def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
 
 def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathered) -> list[str]:
     """The recordings of paths, or those that have an episode which matches; see `chosen_in`."""
-    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.listing import recordings_at
 
     if filter_text is not None:
         return [file for file, _ in chosen_in(places, None, filter_text, gathered)]
-    files = list(dict.fromkeys(str(file) for place in places for file in find_recordings(place)))
+    files = list(dict.fromkeys(file for place in places for file in recordings_at(place)))
     if not files:
         raise RecordingError(f"there is no recording in {', '.join(map(str, places))}")
     return files

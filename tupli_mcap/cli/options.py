@@ -128,7 +128,7 @@ def recordings_of(sources: Sequence[str]) -> list[str]:
             f"expected recordings, found the server {shown(source)}; fetch them with tupli-mcap pull, or write its "
             f"episodes into one file: tupli-mcap filter {shown(source)} FILTER -o FILE"
         )
-    return [str(file) for source in sources for file in recordings_at(source)]
+    return [file for source in sources for file in recordings_at(source)]
 
 
 def filter_of(text: str | None) -> BaseFilter | None:
@@ -143,13 +143,9 @@ def filter_of(text: str | None) -> BaseFilter | None:
 def check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
     """Raises FilterError if the filter, which matched nothing, names a key of metadata or runs that no episode has;
     warns of a text that none has there."""
-    from tupli_mcap.storage.listing import recordings_at
-
     if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
         return
-    is_one = is_server(sources[0])
-    found = sources if is_one else [str(file) for source in sources for file in recordings_at(source)]
-    if found:
+    if found := sources if is_server(sources[0]) else recordings_of(sources):
         matching_in(dataset_of(found), wanted)
 
 

@@ -182,14 +182,12 @@ def _delete_in_files(
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
     from tupli_mcap.storage.base import episode_id
-    from tupli_mcap.storage.listing import find_recordings
 
-    files = [str(file) for given in paths for file in find_recordings(given)]
     gathered = Gathered()
     doomed = chosen_in(paths, episodes, filter_text, gathered)
     gathered.raise_all()
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
-    return ids, curate.delete(FilesSource(files), doomed, force=force, dry_run=dry_run)
+    return ids, curate.delete(FilesSource(file for file, _ in doomed), doomed, force=force, dry_run=dry_run)
 
 
 def restore(

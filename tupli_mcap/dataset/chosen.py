@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
 
 import numpy as np
@@ -126,7 +125,7 @@ def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Su
 
     error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
     try:
-        files = [str(file) for file in recordings_at(name)]
+        files = recordings_at(name)
     except TupliError as err:
         files, error = [], err
     for file in files:
@@ -227,9 +226,7 @@ def _many_at(place: str) -> EpisodeSource | None:
 
     if is_url(place) or not is_of_several(place):
         return None
-
-    files = [Path(file) for file in recordings_at(place)]
-    if not files:
+    if not (files := recordings_at(place)):
         raise RecordingError(f"{place} holds no recording (.mcap)")
     return FilesSource(files, of_directory=True)
 

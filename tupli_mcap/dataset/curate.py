@@ -34,7 +34,6 @@ from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.recording.recover.evidence import metadata_at
-from tupli_mcap.remote import path_of
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 
@@ -391,11 +390,11 @@ def _deleted_at(
     is within one of them; the key names it.
     """
     from tupli_mcap.storage import FileStorage
-    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.listing import recordings_at
     from tupli_mcap.storage.sidecar import storage_of
 
     by_root: dict[Path, set[str]] = {}
-    for file in (file.absolute() for file in find_recordings(path_of(place))):
+    for file in (Path(file).absolute() for file in recordings_at(place)):
         root = storage_of(file)
         by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
     found = []

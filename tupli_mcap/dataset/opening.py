@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 from tupli_mcap.dataset.dataset import Dataset
-from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, place_of
+from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, files_at, place_of
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, path_of
 from tupli_mcap.storage import TupliStorage
-from tupli_mcap.storage.listing import find_recordings, is_storage
+from tupli_mcap.storage.listing import is_storage, recordings_at
 
 Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
 
@@ -49,7 +49,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
             return Dataset(StorageSource(TupliAPIClient(name)))
         if is_url(name) or not folder.is_dir():
             return Dataset(FilesSource(source))
-        files = _files_in(folder)
+        files = recordings_at(folder)
         if is_storage(folder) or not files:
             from tupli_mcap.storage import FileStorage  # and with it a database, which files do not need
 
@@ -64,18 +64,14 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
 
 def _files_in(source: Openable) -> Sequence[str]:
     """The recordings of one source."""
-    if isinstance(source, TupliStorage):
-        from tupli_mcap.storage import FileStorage
-
-        source = source.root if isinstance(source, FileStorage) else source
     if isinstance(source, Recording):
         return [place_of(source)]
     if isinstance(source, str | os.PathLike):
-        name = os.fspath(source)
-        folder = path_of(name).expanduser()
-        if not is_url(name) and folder.is_dir():
-            return [str(path) for path in find_recordings(folder)]
-        return FilesSource(source).names
+        return files_at(source)
+    from tupli_mcap.storage import FileStorage
+
+    if isinstance(source, FileStorage):
+        return recordings_at(source.root)
     raise DatasetError(
         f"expected paths, patterns, URLs and recordings in a list, found {source!r:.80}; "
         "open a server by itself, and join datasets with +"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import glob
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Columns, Episode, Recording
-from tupli_mcap.remote import is_url, matching, shown_name
+from tupli_mcap.remote import is_url, path_of, shown_name
 from tupli_mcap.schema import (
     BaseFilter,
     BenchmarkHeader,
@@ -128,12 +127,12 @@ class FilesSource:
     """The episodes of recordings given by path or URL. Episodes that a storage has deleted are left out.
 
     Args:
-        files: a path, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; a pattern's
-            files are taken in the order of their names.
+        files: a file, a directory, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; the files
+            of a directory or a pattern are taken in the order of their names.
         of_directory: they are the files of a directory, where files that are no recordings are left out with a warning.
 
     Raises:
-        RecordingError: nothing was given, a pattern matches nothing, or a path does not exist.
+        RecordingError: there is no file, a pattern matches nothing, or a path does not exist.
     """
 
     def __init__(
@@ -145,11 +144,9 @@ class FilesSource:
                 f"expected paths of recordings, a pattern or a URL, found {files!r:.80}; give some"
             )
         given = [files] if isinstance(files, str | os.PathLike) else list(files)
-        names = [name for item in given for name in _expand(item)]
+        names = [name for item in given for name in files_at(item)]
         if not names:
-            raise RecordingError(
-                "expected at least one recording, found an empty list; give paths or a pattern"
-            )
+            raise RecordingError("expected at least one recording, found none; give paths or a pattern")
         self.names = list(dict.fromkeys(names))
         # by the names that are shown; of paths the absolute ones, since the working directory may change
         self._places = {
@@ -304,22 +301,12 @@ def _left_out(
     )
 
 
-def _expand(item: str | os.PathLike[str]) -> Sequence[str]:
+def files_at(item: str | os.PathLike[str]) -> list[str]:
+    """As `recordings_at`; `~` is the user's directory."""
     if not isinstance(item, str | os.PathLike):
         raise RecordingError(f"expected the path of a recording or a pattern, found {item!r:.80}")
     name = os.fspath(item)
-    if is_url(name):
-        return matching(name)
-    path = Path(name).expanduser()
-    if path.is_dir():
-        raise RecordingError(
-            f"{name} is a directory; give a pattern such as {str(path / '*.mcap')!r}, or open a storage with "
-            f"TupliDataset(FileStorage({name!r}))"
-        )
-    if not path.exists() and not glob.has_magic(name):
-        what = "there is no file" if path.suffix else "there is no file or directory"
-        raise RecordingError(f"{what} {name!r}; give the path of a recording (.mcap)")
-    return [str(file) for file in recordings_at(path)]
+    return recordings_at(name if is_url(name) else path_of(name).expanduser())
 
 
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:

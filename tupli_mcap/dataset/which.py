@@ -123,14 +123,14 @@ def numbers_in(
         FilterError: the text is something else, or the filter has an unknown key.
         RecordingError: there is no such recording or directory.
     """
-    from tupli_mcap.storage.listing import find_recordings
+    from tupli_mcap.storage.listing import recordings_at
 
     found: dict[tuple[str, str], dict[int, None]] = {}
     for place in places:
         files: list[tuple[str, str]] = []  # of each episode
         numbers: list[int] = []
         returns: list[float] = []
-        for file in map(str, find_recordings(place)):
+        for file in recordings_at(place):
             with gathered.keep(), Recording(file) as recording:
                 rows = recording.index[candidates(recording, filter)]
                 files += [(file, recording.uuid)] * len(rows)

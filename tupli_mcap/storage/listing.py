@@ -192,19 +192,6 @@ def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequen
     return RecordingStamp(status.st_size, status.st_mtime_ns, hash((*facts, *deleting)) & (2**63 - 1))
 
 
-def find_recordings(path: Path) -> list[Path]:
-    """A file itself, or the recordings (`.mcap`) below a directory, sorted.
-    RecordingError if there is no such file or directory, or the directory cannot be read."""
-    if path.is_dir():
-        try:
-            return [path / item.relative for item in sorted(scan(path))]
-        except OSError as err:
-            raise RecordingError(f"{path} cannot be read: {os_reason(err)}") from err
-    if not path.exists():
-        raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
-    return [path]
-
-
 def list_recordings(
     sources: Iterable[Path | str], choose: Callable[[Recording], Array] | None = None
 ) -> Iterator[ListedRecording]:
@@ -226,16 +213,28 @@ def list_recordings(
                     yield item
 
 
-def recordings_at(source: Path | str) -> Sequence[Path | str]:
-    """The recordings of a path, as `find_recordings` finds them, or the files or URLs that match a pattern, sorted; in
-    it, `**` matches folders. RecordingError if there are none."""
-    if isinstance(source, str) and is_url(source):
-        return matching(source)
-    path = path_of(source)
-    if path.is_dir() or not is_of_several(str(source)):
-        return find_recordings(path)
+def recordings_at(place: str | os.PathLike[str]) -> list[str]:
+    """The recordings at a place: a file itself, those (`.mcap`) below a directory, or the files or URLs that match a
+    pattern, in which `**` matches folders; sorted.
+
+    Raises:
+        RecordingError: there is no such file or directory, nothing matches, or the directory cannot be read.
+    """
+    name = os.fspath(place)
+    if is_url(name):
+        return matching(name)
+    path = path_of(name)
+    if path.is_dir():
+        try:
+            return [str(path / item.relative) for item in sorted(scan(path))]
+        except OSError as err:
+            raise RecordingError(f"{path} cannot be read: {os_reason(err)}") from err
+    if path.exists():
+        return [str(path)]
+    if not glob.has_magic(name):
+        raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
     found = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    if not (files := [file for file in map(Path, found) if not file.is_dir()]):
+    if not (files := [file for file in found if not Path(file).is_dir()]):
         raise RecordingError(f"no file matches {str(path)!r}; give the path of a recording (.mcap)")
     return files
 
@@ -322,12 +321,12 @@ def compactable(root: Path) -> list[Compactable]:
 
 
 def _listed(
-    file: Path | str, root: Path | None, choose: Callable[[Recording], Array] | None
+    file: str, root: Path | None, choose: Callable[[Recording], Array] | None
 ) -> list[ListedRecording]:
     """The runs of a recording; without episodes, all of them."""
-    name = shown_name(str(file))
+    name = shown_name(file)
     try:
-        notes = Notes.read(file, root) if isinstance(file, Path) else None
+        notes = None if is_url(file) else Notes.read(Path(file), root)
         with Recording(file) as recording:
             if choose is not None:
                 kept = choose(recording)

@@ -21,7 +21,7 @@ from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.bundles import carried_benchmark
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
-from tupli_mcap.storage.listing import find_recordings, is_storage
+from tupli_mcap.storage.listing import is_storage, recordings_at
 from tupli_mcap.storage.sidecar import DELETING, Notes, sidecar_path
 from tupli_mcap.storage.texts import is_hash
 
@@ -41,7 +41,7 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
         path = path_of(given)
         if path.is_dir():
             try:
-                found = find_recordings(path)
+                found = [Path(file) for file in recordings_at(path)]
             except TupliError as err:
                 yield _refused(VerifyReport(str(path), kind="storage"), err, "check the directory")
                 continue
