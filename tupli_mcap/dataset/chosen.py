@@ -1,7 +1,4 @@
-"""Finds the episodes that a user means in files, directories, servers, datasets and storages.
-
-Storages take long to import, and most files need none, so they are imported where they are needed.
-"""
+"""Finds the episodes that a user means in files, directories, servers, datasets and storages."""
 
 from __future__ import annotations
 
@@ -11,10 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
+from typing import Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
 
 import numpy as np
 
+from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.dataset.which import (
     Positions,
     candidates,
@@ -27,15 +25,14 @@ from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import is_server, is_url, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
-
-if TYPE_CHECKING:
-    from tupli_mcap.dataset.sources import EpisodeSource
-    from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage import TupliStorage
+from tupli_mcap.storage.base import by_recording
+from tupli_mcap.storage.listing import is_of_several, recordings_at
 
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
 AnyRecording = Recording | str | os.PathLike[str]
-Examinable: TypeAlias = Union[AnyRecording, "Listed", "TupliStorage"]
+Examinable: TypeAlias = Union[AnyRecording, "Listed", TupliStorage]
 
 
 @runtime_checkable
@@ -121,8 +118,6 @@ def subjects_once(
 
 
 def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
-    from tupli_mcap.storage.listing import recordings_at
-
     error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
     try:
         files = recordings_at(name)
@@ -135,8 +130,6 @@ def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Su
 
 
 def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iterator[Subject]:
-    from tupli_mcap.storage.base import by_recording
-
     for name, group in by_recording(headers).items():
         numbers = [header.episode for header in group]
         yield Subject(name, partial(source.open, name, numbers), partial(positions_of, headers=group))
@@ -221,9 +214,6 @@ def _many_at(place: str) -> EpisodeSource | None:
     """The episodes of a server, a directory or a pattern; None for the place of one recording."""
     if is_server(place):
         return _stored(place)
-    from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.storage.listing import is_of_several, recordings_at
-
     if is_url(place) or not is_of_several(place):
         return None
     if not (files := recordings_at(place)):
@@ -235,8 +225,6 @@ def _of_many(
     source: EpisodeSource, where: str, text: str, filter: BaseFilter | None, stack: ExitStack
 ) -> list[Chosen]:
     """The episodes that a text names among those of all recordings of a source."""
-    from tupli_mcap.dataset.sources import numbers_by_recording
-
     headers = source.episodes(filter)
     numbers = np.array([header.episode for header in headers])
     returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
@@ -255,7 +243,6 @@ def _of_many(
 
 
 def _stored(storage: TupliStorage | str) -> EpisodeSource:
-    from tupli_mcap.dataset.sources import StorageSource
     from tupli_mcap.storage import storage_at
 
     return StorageSource(storage_at(storage))

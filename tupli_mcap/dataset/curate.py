@@ -13,7 +13,7 @@ import numpy as np
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource
-from tupli_mcap.dataset.which import bounds_of, candidates, may_be_noted, range_text
+from tupli_mcap.dataset.which import bounds_of, candidates, range_text
 from tupli_mcap.errors import FormatError, RecordingError, asking
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
@@ -36,6 +36,8 @@ from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
+from tupli_mcap.storage.listing import recordings_at
+from tupli_mcap.storage.sidecar import Notes, Sidecar, storage_of
 
 if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage, TupliStorage
@@ -118,8 +120,6 @@ def recover_recording(
         dry_run: only report.
         compression: "zstd", "lz4" or "none".
     """
-    from tupli_mcap.storage.sidecar import Notes, Sidecar
-
     notes = Notes.read(Path(source))
     report = recover.recover_recording(
         source, target, overwrite=overwrite, dry_run=dry_run, compression=compression
@@ -282,7 +282,7 @@ def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool, q
         ((source, rows, *_),) = excerpts
         said = say_made_of([source], "filter", **facts)
         rewrite_recording(source, target, episodes=rows["episode"].tolist(), attachments=said)
-        if may_be_noted(target):  # the episodes keep their ids, and earlier ones of the file may be deleted
+        if Notes.read(target).deleted:  # the episodes keep their ids, and were deleted in an earlier file
             restore_episodes(target)
         return target
     made = {"how": "filter" if known else "merge", **facts}
@@ -390,8 +390,6 @@ def _deleted_at(
     is within one of them; the key names it.
     """
     from tupli_mcap.storage import FileStorage
-    from tupli_mcap.storage.listing import recordings_at
-    from tupli_mcap.storage.sidecar import storage_of
 
     by_root: dict[Path, set[str]] = {}
     for file in (Path(file).absolute() for file in recordings_at(place)):

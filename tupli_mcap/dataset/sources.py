@@ -175,9 +175,7 @@ class FilesSource:
         for name, recording in self._each():
             if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
-            notes = None if recording.path is None else Notes.read(recording.path)
-            deleted = set() if notes is None else notes.about(recording.metadata).deleted
-            listed[name] = list(episode_headers(recording, name, deleted))
+            listed[name] = list(episode_headers(recording, name, deleted_of(recording)))
             by_uuid[recording.uuid] = name
             made_of[name] = _made_of(recording)
         for name, uuids in made_of.items():
@@ -307,6 +305,11 @@ def files_at(item: str | os.PathLike[str]) -> list[str]:
         raise RecordingError(f"expected the path of a recording or a pattern, found {item!r:.80}")
     name = os.fspath(item)
     return recordings_at(name if is_url(name) else path_of(name).expanduser())
+
+
+def deleted_of(recording: Recording) -> set[int]:
+    """The numbers of the episodes of a recording that are deleted; none of one at a URL."""
+    return set() if recording.path is None else Notes.read(recording.path).about(recording.metadata).deleted
 
 
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:

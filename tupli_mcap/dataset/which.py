@@ -1,7 +1,4 @@
-"""Finds the episodes of recordings that a user means: by number, by return, by a filter.
-
-Storages take long to import, and most files need none, so they are imported where they are needed.
-"""
+"""Finds the episodes of recordings that a user means: by number, by return, by a filter."""
 
 from __future__ import annotations
 
@@ -11,9 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from tupli_mcap.dataset.sources import deleted_of, episode_headers
 from tupli_mcap.errors import FilterError, Gathered, RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, format_filter
+from tupli_mcap.storage.listing import recordings_at
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """Words in place of an episode's number; best and worst are by return, the first of equal ones."""
@@ -33,27 +32,13 @@ def check_choice(text: str, filter: BaseFilter | None = None) -> None:
 
 def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
     """The positions of the episodes that match a filter, without those that the storage has deleted."""
-    path, deleted = recording.path, set[int]()
-    if path is not None and may_be_noted(path):
-        from tupli_mcap.storage.sidecar import Notes
-
-        deleted = Notes.read(path).about(recording.metadata).deleted
+    deleted = deleted_of(recording)
     if filter is None:
         return np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
-    from tupli_mcap.dataset.sources import episode_headers
-
     check_keys(filter, EpisodeHeader)
     matches = compile_predicate(filter, EpisodeHeader)
     headers = episode_headers(recording, recording.name, deleted)
     return positions_of(recording, (header for header in headers if matches(header)))
-
-
-def may_be_noted(path: Path) -> bool:
-    """Whether a storage may have deleted episodes of a recording."""
-    folders = list(path.absolute().parents)[:3]
-    return path.with_name(f"{path.name}.json").exists() or any(
-        (folder / "deleting.json").exists() for folder in folders
-    )
 
 
 def positions_of(recording: Recording, headers: Iterable[EpisodeHeader]) -> Positions:
@@ -123,8 +108,6 @@ def numbers_in(
         FilterError: the text is something else, or the filter has an unknown key.
         RecordingError: there is no such recording or directory.
     """
-    from tupli_mcap.storage.listing import recordings_at
-
     found: dict[tuple[str, str], dict[int, None]] = {}
     for place in places:
         files: list[tuple[str, str]] = []  # of each episode
