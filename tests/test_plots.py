@@ -153,7 +153,7 @@ def test_of_long_recordings_some_episodes_are_read(cartpole: Path) -> None:
     with Recording(cartpole) as recording:
         rows, states = recording.index, recording.read().states
         found, again = (measure(recording, np.arange(len(recording)), 8000)[0] for _ in range(2))
-        (first,) = measure(recording, np.array([2]), 1)  # one episode is read at least
+        (first,) = measure(recording, np.array([2]), 7 * 77)  # the beginning of an episode is read at least
     assert 0 < found.read_steps < 200
     kept = found.states[0].values.T
     assert kept.shape == (found.read_steps, 4)
@@ -163,7 +163,7 @@ def test_of_long_recordings_some_episodes_are_read(cartpole: Path) -> None:
     assert found.notes() == [
         f"Values are those of {found.read_episodes} randomly chosen episodes ({found.read_steps} steps)."
     ]
-    assert (first.read_episodes, first.read_steps) == (1, rows["length"][2])
+    assert (first.read_episodes, first.read_steps) == (1, 7) and rows["length"][2] > 7
 
 
 def test_several_recordings_share_what_is_read(cartpole: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,7 +62,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]],
         info: dict[str, Any] | None = None,
     ) -> Self:
-        """A dataset of recordings outside of a storage: a file, a directory, a pattern ("runs/*.mcap"), a URL, or several.
+        """A dataset of recordings outside of a storage: a file, a directory, a pattern, a URL, or several of those.
 
         An episode that is in two of the files counts once, with a warning; one that is still being recorded
         is listed as interrupted.

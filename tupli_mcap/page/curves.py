@@ -11,11 +11,10 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.messages.infos import with_text_keys
-from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import INFO
-from tupli_mcap.plots.measure import numbers_in, thinned_to
+from tupli_mcap.plots.measure import number_columns, numbers_in, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
-from tupli_mcap.recording import Columns, Episode, Recording
+from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.labels import Labels
@@ -71,7 +70,7 @@ def curves_of(episode: Episode) -> Curves:
     columns = recording.read_steps(episode.position, 0, read, ("states", "actions", "rewards"), images=False)
     tracks: list[Track] = []
     notes: list[str] = []
-    for field, leaf, column in numbers_of(layout, columns):
+    for field, leaf, column in number_columns(layout, columns):
         tracks += _tracks(field, leaf, recording.labels, column, notes)
         if field == "reward" and leaf.size == 1:
             with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are not drawn
@@ -81,18 +80,6 @@ def curves_of(episode: Episode) -> Curves:
     if read < len(episode):
         notes.append(f"Of its {len(episode):,} steps, the first {read:,} are shown.")
     return Curves(tracks, read, notes)
-
-
-def numbers_of(layout: StepLayout, columns: Columns) -> Iterator[tuple[str, Leaf, Array]]:
-    """The leaves that are neither texts nor pictures: the field of each, and its values (steps, size)."""
-    for field, leaves, values in (
-        ("state", layout.state, columns.states),
-        ("action", layout.action, columns.actions),
-        ("reward", layout.reward, columns.rewards),
-    ):
-        for leaf in leaves:
-            if leaf.kind != "variable" and not leaf.apart:
-                yield field, leaf, np.asarray(leaf.get(values)).reshape(len(columns), leaf.size)
 
 
 def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:

@@ -11,9 +11,9 @@ from sqlalchemy import Connection, func, select
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
-from tupli_mcap.page.curves import numbers_of
 from tupli_mcap.page.datasets import Dataset, of_dataset
 from tupli_mcap.page.shelf import Shelf, seen_episodes
+from tupli_mcap.plots.measure import read_numbers
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes
@@ -97,7 +97,9 @@ def sample_values(shelf: Shelf, seen: Sequence[tuple[str, Sequence[int]]]) -> Sa
         try:
             recording = shelf.open(name)
             if recording.num_envs and (not parts or _alike(recording, parts[0][0])):
-                columns, read, count = _read(recording, numbers)
+                positions = np.flatnonzero(np.isin(recording.index["episode"], list(numbers)))
+                most = max(1, _STEP_BYTES // step_bytes(recording.layout, images=False))
+                columns, read, count = read_numbers(recording, positions, most)
                 parts.append((recording, columns))
                 steps, episodes = steps + read, episodes + count
         except TupliError:  # gone, or damaged: the others are a sample too
@@ -119,23 +121,6 @@ def sample_values(shelf: Shelf, seen: Sequence[tuple[str, Sequence[int]]]) -> Sa
 
 def _alike(a: Recording, b: Recording) -> bool:
     return a.layout.to_metadata() == b.layout.to_metadata()
-
-
-def _read(recording: Recording, numbers: Sequence[int]) -> tuple[dict[str, Array], int, int]:
-    """The columns of some of these episodes by leaf name, (steps, size); how many steps and episodes they are."""
-    layout = recording.layout
-    most = max(1, _STEP_BYTES // step_bytes(layout, images=False))
-    positions = np.flatnonzero(np.isin(recording.index["episode"], list(numbers)))
-    lengths = recording.index["length"][positions].astype(np.int64)
-    fitting = max(1, int(np.searchsorted(np.cumsum(lengths), most, side="right")))
-    positions, lengths = positions[:fitting], lengths[:fitting]
-    fields = ("states", "actions", "rewards")
-    if len(positions) == 1 and lengths[0] > most:
-        columns = recording.read_steps(int(positions[0]), 0, most, fields, images=False)
-    else:
-        columns = recording.read(fields, episodes=positions, images=False)
-    found = {leaf.name: column for _, leaf, column in numbers_of(layout, columns)}
-    return found, len(columns), len(positions)
 
 
 def sample_numbers(shelf: Shelf, connection: Connection, dataset: Dataset) -> list[tuple[str, list[int]]]:

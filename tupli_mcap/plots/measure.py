@@ -14,9 +14,9 @@ from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.messages.infos import InfoCodec, with_text_keys
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
-from tupli_mcap.recording import Recording, Run
+from tupli_mcap.recording import Columns, Recording, Run
 from tupli_mcap.recording.about.success import KEYS, success_of
-from tupli_mcap.recording.blocks import blocks, step_bytes
+from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.describe.description import RecordingDescription, describe, nan_text
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
@@ -27,6 +27,7 @@ INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most:
 _INFO_PLACES, _MOST_KEYS, _MOST_NAMED = 40, 64, 8
 # a key of `Measured.numbers`, and how others begin
 SUCCESS, INFO, METADATA = "success", "info.", "metadata."
+_FIELDS = ("states", "actions", "rewards")
 _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 
 
@@ -128,10 +129,9 @@ def _measure(
     labels = recording.labels
     seeds, measured.step_seconds = recording.seeds, labels.step_seconds
     measured.seeds = sorted({seed for i in positions.tolist() if (seed := seeds[i]) is not None})
-    most = read_bytes // step_bytes(layout, images=False)
+    most = max(1, read_bytes // step_bytes(layout, images=False))
     chosen = _random_episodes(positions, rows["length"].astype(np.int64), most)
-    measured.read_episodes = len(chosen)
-    columns, measured.read_steps = _read(recording, chosen, most)
+    columns, measured.read_steps, measured.read_episodes = read_numbers(recording, chosen, most)
     measured.states, measured.actions, measured.rewards = (
         [LeafValues(leaf, labels, columns.pop(leaf.name, None)) for leaf in leaves]
         for leaves in (layout.state, layout.action, layout.reward)
@@ -139,24 +139,30 @@ def _measure(
     return measured
 
 
-def _read(recording: Recording, positions: Array, most: int) -> tuple[dict[str, Array], int]:
-    """The steps of some episodes by leaf, (steps, size), without images and leaves of variable size; and their number.
+def read_numbers(recording: Recording, positions: Array, most: int) -> tuple[dict[str, Array], int, int]:
+    """The steps of the first of some episodes that have at most `most` (> 0) steps together, or the beginning of a
+    longer one: by leaf as `number_columns`; and how many steps and episodes they are."""
+    lengths = recording.index["length"][positions].astype(np.int64)
+    fitting = max(1, int(np.searchsorted(np.cumsum(lengths), most, side="right")))
+    positions, lengths = positions[:fitting], lengths[:fitting]
+    if len(positions) == 1 and lengths[0] > most:
+        columns = recording.read_steps(int(positions[0]), 0, most, _FIELDS, images=False)
+    else:
+        columns = recording.read(_FIELDS, episodes=positions, images=False)
+    found = {leaf.name: column for _, leaf, column in number_columns(recording.layout, columns)}
+    return found, len(columns), len(positions)
 
-    Reads a few megabytes at a time, until there are `most` steps.
-    """
-    leaves = [leaf for leaf in recording.layout.leaves if leaf.kind != "variable" and not leaf.apart]
-    parts: dict[str, list[Array]] = {leaf.name: [] for leaf in leaves}
-    steps = 0
-    for block in blocks(recording, positions, images=False, finals=False):
+
+def number_columns(layout: StepLayout, columns: Columns) -> Iterator[tuple[str, Leaf, Array]]:
+    """The leaves that are neither texts nor images: "state", "action" or "reward", and the values (steps, size)."""
+    for root, leaves, values in (
+        ("state", layout.state, columns.states),
+        ("action", layout.action, columns.actions),
+        ("reward", layout.reward, columns.rewards),
+    ):
         for leaf in leaves:
-            column = block.leaves[leaf.name].reshape(len(block), leaf.size)
-            parts[leaf.name].append(column)
-        steps += len(block)
-        if steps >= most:
-            break
-    return {
-        leaf.name: np.concatenate(parts[leaf.name] or [np.empty((0, leaf.size))]) for leaf in leaves
-    }, steps
+            if leaf.kind != "variable" and not leaf.apart:
+                yield root, leaf, np.asarray(leaf.get(values)).reshape(len(columns), leaf.size)
 
 
 def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array]:
@@ -255,8 +261,8 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     row = recording.index[position]
     length = int(row["length"])
     width = 1 if length <= MAX_POINTS else -(-length // (MAX_POINTS // 2))
-    most = READ_BYTES // step_bytes(recording.layout, images=False)
-    columns, steps = _read(recording, np.array([position]), most)
+    most = max(1, READ_BYTES // step_bytes(recording.layout, images=False))
+    columns, steps, _ = read_numbers(recording, np.array([position]), most)
     rewards = np.concatenate([columns[leaf.leaf.name] for leaf in measured.rewards], axis=1)
     with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are not drawn
         totals = drawable_numbers(rewards.astype(np.float64).sum(axis=1).cumsum())
