@@ -361,6 +361,17 @@ def test_commands_take_addresses(server: WebServer, large: Path, command: str) -
     assert json.loads(there).keys() == json.loads(near.stdout).keys()
 
 
+def test_episodes_are_run_again_from_the_copy_that_was_verified(server: WebServer, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    CliRunner().invoke(app, ["record", "CartPole-v1", "-o", str(path), "--steps", "50", "--seed", "1"])
+    server.files["/run.mcap"] = path.read_bytes()
+    told = CliRunner().invoke(app, ["verify", "--rerun", server.url("/run.mcap"), "--json"])
+    assert told.exit_code == 0, told.output
+    result = json.loads(told.stdout)["result"]
+    assert result["reports"][0]["path"] == result["reruns"][0]["path"] == server.url("/run.mcap")
+    assert result["reruns"][0]["agrees"] and server.sent < 2 * path.stat().st_size
+
+
 @pytest.mark.sampled(0, keep=["doctor-fetching-True", "verify-downloading-False"])
 @pytest.mark.parametrize(
     ("command", "what", "ranges"),

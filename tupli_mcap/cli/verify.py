@@ -12,9 +12,10 @@ from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, TupliError
-from tupli_mcap.remote import is_url, shown_name
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tupli_mcap.recording import Recording, VerifyReport
     from tupli_mcap.reexecute import Certificate
     from tupli_mcap.schema import BaseFilter
@@ -60,14 +61,13 @@ def verify(
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import verify_paths
 
-    addresses = {shown_name(path): path for path in paths if is_url(path)}
     reports: list[VerifyReport] = []
-    for report in verify_paths(paths):
+    for report, path in verify_paths(paths):
         reports.append(report)
         if not as_json:
             _print_verified(report)
         if reruns is not None and report.kind == "recording" and report.ok:
-            reruns.add(addresses.get(report.path, report.path), quiet=as_json)
+            reruns.add(report.path, path, quiet=as_json)
     if not reports:
         raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
     damaged = sum(not report.ok for report in reports)
@@ -145,8 +145,9 @@ class _Reruns:
         certificates = [certificate for _, certificate, _ in self._found]
         return bool(certificates) and all(found is not None and found.agrees for found in certificates)
 
-    def add(self, path: str, *, quiet: bool) -> None:
-        """Runs the chosen episodes of a recording again; prints the outcome unless `quiet`."""
+    def add(self, name: str, path: Path, *, quiet: bool) -> None:
+        """Runs the chosen episodes of a recording again; prints the outcome unless `quiet`. `name`: its path or URL,
+        where `path` is that of a copy."""
         from tupli_mcap.recording import Recording
         from tupli_mcap.reexecute import certify
 
@@ -156,19 +157,20 @@ class _Reruns:
                 Recording(path) as recording,
                 step_progress(recording.n_steps, "running again") as progress,
             ):
+                recording.name = name
                 numbers = self._numbers(recording)
                 if numbers == []:
                     return
                 certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
-            self._found.append((shown_name(path), None, str(err)))
+            self._found.append((name, None, str(err)))
             if not quiet:
                 fail(str(err))
             return
-        self._found.append((shown_name(path), certificate, ""))
+        self._found.append((name, certificate, ""))
         if not quiet:
-            say(f"{shown_name(path)}: {_outcome(certificate)}")
+            say(f"{name}: {_outcome(certificate)}")
             for line in _lines(certificate, seconds):
                 print_wrapped(line, "  ", "    ")
 

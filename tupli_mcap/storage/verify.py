@@ -28,30 +28,33 @@ from tupli_mcap.storage.texts import is_hash
 _AGAIN = "store it again, or import its bundle"
 
 
-def verify_paths(paths: Iterable[Path | str]) -> Iterator[VerifyReport]:
+def verify_paths(paths: Iterable[Path | str]) -> Iterator[tuple[VerifyReport, Path]]:
     """Verifies files and directories, one after the other, also after damage. A URL is copied to a temporary file.
 
-    A path that does not exist gives a report with a problem. Files that killed processes left are reported last.
+    A path that does not exist gives a report with a problem. Files that killed processes left are reported last. With
+    each report comes the path of what it is about; of a URL, that of its copy, which goes with the next report.
     """
     beside: dict[Path, None] = {}
     for given in paths:
         if isinstance(given, str) and is_url(given):
-            yield from map(_at_url, _found_at(given))
+            for url in _found_at(given):
+                yield from _at_url(url)
             continue
         path = path_of(given)
         if path.is_dir():
             try:
                 found = [Path(file) for file in recordings_at(path)]
             except TupliError as err:
-                yield _refused(VerifyReport(str(path), kind="storage"), err, "check the directory")
+                refused = VerifyReport(str(path), kind="storage")
+                yield _refused(refused, err, "check the directory"), path
                 continue
-            yield from map(_recording, found)
-            yield from _directory(path)
+            yield from ((_recording(file), file) for file in found)
+            yield from ((report, path) for report in _directory(path))
         else:
-            yield _recording(path)
+            yield _recording(path), path
             beside[path.parent] = None
     for directory in beside:
-        yield from _left_in(directory)
+        yield from ((report, directory) for report in _left_in(directory))
 
 
 def _found_at(url: str) -> list[str]:
@@ -62,7 +65,7 @@ def _found_at(url: str) -> list[str]:
         return [url]
 
 
-def _at_url(url: str) -> VerifyReport:
+def _at_url(url: str) -> Iterator[tuple[VerifyReport, Path]]:
     """The report on a file on a server, from a copy."""
     try:
         if is_server(url):
@@ -71,10 +74,10 @@ def _at_url(url: str) -> VerifyReport:
             )
         with copied(url) as path:
             report = _recording(path)
+            report.path = shown(url)
+            yield report, path
     except TupliError as err:
-        report = _refused(VerifyReport(shown(url)), err, "check the address")
-    report.path = shown(url)
-    return report
+        yield _refused(VerifyReport(shown(url)), err, "check the address"), Path()
 
 
 def _refused(report: VerifyReport, err: Exception, advice: str) -> VerifyReport:
