@@ -675,6 +675,11 @@ class TestLook:
         assert ok("info", "**/*.mcap").startswith("pattern ")
         assert fails("info", "a.mcap", "gone.mcap").startswith("gone.mcap does not exist")
 
+    def test_info_names_a_run_of_several_files_once(self, here: Path) -> None:
+        record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)
+        told = run("info", ".", "--json").json
+        assert told["recordings"] > 1 and told["runs"] == ["a"]
+
     def test_info_of_infos_whose_keys_are_no_texts(self, here: Path) -> None:
         keys: dict[Any, float] = {1: 2.0, "x": 1.0, 0: 3.0, None: 4.0}
         with RecordEpisodes(

@@ -85,7 +85,11 @@ def _print_many(
         ends[header.end] = ends.get(header.end, 0) + 1
     seeds = {header.seed for header in headers} - {None}
     recordings = len({header.recording for header in headers})
-    runs = list(dict.fromkeys(str(header.run.get("name", "")) for header in headers))
+    run_names: dict[object, str] = {}  # by id: without a name of its own, a run has the name of its first file
+    for header in headers:
+        name = str(header.run.get("name", ""))
+        run_names.setdefault(header.run.get("id") or name, name)
+    runs = list(dict.fromkeys(run_names.values()))
     environments = sorted(
         {str(header.run["environment"]) for header in headers if header.run.get("environment")}
     )
