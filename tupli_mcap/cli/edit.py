@@ -361,8 +361,8 @@ def trim(
     recorded success is dropped. An episode that loses its beginning loses its seed. The new
     recording has a new id, and no signature.
     """
+    from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.chosen import chosen_ids
-    from tupli_mcap.dataset.curate import trim_dataset
 
     begin, colon, stop = steps.partition(":")
     try:
@@ -378,7 +378,7 @@ def trim(
         ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
         if not ids:
             raise none_in(sources, filter_text)
-    report = trim_dataset(dataset, kept, ids, output, overwrite=force, dry_run=dry_run)
+    report = curate.trim(dataset, kept, output, chosen=ids, overwrite=force, dry_run=dry_run)
     _print_made(report, dry_run=dry_run, as_json=as_json)
 
 

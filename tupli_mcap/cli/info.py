@@ -85,7 +85,7 @@ def _print_many(
         ends[header.end] = ends.get(header.end, 0) + 1
     seeds = {header.seed for header in headers} - {None}
     recordings = len({header.recording for header in headers})
-    run_names: dict[object, str] = {}  # by id: without a name of its own, a run has the name of its first file
+    run_names: dict[object, str] = {}  # by id; that of the first file, where the run has none of its own
     for header in headers:
         name = str(header.run.get("name", ""))
         run_names.setdefault(header.run.get("id") or name, name)

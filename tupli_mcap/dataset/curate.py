@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource
+from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource, numbers_by_recording
 from tupli_mcap.dataset.which import bounds_of, candidates, range_text
 from tupli_mcap.errors import FormatError, RecordingError, asking
 from tupli_mcap.mcap.container import Container
@@ -161,81 +161,61 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    query = filter if isinstance(filter, str) and dataset._filter is None else str(kept._filter)
-    return report._replace(size=save(kept, target, overwrite=overwrite, query=query).stat().st_size)
+    return report._replace(size=save(kept, target, str(filter), overwrite=overwrite).stat().st_size)
 
 
 def trim(
-    dataset: Episodes, steps: slice | Callable[[Episode], slice], target: Path, *, overwrite: bool
-) -> Path:
-    """See `Dataset.trim`."""
-    _check_new(dataset, target, overwrite=overwrite)
-    kept: dict[str, dict[int, slice]] = {name: {} for name in dataset._chosen}
-    for header, episode in zip(dataset.headers, dataset, strict=True):
-        part = steps(episode) if callable(steps) else steps
-        if not isinstance(part, slice):
-            raise DatasetError(f"expected a slice of the steps of episode {header.id}, found {part!r:.80}")
-        kept[header.recording][header.episode] = part
-    return _save_trimmed(dataset, kept, target)
-
-
-def trim_dataset(
     dataset: Episodes,
-    steps: slice,
-    chosen: Collection[str],
+    steps: slice | Callable[[Episode], slice],
     target: str | os.PathLike[str],
     *,
+    chosen: Collection[str] | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> TrimReport:
-    """Writes the episodes of a dataset to `target`, those whose ids are chosen with only some consecutive steps.
-
-    Raises as `Dataset.trim`.
-    """
+    """See `Dataset.trim`; raises as that does. `chosen`: the ids of the episodes that lose `steps`, which is a slice
+    then; the others stay whole."""
     target = file_path(target)
     _check_new(dataset, target, overwrite=overwrite)
-    lengths: list[int] = []
-    kept: dict[str, dict[int, slice]] = {name: {} for name in dataset._chosen}
+    kept: dict[str, dict[int, slice]] = {name: {} for name in by_recording(dataset.headers)}
+    episodes, left_out = iter(dataset), 0
     for header in dataset.headers:
-        lengths.append(header.n_tuples)
-        if header.id in chosen:
-            kept[header.recording][header.episode] = steps
-            lengths[-1] = len(range(*steps.indices(header.n_tuples)))
-        if not lengths[-1]:
+        if chosen is not None and header.id not in chosen:
+            continue
+        part = steps(next(episodes)) if callable(steps) else steps
+        if not isinstance(part, slice):
+            raise DatasetError(f"expected a slice of the steps of episode {header.id}, found {part!r:.80}")
+        left = len(range(*part.indices(header.n_tuples)))
+        if not left:
             raise RecordingError(
                 f"{header.recording}: expected a step of episode {header.episode} to stay, found none of its "
                 f"{header.n_tuples}; choose other steps, or other episodes"
             )
-    report = TrimReport(target, len(lengths), sum(lengths), dataset.n_steps - sum(lengths))
-    if dry_run:
-        check_mergeable(_excerpts(dataset))
-        return report
-    return report._replace(size=_save_trimmed(dataset, kept, target).stat().st_size)
-
-
-def _save_trimmed(dataset: Episodes, kept: Mapping[str, Mapping[int, slice]], target: Path) -> Path:
-    """Writes the episodes of a dataset; `kept`: by recording and number, the steps that stay."""
+        kept[header.recording][header.episode] = part
+        left_out += header.n_tuples - left
     excerpts = _excerpts(dataset)
+    report = TrimReport(target, len(dataset), dataset.n_steps - left_out, left_out)
+    if dry_run:
+        check_mergeable(excerpts)
+        return report
     if len(excerpts) == 1:
         ((name, excerpt),) = zip(kept, excerpts, strict=True)
         numbers = excerpt.rows["episode"].tolist()
-        trim_recording(excerpt.recording, target, kept[name], episodes=numbers, overwrite=True)
-        return target
+        return trim_recording(excerpt.recording, target, kept[name], episodes=numbers, overwrite=True)
     trimmed = [
         excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
         for name, excerpt in zip(kept, excerpts, strict=True)
     ]
     with replacing(target) as (fd, _):
         merge_excerpts(trimmed, Container(fd, str(target), "zstd"))
-    return target
+    return report._replace(size=target.stat().st_size)
 
 
 def _excerpts(dataset: Episodes) -> list[Excerpt]:
     """The episodes of a dataset, by recording. NotFoundError if a recording has not all of them any more."""
-    found = []
-    for name, headers in by_recording(dataset.headers).items():
-        recording = dataset._open(name)
-        positions = positions_of(recording, ListedEpisodes.of(name, headers))
+    found, listed = [], by_recording(dataset.headers)
+    for name, recording in dataset.opened():
+        positions = positions_of(recording, ListedEpisodes.of(name, listed[name]))
         found.append(Excerpt(recording, recording.index[np.sort(positions)]))
     return found
 
@@ -252,7 +232,7 @@ def file_path(place: str | os.PathLike[str]) -> Path:
 def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
     """Raises DatasetError if there is no episode, one occurs twice, or the target exists: one of the sources, or not to
     be replaced."""
-    if not dataset._chosen:
+    if not len(dataset):
         raise DatasetError("expected episodes to save, found none")
     ((header, times),) = Counter(header.id for header in dataset.headers).most_common(1)
     if times > 1:
@@ -262,8 +242,8 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
         )
     if not target.exists():
         return
-    sources = [dataset._open(name).path for name in dataset._chosen]
-    if any(source is not None and target.samefile(source) for source in sources):
+    paths = (recording.path for _, recording in dataset.opened())
+    if any(path is not None and target.samefile(path) for path in paths):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     if not overwrite:
         raise DatasetError(
@@ -271,12 +251,11 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
         )
 
 
-def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool, query: str = "") -> Path:
-    """See `Dataset.save`. `query`: the text of the dataset's filter, if the user gave one."""
+def save(dataset: Episodes, place: str | os.PathLike[str], query: str, *, overwrite: bool) -> Path:
+    """See `Dataset.save`. `query`: the text of the dataset's filter, if there is one."""
     target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
-    known = query or ("" if dataset._filter is None else str(dataset._filter))
-    facts = {"query": known} if known else {}
+    facts = {"query": query} if query else {}
     excerpts = _excerpts(dataset)
     if len(excerpts) == 1:
         ((source, rows, *_),) = excerpts
@@ -285,7 +264,7 @@ def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool, q
         if Notes.read(target).deleted:  # the episodes keep their ids, and were deleted in an earlier file
             restore_episodes(target)
         return target
-    made = {"how": "filter" if known else "merge", **facts}
+    made = {"how": "filter" if query else "merge", **facts}
     with replacing(target) as (fd, _):
         merge_excerpts(excerpts, Container(fd, str(target), "zstd"), made=made)
     return target
@@ -308,15 +287,15 @@ def relabel(
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     """See `Dataset.annotate`."""
 
-    def change(name: str, dry: bool) -> Recording:
-        recording = dataset._open(name)
-        recording.annotate(dataset._chosen[name], values, dry_run=dry)
-        return recording
+    recordings, numbers = dict(dataset.opened()), numbers_by_recording(dataset.headers)
 
-    changed = change_all(dataset._chosen, change, dry_run=False)
-    noted = {name: one.annotations for name, one in zip(dataset._chosen, changed, strict=True)}
+    def change(name: str, dry: bool) -> None:
+        recordings[name].annotate(numbers[name], values, dry_run=dry)
+
+    change_all(recordings, change, dry_run=False)
     for header in dataset.headers:
-        header.metadata = noted[header.recording].applied(header.episode, header.metadata)
+        noted = recordings[header.recording].annotations
+        header.metadata = noted.applied(header.episode, header.metadata)
 
 
 def delete(

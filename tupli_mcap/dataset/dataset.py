@@ -159,13 +159,18 @@ class Dataset(RandomAccess):
         Raises:
             FormatError: one says something else.
         """
-        said = {name: self._open(name).made_of for name in self._chosen}
-        return {name: document for name, document in said.items() if document is not None}
+        said = ((name, recording.made_of) for name, recording in self.opened())
+        return {name: document for name, document in said if document is not None}
 
     @cached_property
     def _chosen(self) -> Mapping[str, Sequence[int]]:
         """The numbers of the episodes, by recording."""
         return numbers_by_recording(self.headers)
+
+    def opened(self) -> Iterator[tuple[str, Recording]]:
+        """The recordings and their names, each opened when it is its turn; other episodes may be missing in them."""
+        for name in self._chosen:
+            yield name, self._open(name)
 
     def _open(self, name: str, needed: Sequence[int] | None = None) -> Recording:
         """A recording with the dataset's episodes in it, or at least the `needed` ones."""
@@ -340,7 +345,7 @@ class Dataset(RandomAccess):
         return self._episode(self.headers[place]).frames
 
     def _step_seconds(self) -> float | None:
-        known = {self._open(name).labels.step_seconds for name in self._chosen}
+        known = {recording.labels.step_seconds for _, recording in self.opened()}
         return known.pop() if len(known) == 1 else None
 
     def loader(
@@ -439,7 +444,8 @@ class Dataset(RandomAccess):
             RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
-        return curate.save(self, target, overwrite=overwrite)
+        query = "" if self._filter is None else str(self._filter)
+        return curate.save(self, target, query, overwrite=overwrite)
 
     def map(
         self,
@@ -491,7 +497,7 @@ class Dataset(RandomAccess):
                 of the sources.
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
-        return curate.trim(self, steps, curate.file_path(target), overwrite=overwrite)
+        return curate.trim(self, steps, target, overwrite=overwrite).path
 
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episodes, in their files: `ds.filter("return > 100").annotate(success=True)`.

@@ -217,7 +217,7 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     }
     recording = dataset.example
     if recording is not None:
-        own = {name: dataset._open(name).labels for name in dataset._chosen}
+        own = {name: opened.labels for name, opened in dataset.opened()}
         labels = common_labels(own or {recording.name: recording.labels})
         columns |= _named(found.states, recording.layout.state, labels)
         columns |= _named(found.actions, recording.layout.action, labels)
