@@ -29,6 +29,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, read_model, refusals_told, write_bytes
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
+from tupli_mcap.storage.catalog.queries import count_episodes, plan_of
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files.recordings import RecordingFiles
@@ -206,7 +207,7 @@ class FileStorage(TupliStorage):
         return self._catalog.headers(filter, limit=limit, offset=offset)
 
     def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
-        return self._catalog.count(filter)
+        return self.ask(lambda connection: count_episodes(connection, filter))
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
         """The result of a function of a connection to the up-to-date catalog, such as those of `catalog.queries`."""
@@ -219,7 +220,7 @@ class FileStorage(TupliStorage):
 
     def explain(self, filter: BaseFilter | str | None) -> str:
         """The SQL that a filter over episodes becomes, and SQLite's plan for it."""
-        return self._catalog.explain(filter)
+        return self.ask(lambda connection: plan_of(connection, filter))
 
     def delete_episode(self, uri: str) -> None:
         if not self._recordings.delete([self._recordings.header(uri)]):

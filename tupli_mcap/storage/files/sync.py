@@ -21,6 +21,7 @@ from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.database import CatalogDamagedError, CatalogMovedError, CatalogUnusableError
 from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.listing import RecordingStamp, scan, stamp_of
 
 _T = TypeVar("_T")
@@ -34,8 +35,9 @@ class SyncedCatalog:
 
     The files alone count. Before each query the catalog is updated with files that have appeared, changed (by size,
     time stamps and inode) or gone; recordings that are being written are read anew each time. An episode that several
-    files hold is listed once: if one of them changes, all are read anew. The catalog is in this
-    user's cache directory, or in memory: a query writes nothing below the root.
+    files hold is listed once, for the file that was catalogued first (new files are catalogued in order of their
+    paths): if one of them changes, all are read anew. The catalog is in this user's cache directory, or in memory: a
+    query writes nothing below the root.
     """
 
     def __init__(self, root: Path, declared_keys: Iterable[str]) -> None:
@@ -62,17 +64,13 @@ class SyncedCatalog:
     def headers(
         self, filter: BaseFilter | str | None, *, limit: int | None = None, offset: int = 0
     ) -> list[EpisodeHeader]:
-        return self._settled(lambda: self._catalog.episodes(filter, limit=limit, offset=offset))
-
-    def count(self, filter: BaseFilter | str | None) -> int:
-        return self._settled(lambda: self._catalog.count(filter))
+        return self.ask(
+            lambda connection: list(find_episodes(connection, filter, limit=limit, offset=offset))
+        )
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
         """The result of a function of a connection to the up-to-date catalog."""
-        return self._settled(lambda: self._catalog.ask(question))
-
-    def explain(self, filter: BaseFilter | str | None) -> str:
-        return self._settled(lambda: self._catalog.explain(filter))
+        return self._with_usable_catalog(lambda: self._synced_answer(lambda: self._catalog.ask(question)))
 
     def declare_key(self, key: str) -> None:
         self._with_usable_catalog(lambda: self._catalog.declare_key(key))
@@ -102,10 +100,6 @@ class SyncedCatalog:
             return -1  # the next query fills the new catalog
 
         return self._with_usable_catalog(put)
-
-    def _settled(self, ask: Callable[[], _T]) -> _T:
-        """Queries the up-to-date catalog."""
-        return self._with_usable_catalog(lambda: self._synced_answer(ask))
 
     def _synced_answer(self, ask: Callable[[], _T]) -> _T:
         """Brings the catalog up to date with the files and queries it, again if somebody replaced it meanwhile."""
