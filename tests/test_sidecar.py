@@ -123,10 +123,10 @@ class TestAReplacedRecording:
 
     def test_is_told_by_verify(self, storage: FileStorage, run: Path) -> None:
         delete(storage, 0)
-        (report,) = verify_paths([storage.root])
+        ((report, _),) = verify_paths([storage.root])
         assert report.problems == []
         record(run, 3)
-        (report,) = verify_paths([storage.root])
+        ((report, _),) = verify_paths([storage.root])
         (problem,) = report.problems
         assert report.ok
         assert problem.kind == "leftover"

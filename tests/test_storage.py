@@ -634,7 +634,7 @@ class TestFileStorage(StorageContract):
             listed = list_recordings([root])
             of_files = TupliDataset.from_files(sorted(root.rglob("*.mcap")))
             assert len(left) == sum(item.episodes for item in listed) == len(of_files.preview())
-            assert all(report.ok for report in verify_paths([root]))
+            assert all(report.ok for report, _ in verify_paths([root]))
             assert state_of(root) == before
             seen.add(len(left))
             assert not left & {h.id for h in doomed} if len(left) == 2 else len(left) == 6
@@ -932,7 +932,7 @@ class TestFileStorage(StorageContract):
         assert other.load_benchmark(header.id).metadata == edited.metadata
         copied = copy_episodes(storage, FileStorage(tmp_path / "third"), benchmark_id=header.id)
         assert copied[header.id].episodes == 1
-        assert all(report.ok for report in verify_paths([other.root]))
+        assert all(report.ok for report, _ in verify_paths([other.root]))
         document = json.loads((storage.root / "benchmarks" / f"{header.id}.json").read_text())
         validator("benchmark.schema.json").validate(document)
         assert storage.undo_benchmark_edit(header.id, dry_run=True).metadata.name == "cart pole"

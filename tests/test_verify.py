@@ -383,7 +383,7 @@ def storage_at(root: Path) -> FileStorage:
 
 def test_a_storage(tmp_path: Path) -> None:
     with storage_at(tmp_path / "lab") as storage:
-        reports = list(verify_paths([storage.root]))
+        reports = [report for report, _ in verify_paths([storage.root])]
     assert [report.problems for report in reports] == [[], [], []]
     assert [report.kind for report in reports] == ["recording", "recording", "storage"]
 
@@ -398,9 +398,9 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
         (root / "recordings" / f".tupli-mcap-{32 * '0'}.tmp").write_bytes(b"x")
         notes = {"version": 1, "uuid": Recording(root / "recordings" / "two.mcap").uuid, "deleted": [77]}
         (root / "recordings" / "two.mcap.json").write_text(json.dumps(notes))
-        reports = list(verify_paths([root]))
+        reports = [report for report, _ in verify_paths([root])]
         (root / "recordings" / "two.mcap.json").write_text("nonsense")
-        again = list(verify_paths([root]))
+        again = [report for report, _ in verify_paths([root])]
     one, two, other = reports
     assert [report.ok for report in reports] == [False, True, False]
     assert one.path.endswith("one.mcap")
@@ -417,7 +417,7 @@ def test_a_storage_in_which_a_program_writes_meanwhile(tmp_path: Path) -> None:
         note = storage.root / "artifacts" / "note"
         writing = pool.submit(lambda: [files.write_bytes(note, b"") for _ in range(400)])
         while not writing.done():
-            assert not [report.problems for report in verify_paths([storage.root]) if report.problems]
+            assert not [report.problems for report, _ in verify_paths([storage.root]) if report.problems]
         writing.result()
 
 
@@ -425,7 +425,7 @@ def test_a_plain_directory_and_several_paths(tmp_path: Path) -> None:
     record(tmp_path / "x" / "a.mcap") if (tmp_path / "x").mkdir() is None else None
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"no")
-    found = list(verify_paths([bad, tmp_path / "x", tmp_path / "none.mcap"]))
+    found = [report for report, _ in verify_paths([bad, tmp_path / "x", tmp_path / "none.mcap"])]
     assert [report.ok for report in found] == [False, True, False]
     assert "does not exist" in said(found[2])
 
