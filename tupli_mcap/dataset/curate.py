@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -286,8 +287,10 @@ def relabel(
 
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     """See `Dataset.annotate`."""
-
-    recordings, numbers = dict(dataset.opened()), numbers_by_recording(dataset.headers)
+    numbers = numbers_by_recording(dataset.headers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # to list the episodes gave the same ones
+        recordings = dict(dataset.opened())
 
     def change(name: str, dry: bool) -> None:
         recordings[name].annotate(numbers[name], values, dry_run=dry)
