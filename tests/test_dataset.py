@@ -323,7 +323,7 @@ def test_tuple_filters_narrow(cart: tuple[TupliDataset, Taken], blocks: int) -> 
     assert 0 < len(wanted) < 700
     np.testing.assert_array_equal(both.convert_to_numpy()[0], column(wanted, 0))
     assert len(asked) == len(right), "a function is asked about steps that earlier filters chose"
-    assert re.search(r'tuples where F\("action"\) == 1 and .*<lambda> and F\("state.2"\) < 0', repr(both))
+    assert re.search(r'steps where F\("action"\) == 1 and .*<lambda> and F\("state.2"\) < 0', repr(both))
     assert len(both.with_tuple_filter(None)) == 700
 
 
@@ -869,7 +869,7 @@ def test_repr_says_what_is_known(cart: tuple[TupliDataset, Taken]) -> None:
     assert repr(dataset) == f"<TupliDataset of 2 files: {n} episodes, 700 steps>"
     right = dataset.with_tuple_filter(F("action") == 1)
     right.preview()
-    assert '700 steps before the tuple filter; tuples where F("action") == 1' in repr(right)
+    assert '700 steps before the filter of steps; steps where F("action") == 1' in repr(right)
     assert f"{len(right)} of 700 steps" in repr(right)
 
 

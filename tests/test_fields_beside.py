@@ -213,6 +213,10 @@ def test_frames_are_a_field(pictures: tupli_mcap.Dataset) -> None:
             recording.read("frames", episodes=[1]).frames[:, 0, 0, 0], range(10, 15)
         )
     assert pictures.head(0).read("frames").frames.shape == (0, 0, 0, 3)
+    some = mixed.filter_steps("step in [1, 2, 4]")
+    for found in (some.read(["frames", "states"]), some.transitions(fields=["frames", "states"])[:]):
+        assert len(found.states) == 9
+        np.testing.assert_array_equal(found.frames[:, 0, 0, 0], found.states)
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -634,11 +634,11 @@ class TestTimes:
             (F("name") == "ppo", r"unknown key 'name' \(did you mean 'run.name'\?\); the keys are"),
             (
                 F("info.force") > 1,
-                r"unknown key 'info.force': it is of steps, which TupliDataset.from_files\(path\).with_tuple_filter",
+                r"unknown key 'info.force': it is of steps, which filter_steps\(...\) of a dataset chooses",
             ),
             (
                 F("reward") > 1,
-                r"unknown key 'reward' \(did you mean 'return'\?\): it is of steps, which Tupli",
+                r"unknown key 'reward' \(did you mean 'return'\?\): it is of steps, which filter_steps",
             ),
             (F("tag") == "ppo", r"unknown key 'tag' \(did you mean 'run.tags'\?\); the keys are"),
         ],

@@ -25,6 +25,7 @@ from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import EpisodeMetadataCallback
 
 SPACE = spaces.Box(-1, 1, (1,), np.float32)
+FIELDS = ["states", "next_states", "times", "infos"]
 OWN = ["metadata.side", "metadata.count", "metadata.success", "info.tag"]
 
 
@@ -227,6 +228,110 @@ def test_an_error_within_a_property_is_not_taken_for_a_wrong_name(
     monkeypatch.setattr(Dataset, "lengths", property(lambda ds: ds.headers.nothing))
     with pytest.raises(AttributeError, match="'list' object has no attribute 'nothing'"):
         _ = dataset.lengths
+
+
+def wanted_steps(dataset: Dataset) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Those that the tests below choose, found by a loop."""
+    return np.array(
+        [
+            step.state[0] > 0 and (info["tag"] == 1 or number < 3)
+            for episode in dataset
+            for number, (step, info) in enumerate(zip(episode.tuples, episode.infos or (), strict=True))
+        ]
+    )
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize(
+    "narrow",
+    [
+        lambda d: d.filter_steps("state[0] > 0 and (info.tag = 1 or step < 3)"),
+        lambda d: d.filter_steps(F("states[0]") > 0).filter_steps((F("info.tag") == 1) | (F("step") < 3)),
+        lambda d: d.filter_steps("info.tag = 1 or step < 3").filter_steps(lambda step: step.state[0] > 0),
+    ],
+)
+def test_steps_are_chosen(runs: Path, narrow: Callable[[Dataset], Dataset], mixed: bool) -> None:
+    whole = tupli_mcap.open(runs)
+    if mixed:  # the episodes of a recording do not follow each other, and one is there twice
+        whole = whole[[*np.random.default_rng(0).permutation(len(whole)), 4]]
+    chosen, wanted, everything = narrow(whole), wanted_steps(whole), whole.read(["rewards", *FIELDS])
+    assert 0 < wanted.sum() < len(wanted)
+    assert len(chosen) == len(whole) and "before the filter of steps; steps where" in repr(chosen)
+    for _ in range(2):  # the second time with what the first one has found
+        found = chosen.read(FIELDS)
+        for field in ("states", "next_states", "times"):
+            np.testing.assert_array_equal(found[field], everything[field][wanted])
+        assert found.infos == [everything.infos[i] for i in np.flatnonzero(wanted)]
+    of = np.repeat(np.arange(len(whole)), whole.lengths)[wanted]
+    np.testing.assert_array_equal(found.episode_lengths, np.bincount(of, minlength=len(whole)))
+    np.testing.assert_array_equal(chosen.lengths, found.episode_lengths)
+    assert chosen.n_steps == wanted.sum() and f"{wanted.sum():,} of {len(wanted):,} steps" in repr(chosen)
+    np.testing.assert_array_equal(chosen.transitions()[:].states, found.states)
+    runs_of_two = np.flatnonzero(
+        wanted[1:] & wanted[:-1] & (np.diff(np.repeat(whole.lengths.cumsum(), whole.lengths)) == 0)
+    )
+    windows = chosen.windows(2, fields=["states", "info.tag"])
+    np.testing.assert_array_equal(windows[:].states[:, 0], everything.states[runs_of_two])
+    np.testing.assert_array_equal(
+        windows[:].infos["tag"][:, 1], [everything.infos[i + 1]["tag"] for i in runs_of_two]
+    )
+    np.testing.assert_allclose(chosen.stats()["state"].mean, found.states.mean(axis=0), rtol=1e-5, atol=1e-7)
+
+
+def test_chosen_steps_are_those_of_pytuplis_filter(runs: Path) -> None:
+    torch, test = pytest.importorskip("torch"), "state[0] > 0 and step > 2"
+    chosen = tupli_mcap.open(runs).filter_steps(test)
+    tuples = TupliDataset.from_files(str(runs / "*.mcap")).with_tuple_filter(test)
+    table, other = chosen.to_pandas(), tuples.convert_to_dataframe()
+    for name in ("episode", "step", "reward"):
+        assert table[name].tolist() == other[name if name != "reward" else "rewards"].tolist()
+    assert chosen.steps.identity == tuples.steps.identity
+    (batch,) = chosen.loader(2, batch_size=10_000, shuffle=False)
+    assert torch.equal(batch["states"], torch.from_numpy(tuples.windows(2)[:].states))
+    with Recording(runs / "b.mcap") as recording:
+        assert (
+            recording.filter_steps(test).n_steps
+            == tupli_mcap.open(runs / "b.mcap").filter_steps(test).n_steps
+        )
+    # episodes are narrowed beside their steps, and stay whole
+    best = chosen.filter("return > 20").sort("return", descending=True).head(3)
+    assert ids(best) == ids(tupli_mcap.open(runs).sort("return", descending=True).head(3))
+    assert len(best[0]) > best.lengths[0] == len(best.head(1).read().rewards)
+    assert best.to_pandas("episodes")["steps"].tolist() == [len(episode) for episode in best]
+
+
+def test_an_empty_choice_of_steps(dataset: Dataset) -> None:
+    with pytest.warns(UserWarning, match=r"no step has info.tga \(did you mean 'info.tag'\?\)"):
+        none = dataset.filter_steps("info.tga > 1")
+        assert none.n_steps == 0
+    assert none.read().states.shape == (0, 4) and len(none.to_pandas()) == 0
+    assert not none.lengths.any() and len(none) == len(none.lengths) == 36
+    with pytest.raises(TupliError, match="found an empty dataset"):
+        none.windows(1)
+    with pytest.raises(TupliError, match="expected steps to take statistics of, found none"):
+        none.stats()
+
+
+def test_what_needs_whole_episodes_refuses_chosen_steps(dataset: Dataset, tmp_path: Path) -> None:
+    chosen = dataset.filter_steps("reward > 0")
+    for ask in (
+        lambda: chosen.save(tmp_path / "new.mcap"),
+        lambda: chosen.map(lambda episode: episode.rewards, tmp_path / "new.mcap"),
+        lambda: chosen.trim(slice(1, None), tmp_path / "new.mcap"),
+        lambda: chosen.annotate(success=True),
+        lambda: chosen.head(2).delete(),
+        lambda: chosen.plot(),
+        lambda: chosen + dataset,
+        lambda: dataset + chosen,
+    ):
+        with pytest.raises(
+            TupliError, match=r"expected whole episodes, found <Dataset .*steps where .*reward"
+        ):
+            ask()
+    for wrong in ("return > 3", "sate > 1", 3):
+        with pytest.raises(FilterError, match="unknown key|expected a function of one tuple"):
+            dataset.filter_steps(wrong)  # type: ignore[arg-type]
+    assert len(tupli_mcap.open(dataset)) == 36 and not list(tmp_path.iterdir())
 
 
 def test_keys(dataset: Dataset) -> None:

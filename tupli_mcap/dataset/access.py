@@ -24,7 +24,6 @@ from tupli_mcap.dataset.items.steps import checked_fields
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import SaysWhatIsMeant
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.recording.frames import Frames
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, compile_predicate
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.predicate import MISSING, look_up
@@ -58,7 +57,7 @@ class RandomAccess(SaysWhatIsMeant):
         *,
         fields: Sequence[str] = FIVE,
     ) -> Windows:
-        """Sub-trajectories of `length` steps that never cross episodes, nor the cuts of a tuple filter.
+        """Sub-trajectories of `length` steps that never cross episodes, nor steps that a filter left out.
 
         See `Windows`: an index gives one window, an array of numbers gives a batch. The field "infos" gives a dict of
         columns for all keys of the infos, "info.<key>" for one key, and "info.contact.left" for a value in a dict; they
@@ -94,7 +93,7 @@ class RandomAccess(SaysWhatIsMeant):
         keys, given = info_keys(fields)
         rest = checked_fields(given, (*steps.fields, *BESIDE))
         if FRAMES in rest:
-            steps = StepsWith(steps, FRAMES, FrameValues(steps.episode_lengths, self._frames_of))
+            steps = StepsWith(steps, FRAMES, self._frames())
         if not keys:
             return steps, rest
         columns = info_columns(self._infos(), keys if all(keys) else None)
@@ -106,8 +105,8 @@ class RandomAccess(SaysWhatIsMeant):
             "saved columns hold no infos; open the recordings with tupli_mcap.open, and take windows of that"
         )
 
-    def _frames_of(self, place: int) -> Frames:
-        """The frames of an episode."""
+    def _frames(self) -> FrameValues:
+        """The frame of each step."""
         raise SamplingError(
             "saved columns hold no frames; open the recordings with tupli_mcap.open, and take windows of that"
         )

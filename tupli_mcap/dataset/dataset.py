@@ -16,10 +16,16 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
-from tupli_mcap.dataset.columns.load import read_in_order
+from tupli_mcap.dataset.columns.load import (
+    Selected,
+    TupleFilter,
+    TupleSelector,
+    read_in_order,
+    steps_within,
+)
 from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
-from tupli_mcap.dataset.items.beside import INFOS, info_columns, info_keys
+from tupli_mcap.dataset.items.beside import INFOS, FrameValues, info_columns, info_keys
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.keys import check_metadata, keys_of, matching, values_at
 from tupli_mcap.dataset.sources import (
@@ -32,7 +38,7 @@ from tupli_mcap.dataset.sources import (
     numbers_by_recording,
     place_of,
 )
-from tupli_mcap.errors import plural, warn
+from tupli_mcap.errors import warn
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import FIELDS, FIVE, ColumnDict, field_names
 from tupli_mcap.recording.frames import Frames
@@ -52,9 +58,9 @@ Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
 class Dataset(RandomAccess):
     """Episodes of files, directories and servers, in an order.
 
-    Nothing is read before it is needed, and the episodes are listed once. `filter`, `sort`, `head`, `sample`, `split`
-    and an index return another dataset and do not change this one. Iteration gives episodes, and `len` counts them.
-    Not thread-safe; a pickled copy opens the files itself.
+    Nothing is read before it is needed, and the episodes are listed once. `filter`, `filter_steps`, `sort`, `head`,
+    `sample`, `split` and an index return another dataset and do not change this one. Iteration gives episodes, and
+    `len` counts them. Not thread-safe; a pickled copy opens the files itself.
 
     Use `tupli_mcap.open` to make one.
     """
@@ -63,6 +69,8 @@ class Dataset(RandomAccess):
         self._source = source
         self._filter: BaseFilter | None = None  # is true of the episodes; `save` notes it
         self._listed = None if headers is None else list(headers)
+        self._selector: TupleSelector | None = None  # of steps
+        self._known: Selected | None = None  # what it has found
         self._recordings = OpenRecordings(source.open)
         self._steps: RecordedSteps | None = None
         self._stats: dict[str, Mapping[str, FieldStatistics]] = {}
@@ -86,17 +94,17 @@ class Dataset(RandomAccess):
 
     @property
     def n_steps(self) -> int:
-        """The number of steps of all episodes."""
-        return sum(header.n_tuples for header in self.headers)
+        """The number of steps of all episodes, after `filter_steps`."""
+        return self._selected.steps
 
     @property
     def lengths(self) -> Array:
-        """Steps of each episode: int64 (episodes,)."""
-        return np.array([header.n_tuples for header in self.headers], np.int64)
+        """Steps of each episode, after `filter_steps`: int64 (episodes,)."""
+        return self._selected.lengths.copy()
 
     @property
     def returns(self) -> Array:
-        """The sum of each episode's rewards: float64 (episodes,), NaN if the rewards are no numbers."""
+        """The sum of all rewards of each episode: float64 (episodes,), NaN if the rewards are no numbers."""
         return np.array([header.episode_return for header in self.headers], np.float64)  # None becomes NaN
 
     @overload
@@ -127,7 +135,8 @@ class Dataset(RandomAccess):
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes that match the filter."""
-        return self._source, (self if filter is None else self.filter(filter)).headers
+        whole = self._whole()
+        return self._source, (whole if filter is None else whole.filter(filter)).headers
 
     def _episode(self, header: EpisodeHeader) -> Episode:
         recording = self._open(header.recording, [header.episode])
@@ -179,21 +188,30 @@ class Dataset(RandomAccess):
     def _of(self, headers: Sequence[EpisodeHeader] | None) -> Dataset:
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
-        made._filter = self._filter
+        made._filter, made._selector = self._filter, self._selector
         return made
+
+    def _whole(self) -> Dataset:
+        """The dataset. DatasetError if `filter_steps` narrowed it: then its episodes have lost steps."""
+        if self._selector is not None:
+            raise DatasetError(
+                f"expected whole episodes, found {self!r}; choose episodes by filter, not by filter_steps, or do this "
+                "before filter_steps"
+            )
+        return self
 
     def __add__(self, other: Dataset | Recording) -> Dataset:
         """The episodes of both, these first. An episode that is in both counts once.
 
         Raises:
-            DatasetError: two of their recordings have the same name and differ.
+            DatasetError: two of their recordings have the same name and differ, or `filter_steps` narrowed one.
         """
         if not isinstance(other, Dataset | Recording):
             return NotImplemented
         if isinstance(other, Recording):
             other = Dataset(FilesSource([place_of(other)]))
-        ids = {header.id for header in self.headers}
-        more = [header for header in other.headers if header.id not in ids]
+        ids = {header.id for header in self._whole().headers}
+        more = [header for header in other._whole().headers if header.id not in ids]
         if self._source is other._source:
             made = self._of([*self.headers, *more])
         else:
@@ -228,6 +246,31 @@ class Dataset(RandomAccess):
                 check_metadata(wanted, self._listed)
         made = self._of(found)
         made._filter = wanted if self._filter is None else self._filter & wanted  # what `save` notes
+        return made
+
+    def filter_steps(self, test: TupleFilter | str) -> Dataset:
+        """The episodes with only those of their steps that match a test.
+
+            ds.filter_steps("reward > 0 and state.arm.q[0] < 1").read()
+            ds.filter_steps("info.force > 2").windows(8)  # of steps that follow each other
+
+        It narrows what is read of steps: `read`, `windows`, `transitions`, `loader`, `stats`, `to_pandas("steps")`,
+        `lengths`, `n_steps`. The episodes stay, also without a step, and each by itself has all of its steps. What
+        needs whole episodes (`save`, `map`, `trim`, `annotate`, `delete`, `plot`, `+`) refuses.
+
+        Args:
+            test: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time (ns) and
+                step (counted from 0 in each episode), or the names of their columns (states, times), or Gymnasium's
+                (observation, terminated, truncated), such as `F("state[0]") > 1`, which is evaluated on whole columns;
+                or a function of one `RLTuple` that returns True or False, called for every step that earlier tests
+                chose. It is evaluated once, when steps are needed.
+
+        Raises:
+            FilterError: it is neither, or names an unknown field.
+        """
+        found = TupleSelector(parse_filter(test) if isinstance(test, str) else test)
+        made = self._of(self._listed)
+        made._selector = found if self._selector is None else self._selector & found
         return made
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
@@ -326,20 +369,50 @@ class Dataset(RandomAccess):
         wanted = field_names(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
             return example.read(wanted, episodes=[])
-        return Columns(self.lengths, **read_in_order(self._source, self.headers, wanted))
+        columns = self._read(wanted)
+        return Columns(self.lengths, **columns)
+
+    def _read(self, fields: Sequence[str]) -> dict[str, Any]:
+        columns, self._known = read_in_order(self._source, self.headers, fields, self._selector, self._known)
+        return columns
+
+    @property
+    def _selected(self) -> Selected:
+        """The steps that `filter_steps` chose; without one, all."""
+        if self._known is None:
+            if self._selector is None:
+                self._known = Selected(self._whole_lengths())
+            else:
+                self._read(["terminals"])
+        assert self._known is not None  # reading leaves it behind
+        return self._known
+
+    def _whole_lengths(self) -> Array:
+        return np.array([header.n_tuples for header in self.headers], np.int64)
+
+    @property
+    def step_numbers(self) -> Array:
+        """The number of each step (after `filter_steps`) within its episode, from 0: int64 (steps,)."""
+        numbers, mask = steps_within(self._whole_lengths()), self._selected.mask
+        return numbers if mask is None else numbers[mask]
 
     @property
     def steps(self) -> Steps:
-        """All steps by number, from 0, episode after episode; windows and samplers read them."""
+        """All steps (after `filter_steps`) by number, from 0, episode after episode; windows and samplers read them."""
         if self._steps is None:
             self._steps = RecordedSteps(
-                ListedEpisodes.each(self.headers), lambda name: nullcontext(self._open(name))
+                ListedEpisodes.each(self.headers),
+                lambda name: nullcontext(self._open(name)),
+                self._selected.mask,
             )
         return self._steps
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         infos: Sequence[Mapping[str, Any]] = self.read(["infos"]).infos
         return infos
+
+    def _frames(self) -> FrameValues:
+        return FrameValues(self._whole_lengths(), self._frames_of, self._selected.mask)
 
     def _frames_of(self, place: int) -> Frames:
         return self._episode(self.headers[place]).frames
@@ -445,7 +518,7 @@ class Dataset(RandomAccess):
             SpaceError: two recordings have different spaces.
         """
         query = "" if self._filter is None else str(self._filter)
-        return curate.save(self, target, query, overwrite=overwrite)
+        return curate.save(self._whole(), target, query, overwrite=overwrite)
 
     def map(
         self,
@@ -473,7 +546,7 @@ class Dataset(RandomAccess):
                 cannot be written.
             StepError: a value of variable size is not in its space.
         """
-        return curate.relabel(self, function, curate.file_path(target), fields, overwrite=overwrite)
+        return curate.relabel(self._whole(), function, curate.file_path(target), fields, overwrite=overwrite)
 
     def trim(
         self,
@@ -497,7 +570,7 @@ class Dataset(RandomAccess):
                 of the sources.
             RecordingError: no step of an episode would stay, the slice has a stride, or the target cannot be written.
         """
-        return curate.trim(self, steps, target, overwrite=overwrite).path
+        return curate.trim(self._whole(), steps, target, overwrite=overwrite).path
 
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episodes, in their files: `ds.filter("return > 100").annotate(success=True)`.
@@ -511,7 +584,7 @@ class Dataset(RandomAccess):
                 finished, or cannot be written.
             FormatError: a recording is damaged.
         """
-        curate.annotate(self, values)
+        curate.annotate(self._whole(), values)
 
     def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
         """Deletes the episodes where they are stored: `ds.filter("return < 0").delete()`; returns their number.
@@ -531,7 +604,7 @@ class Dataset(RandomAccess):
                 file cannot be written, ...
         """
         doomed: dict[tuple[str, str], list[int]] = {}
-        for header in self.headers:
+        for header in self._whole().headers:
             doomed.setdefault((header.recording, uuid_of(header)), []).append(header.episode)
         return curate.delete(self._source, doomed, force=force, dry_run=dry_run)
 
@@ -550,11 +623,7 @@ class Dataset(RandomAccess):
         return plots.report(self, **options)
 
     def __repr__(self) -> str:
-        if self._listed is None:
-            return f"<Dataset of {self._source!r}: not listed yet>"
-        return (
-            f"<Dataset of {self._source!r}: {plural(len(self), 'episode')}, {plural(self.n_steps, 'step')}>"
-        )
+        return display.text("Dataset", self._facts())
 
     def __str__(self) -> str:
         """As `repr`, but lists the episodes first."""
@@ -565,7 +634,13 @@ class Dataset(RandomAccess):
         return self._html("Dataset")
 
     def _html(self, name: str) -> str:
-        return display.html(name, display.Facts(repr(self._source), self.headers, None, {}))
+        _ = self.headers
+        return display.html(name, self._facts())
+
+    def _facts(self) -> display.Facts:
+        filters = {"steps": None if self._selector is None else self._selector.filters}
+        steps = None if self._known is None else self._known.steps
+        return display.Facts(repr(self._source), self._listed, steps, filters)
 
 
 def _places(chosen: object, count: int) -> list[int]:

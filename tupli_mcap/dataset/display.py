@@ -14,7 +14,7 @@ _WIDTH = 100
 
 
 class Facts(NamedTuple):
-    """Known facts about a dataset; `headers`, and `steps` after the tuple filter, are None before they are read."""
+    """Known facts about a dataset; `headers`, and `steps` after the filter of steps, are None before they are read."""
 
     source: str
     headers: Sequence[EpisodeHeader] | None
@@ -44,10 +44,10 @@ def _counts(facts: Facts) -> str:
         return "not listed yet"
     listed = sum(header.n_tuples for header in facts.headers)
     episodes = plural(len(facts.headers), "episode")
-    if facts.filters.get("tuples") is None:
+    if facts.filters.get("steps") is None:
         return f"{episodes}, {plural(listed, 'step')}"
     if facts.steps is None:
-        return f"{episodes}, {plural(listed, 'step')} before the tuple filter"
+        return f"{episodes}, {plural(listed, 'step')} before the filter of steps"
     return f"{episodes}, {facts.steps:,} of {plural(listed, 'step')}"
 
 

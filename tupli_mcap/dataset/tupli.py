@@ -106,14 +106,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         return self._with(episode_filter=filter)
 
     def with_tuple_filter(self, filter_fcn: TupleFilter | str | None) -> Self:
-        """The dataset with a further tuple filter, which chooses steps; None removes all.
-
-        Args:
-            filter_fcn: an expression or a text over state, action, reward, terminal, timeout, info, next_state, time
-                (ns) and step (counted from 0 in each episode), or the names of their columns (states, times), or
-                Gymnasium's (observation, terminated, truncated), such as `F("state[0]") > 1` or "info.force > 2", which
-                is evaluated on whole columns; or a function of one `RLTuple` that returns True or False, called for
-                every step that earlier filters chose.
+        """The dataset with a further tuple filter, which chooses steps like `Dataset.filter_steps`; None removes all.
 
         Raises:
             FilterError: it is neither, or names an unknown field.
@@ -385,7 +378,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         filters = {
             "benchmarks": self._query.benchmark_filter,
             "episodes": self._query.episode_filter,
-            "tuples": None if tuples is None else tuples.filters,
+            "steps": None if tuples is None else tuples.filters,
         }
         return display.Facts(
             repr(self._query.source), headers, None if selected is None else selected.steps, filters

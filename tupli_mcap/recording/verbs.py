@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.dataset.columns.load import TupleFilter
     from tupli_mcap.dataset.columns.statistics import FieldStatistics
     from tupli_mcap.dataset.columns.tables import Level
     from tupli_mcap.dataset.dataset import Test
@@ -39,6 +40,10 @@ class DatasetVerbs(SaysWhatIsMeant):
     def filter(self, test: Test) -> Dataset:
         """The episodes that match a test: `recording.filter("return > 100")`."""
         return self.dataset.filter(test)
+
+    def filter_steps(self, test: TupleFilter | str) -> Dataset:
+        """The episodes with only the steps that match a test: `recording.filter_steps("reward > 0")`."""
+        return self.dataset.filter_steps(test)
 
     def sort(self, key: str | Callable[[Episode], Any], *, descending: bool = False) -> Dataset:
         """The episodes in the order of a key ("return", "metadata.score") or a function."""

@@ -90,7 +90,7 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
         hint = did_you_mean(like, [*known, *_MEANT.values(), *nested])
         if name in _OF_STEPS and "run" in known:
-            hint += ": it is of steps, which TupliDataset.from_files(path).with_tuple_filter(...) chooses"
+            hint += ": it is of steps, which filter_steps(...) of a dataset chooses"
         elif not hint and "run" in known:
             hint = f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
         raise FilterError(f"unknown key {key!r}{hint}; the keys are {', '.join(known)}")

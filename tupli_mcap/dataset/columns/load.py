@@ -45,6 +45,11 @@ class Selected:
     def steps(self) -> int:
         return int(self.lengths.sum())
 
+    def reordered(self, listed: Array, order: Array) -> Selected:
+        """The selection with the episodes in another order; `listed` are the lengths of whole episodes, in this one."""
+        mask = None if self.mask is None else self.mask[_rows_of(listed, order)]
+        return Selected(self.lengths[order], mask)
+
 
 def read_columns(
     source: EpisodeSource,
@@ -79,18 +84,33 @@ def read_columns(
 
 
 def read_in_order(
-    source: EpisodeSource, headers: Sequence[EpisodeHeader], fields: Sequence[str]
-) -> dict[str, Any]:
-    """Columns of all steps of episodes in any order, as `read_columns` reads them; opens each recording once."""
+    source: EpisodeSource,
+    headers: Sequence[EpisodeHeader],
+    fields: Sequence[str],
+    selector: TupleSelector | None = None,
+    known: Selected | None = None,
+) -> tuple[dict[str, Any], Selected]:
+    """Columns of the wanted steps of episodes in any order, and the selection of these steps, as `read_columns` reads
+    them; opens each recording once."""
     places = {name: i for i, name in enumerate(dict.fromkeys(header.recording for header in headers))}
     order = np.argsort([places[header.recording] for header in headers], kind="stable")
-    columns, selected, _ = read_columns(source, [headers[i] for i in order], fields)
-    if (np.diff(order) < 0).any():
-        ends = np.cumsum(selected.lengths)
-        starts = ends - selected.lengths
-        rows = np.concatenate([np.arange(starts[i], ends[i]) for i in np.argsort(order).tolist()])
-        columns = {field: pick(column, rows) for field, column in columns.items()}
-    return columns
+    if (np.diff(order) >= 0).all():
+        return read_columns(source, headers, fields, selector, known)[:2]
+    listed, back = np.array([header.n_tuples for header in headers], np.int64), np.argsort(order)
+    known = None if known is None else known.reordered(listed, order)
+    columns, selected, _ = read_columns(source, [headers[i] for i in order], fields, selector, known)
+    rows = _rows_of(selected.lengths, back)
+    return {field: pick(column, rows) for field, column in columns.items()}, selected.reordered(
+        listed[order], back
+    )
+
+
+def _rows_of(lengths: Array, order: Array) -> Array:
+    """The rows of episodes of these lengths, in another order."""
+    ends = np.cumsum(lengths)
+    starts = ends - lengths
+    rows: Array = np.concatenate([np.arange(starts[i], ends[i]) for i in order.tolist()])
+    return rows
 
 
 class _Reader:

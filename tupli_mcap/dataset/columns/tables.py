@@ -11,7 +11,6 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
-from tupli_mcap.dataset.columns.load import steps_within
 from tupli_mcap.dataset.items.beside import info_column
 from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
@@ -99,7 +98,7 @@ def _episode_columns(dataset: Episodes) -> dict[str, Any]:
         "recording": [header.recording for header in headers],
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
-        "steps": dataset.lengths,
+        "steps": np.array([header.n_tuples for header in headers], np.int64),
         "return": dataset.returns,
         "end": [header.end for header in headers],
         "seed": _whole_numbers([header.seed for header in headers]),
@@ -212,7 +211,7 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     episodes = _episode_columns(dataset)
     columns: dict[str, Any] = {
         "episode": of_episode,
-        "step": steps_within(lengths),
+        "step": dataset.step_numbers,
         "time": _in_utc(found.times.astype("datetime64[ns]")),
     }
     recording = dataset.example

@@ -73,15 +73,18 @@ class FrameValues:
     """The frames of steps, decoded on access: uint8 (steps, height, width, 3).
 
     Args:
-        lengths: of the episodes (int64).
+        lengths: of the whole episodes (int64).
         frames_of: returns the frames of an episode by its place.
+        mask: the wanted ones of their steps (bool), by whose numbers they are called; None for all.
     """
 
-    def __init__(self, lengths: Array, frames_of: Callable[[int], Frames]) -> None:
+    def __init__(self, lengths: Array, frames_of: Callable[[int], Frames], mask: Array | None = None) -> None:
         self._ends, self._frames_of = np.cumsum(lengths), frames_of
         self._starts = self._ends - lengths
+        self._wanted = None if mask is None else np.flatnonzero(mask)
 
     def __call__(self, rows: Array) -> Array:
+        rows = rows if self._wanted is None else self._wanted[rows]
         episodes = self._ends.searchsorted(rows, side="right")
         steps = rows - self._starts[episodes]
         each = ((episode, np.flatnonzero(episodes == episode)) for episode in np.unique(episodes).tolist())
