@@ -657,6 +657,24 @@ class TestLook:
         assert re.search(r"^infos +force, logp, name, step$", ok("info", "."), re.M)
         assert run("info", ".", "--filter", "steps = 1", "--json").json["info_keys"] == ["force"]
 
+    def test_info_of_numbers_within_infos(self, here: Path) -> None:
+        info = {
+            "many": np.ones(17),
+            "contact": {"left": np.array([1.5, -2])},
+            "part": np.arange(6),
+            "force": 1,
+        }
+        with RecordEpisodes(
+            gym.make("CartPole-v1"), here / "i.mcap", step_callback=lambda step: info
+        ) as recorded:
+            recorded.reset(seed=1)
+            recorded.step(0)
+        out = ok("info", "i.mcap")
+        names = re.findall(r"^(info\.\S+) ", out, re.M)
+        contact = ["info.contact.left[0]", "info.contact.left[1]"]
+        assert names == ["info.force", *contact, "info.part[0]", "info.part[1]", "info.part[2]"]
+        assert "\ninfos that are not shown: many, part\n" in out
+
     def test_info_of_several_is_of_one_dataset(self, here: Path, cartpole: Path) -> None:
         shutil.copy(cartpole, here / "a.mcap")
         record_rollouts("CartPole-v1", "deep/b.mcap", steps=50, seed=9)

@@ -251,6 +251,20 @@ class TestEpisodes:
             told = values_at(recording.episodes[0], 3)
         assert told["reward"] == {"reward": "1e+308", "return so far": "inf"}
 
+    def test_numbers_within_infos(self, tmp_path: Path) -> None:
+        info = {"contact": {"left": np.array([1.5, -2])}, "force": 123456789, "note": [1, 2]}
+        with tupli_mcap.RecordEpisodes(
+            gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=lambda step: info
+        ) as env:
+            env.reset(seed=1)
+            env.step(0)
+        with tupli_mcap.Recording(tmp_path / "r.mcap") as recording:
+            tracks = curves_of(recording.episodes[0]).of("info")
+            told = values_at(recording.episodes[0], 0)["info"]
+        names = ["info.force", "info.contact.left[0]", "info.contact.left[1]"]
+        assert [track.name for track in tracks] == names
+        assert [told[name] for name in names] == ["123456789", "1.5", "-2"] and told["info.note"] == "[1, 2]"
+
     def test_pictures(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
         picture = web.get(f"/episode/{uri}/picture/0/3")

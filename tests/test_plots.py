@@ -683,7 +683,7 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     )
     assert panel(made, "metadata.score") and panel(made, "info.distance")  # of episodes; step by step
     assert not {"metadata.constant", "info.k, mean of each episode"} & set(texts(made))  # all the same
-    assert made.notes == ["Infos that are not single numbers are not shown: info.word."]
+    assert made.notes == ["Infos that are no numbers, or many, are not shown: info.word."]
 
 
 def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -719,14 +719,37 @@ def test_infos_without_numbers_are_named(tmp_path: Path) -> None:
     env = Scripted(
         lambda n: UNIT.low,
         UNIT,
-        info=lambda n: {"force": 1.0, "contact": np.ones(2), "note": "x", "is_success": False},
+        info=lambda n: {"contact": np.ones(17), "force": 1.0, "note": "x", "is_success": False},
         length=4,
     )
     made = report(record(tmp_path / "r.mcap", env, 8, record_info=True))
     assert [note for note in made.notes if note.startswith("Infos")] == [
-        "Infos that are not single numbers are not shown: info.contact, info.note."
+        "Infos that are no numbers, or many, are not shown: info.contact, info.note."
     ]
     assert "info.force" in texts(made)
+
+
+def test_numbers_in_infos_are_drawn_one_by_one(tmp_path: Path) -> None:
+    env = Scripted(
+        lambda n: UNIT.low,
+        UNIT,
+        info=lambda n: {"contact": {"left": np.array([n, -n]), "on": n % 2 == 0}, "force": 2.0 * n},
+        length=4,
+    )
+    path = record(tmp_path / "r.mcap", env, 8, record_info=True)
+    made = report(path)
+    assert not made.notes
+    numbers = {name: values for name, values in made.measured[0].numbers.items() if name.startswith("info.")}
+    assert {name: values.tolist() for name, values in numbers.items()} == {
+        "info.force": [5, 5],
+        "info.contact.left[0]": [2.5, 2.5],
+        "info.contact.left[1]": [-2.5, -2.5],
+        "info.contact.on": [0.5, 0.5],
+    }
+    assert next(iter(numbers)) == "info.force"  # what is one number comes first
+    assert panel(made, "info.contact.left[1]").lines[0].get_ydata().tolist() == [-1, -2, -3, -4]
+    with Recording(path) as recording:
+        assert {name for name in recording.dataset.to_pandas() if name.startswith("info.")} == set(numbers)
 
 
 def test_infos_of_float32_are_drawn_without_warning(tmp_path: Path) -> None:

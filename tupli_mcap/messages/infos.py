@@ -1,4 +1,4 @@
-"""Step infos: entries that the user named have typed fields in `/info`, all others are JSON.
+"""Step infos: entries that the user named have typed fields in `/info`, all others are JSON; infos as columns.
 
 A typed field of an entry that is missing or no float64 is marked absent; the JSON then holds the entry.
 """
@@ -7,17 +7,23 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import are_floats
 from tupli_mcap.errors import FormatError
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.layout import NUMBERS
+from tupli_mcap.schema.keys import name_within
+from tupli_mcap.spaces.labels import indexed_names
 from tupli_mcap.spaces.leaves import NameRegistry
 
 _FIELD = struct.Struct("<d?7x")
+_NUMBER = (int, float, np.integer, np.floating, np.bool_)
+_FEW = 16  # numbers of one info that are drawn
+_TOO_LARGE = 2**1000  # for a float
 
 
 def with_text_keys(info: Mapping[Any, Any]) -> dict[str, Any]:
@@ -31,6 +37,98 @@ def paths_in(info: Mapping[Any, Any], before: tuple[str, ...] = ()) -> Iterator[
         yield (path := (*before, str(key)))
         if isinstance(value, dict):
             yield from paths_in(value, path)
+
+
+# ---- as columns
+
+
+def info_column(values: list[Any]) -> Any:
+    """Values of infos, None where there is none, as one column: an array of shape (steps, ...) of numbers and of arrays
+    of one shape, float64 with NaN if some are missing; of others, and where floats would lose digits, the list."""
+    if any(isinstance(value, list | tuple | dict) for value in values):
+        return values
+    there = [np.asarray(value) for value in values if value is not None]
+    alike = len({value.shape for value in there}) == 1 and all(value.dtype.kind in "biuf" for value in there)
+    if not alike:
+        return values
+    if len(there) == len(values):
+        column = np.stack(there)
+    else:
+        column = np.full((len(values), *there[0].shape), np.nan)
+        column[[value is not None for value in values]] = there
+    return column if column.dtype.kind != "f" or are_floats(there) else values
+
+
+def columns_in(infos: Sequence[Mapping[Any, Any]], most: int) -> Iterator[tuple[Any, str, Any]]:
+    """The key, name and values of each column of infos: `("x", "info.x", [3, None])`, with None where there is none.
+
+    If an info is always an array of at most `most` numbers, of one shape, or a dict of about as many in those and by
+    themselves, each has a column: `info.contact.left[0]`; those in arrays are arrays, masked where there is none.
+    """
+    for key in dict.fromkeys(key for info in infos for key in info):
+        name, values = name_within("info", key), [info.get(key) for info in infos]
+        found = _numbers_within(name, values, most) or {name: values}
+        yield from ((key, own, column) for own, column in found.items())
+
+
+def _numbers_within(name: str, values: list[Any], most: int) -> dict[str, Any] | None:
+    """A column for each number in the values; None if they are not the same numbers in all that are there, or many."""
+    given = [value for value in values if value is not None]
+    if given and all(isinstance(value, dict) for value in given):
+        columns: dict[str, Any] = {}
+        for key in dict.fromkeys(key for value in given for key in value):
+            inside = [value if value is None else value.get(key) for value in values]
+            parts = _numbers_within(name_within(name, key), inside, most)
+            if parts is None or len(columns) > most:
+                return None
+            columns |= parts
+        return columns
+    if given and all(isinstance(value, np.ndarray) for value in given):
+        column = info_column(values)
+        if isinstance(column, list) or not 0 < column[0].size <= most:
+            return None
+        flat = column.reshape(len(column), column[0].size)
+        if len(given) < len(values):
+            flat = np.ma.masked_array(flat)
+            flat[[value is None for value in values]] = np.ma.masked
+        names = indexed_names(name, column.shape[1:], np.arange(column[0].size))
+        return {own: flat[:, i] for i, own in enumerate(names)}
+    return {name: values} if given and all(isinstance(value, _NUMBER) for value in given) else None
+
+
+class InfoNumbers(NamedTuple):
+    """The numbers of a column of infos: float64 (infos,), masked where there is none."""
+
+    key: Any
+    name: str
+    values: np.ma.MaskedArray[Any, np.dtype[np.float64]]
+
+
+def numbers_in(infos: Sequence[Mapping[Any, Any]]) -> list[InfoNumbers]:
+    """The columns of infos that have numbers: first the infos that are one, then dicts and arrays of few."""
+    found = [InfoNumbers(key, name, _masked(values)) for key, name, values in columns_in(infos, _FEW)]
+    found = [one for one in found if one.values.count()]
+    return sorted(found, key=lambda one: one.name != name_within("info", one.key))
+
+
+def parts_of(info: Mapping[Any, Any]) -> Iterator[tuple[str, Any]]:
+    """The name and value of each of those columns in one info, and of its other entries."""
+    for _, name, values in columns_in([info], _FEW):
+        yield name, values[0]
+
+
+def _masked(values: Any) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
+    if isinstance(values, np.ndarray):
+        return np.ma.masked_array(values, dtype=np.float64)
+    is_number = [
+        isinstance(value, _NUMBER) and (not isinstance(value, int) or abs(value) < _TOO_LARGE)
+        for value in values
+    ]
+    numbers = [float(value) if known else 0.0 for value, known in zip(values, is_number, strict=True)]
+    return np.ma.masked_array(numbers, np.logical_not(is_number), dtype=np.float64)
+
+
+# ---- as messages
 
 
 class InfoCodec:

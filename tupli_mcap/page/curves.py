@@ -10,13 +10,12 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.jsonvalue import spelled
-from tupli_mcap.messages.infos import with_text_keys
+from tupli_mcap.messages.infos import parts_of, with_text_keys
 from tupli_mcap.messages.topics import INFO
-from tupli_mcap.plots.measure import number_columns, numbers_in, thinned_to
+from tupli_mcap.plots.measure import drawable_infos, number_columns, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -100,10 +99,8 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     if _few_infos(recording):
         info = (episode.infos or [None] * len(episode))[step] or {}
         told["info"] = {
-            name_within("info", key): f"{value:.5g}"
-            if isinstance(value, float | np.floating)
-            else spelled(value)
-            for key, value in with_text_keys(info).items()
+            name: f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
+            for name, value in parts_of(with_text_keys(info))
         }
     return told
 
@@ -157,11 +154,7 @@ def _info_tracks(recording: Recording, episode: Episode, read: int, notes: list[
     if not _few_infos(recording):
         notes.append(f"Infos are not drawn: the recording has more than {_MOST_INFOS:,}.")
         return
-    found: dict[str, Array] = {}
-    for step, info in enumerate((episode.infos or [])[:read]):
-        for name, value in numbers_in("info", info):
-            if name in found or len(found) < _MOST_KEYS:
-                found.setdefault(name, np.full(read, np.nan))[step] = value
     at = np.arange(read, dtype=np.float64)
-    for name, values in found.items():
+    infos = [info or {} for info in (episode.infos or [])[:read]]
+    for _, name, values in drawable_infos(infos)[:_MOST_KEYS]:
         yield _track("info", name, at, values)

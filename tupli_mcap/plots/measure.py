@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
-from tupli_mcap.messages.infos import InfoCodec, with_text_keys
+from tupli_mcap.messages.infos import InfoCodec, numbers_in, with_text_keys
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
 from tupli_mcap.recording import Columns, Recording, Run
@@ -39,7 +39,7 @@ class Measured:
     is_recorded: see `Recording.is_recorded`.
     numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata.key`, and `info.key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
-    other_infos: names of infos that are never a finite number.
+    other_infos: names of infos without a finite number, or with many.
     read_episodes, read_steps: how many episodes and steps the values are from.
     states, actions, rewards: the values of their leaves. seeds: the different seeds of the chosen episodes, ascending.
     """
@@ -90,9 +90,8 @@ class Measured:
         if self.other_infos:
             more = len(self.other_infos) - _MOST_NAMED
             names = ", ".join(key[:40] for key in self.other_infos[:_MOST_NAMED])
-            notes.append(
-                f"Infos that are not single numbers are not shown: {names}{f' and {more:,} more' if more > 0 else ''}."
-            )
+            names += f" and {more:,} more" if more > 0 else ""
+            notes.append(f"Infos that are no numbers, or many, are not shown: {names}.")
         for leaf in self.leaves:
             notes += leaf.notes()
         odd = int(np.isnan(self.rows["return"]).sum())
@@ -173,24 +172,30 @@ def _metadata_numbers(recording: Recording, positions: Array) -> dict[str, Array
         if texts[position] == "{}":
             continue
         said = jsonvalue.loads(texts[position])
-        found = {SUCCESS: success_of(said), **dict(numbers_in("metadata", said))}
+        found = {SUCCESS: success_of(said), **dict(_metadata_entries(said))}
         for key, value in found.items():
             if value is not None and (key in numbers or len(numbers) < _MOST_KEYS):
                 numbers.setdefault(key, np.full(len(positions), np.nan))[at] = float(value)
     return numbers
 
 
-def numbers_in(word: str, said: Any) -> Iterator[tuple[str, float]]:
-    """The entries of an info or of metadata (as `word` says) that are numbers, by their names (`info.key`), except
-    those for success."""
-    for key, value in with_text_keys(said).items() if isinstance(said, Mapping) else ():
-        if key not in KEYS and isinstance(value, int | float | np.number | np.bool_):
-            if isinstance(value, np.floating):
-                value = float(value)  # a float32 cannot be compared with LARGEST
-            # an integer may be too large for a float
-            number = float(value) if -LARGEST <= value <= LARGEST else np.nan
-            if np.isfinite(number):
-                yield name_within(word, key), number
+def _metadata_entries(said: Any) -> Iterator[tuple[str, float]]:
+    """The entries of metadata that are numbers, by their names, except those for success."""
+    for key, value in said.items() if isinstance(said, Mapping) else ():
+        # an integer may be too large for a float
+        if key not in KEYS and isinstance(value, int | float) and -LARGEST <= value <= LARGEST:
+            yield name_within("metadata", key), float(value)
+
+
+def drawable_infos(infos: Sequence[Mapping[Any, Any]]) -> list[tuple[str, str, Array]]:
+    """The key, name and values of each column of infos that can be drawn (float64, NaN for what cannot), without those
+    for success."""
+    columns = [
+        (key, name, drawable_numbers(values.filled(np.nan)))
+        for key, name, values in numbers_in(list(map(with_text_keys, infos)))
+        if key not in KEYS
+    ]
+    return [column for column in columns if np.isfinite(column[2]).any()]
 
 
 def _add_infos(recording: Recording, measured: Measured) -> None:
@@ -208,22 +213,23 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     number = file.topics["/info"]
     decoder = InfoCodec.from_metadata(file.contents.channels[number].metadata)
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
-    sums: dict[str, Array] = {}
-    names, numbers = set[str](), {name_within("info", key) for key in KEYS}
+    infos: list[dict[Any, Any]] = []
+    places_of: list[int] = []
     for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
         for body in file.store.bodies(number, first, each):
             episode, _, info = decoder.decode(body)
-            if episode not in at:
-                continue
-            names.update(name_within("info", key) for key in with_text_keys(info))
-            for name, value in numbers_in("info", info):
-                numbers.add(name)
-                if name in sums or len(sums) < _MOST_KEYS:
-                    sums.setdefault(name, np.zeros((2, len(at))))[:, at[episode]] += value, 1
+            if episode in at:
+                infos.append(info)
+                places_of.append(at[episode])
     measured.info_steps, measured.read_infos = channel.messages, each * places
-    measured.other_infos = sorted(names - numbers)
-    with np.errstate(invalid="ignore"):
-        measured.numbers |= {key: total / count for key, (total, count) in sums.items()}
+    found, of = drawable_infos(infos), np.array(places_of, np.int64)
+    others = {str(key) for info in infos for key in info} - {key for key, *_ in found} - {*KEYS}
+    measured.other_infos = sorted(name_within("info", key) for key in others)
+    for _, name, values in found[:_MOST_KEYS]:
+        known = np.isfinite(values)
+        sums = np.bincount(of[known], values[known], len(at))
+        with np.errstate(invalid="ignore"):
+            measured.numbers[name] = sums / np.bincount(of[known], minlength=len(at))
 
 
 def _random_episodes(positions: Array, lengths: Array, most: int) -> Array:
@@ -273,9 +279,8 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     }
     infos: dict[str, Array] = {}
     if measured.info_steps and measured.read_infos == measured.info_steps:
-        for step, info in enumerate(recording.infos(position) or ()):
-            for name, value in numbers_in("info", info):
-                infos.setdefault(name, np.full(length, np.nan))[step] = value
+        said = [info or {} for info in recording.infos(position) or ()]
+        infos = {name: values for _, name, values in drawable_infos(said)}
     return Trace(
         int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
         recording.episode_start(position).seed_number, width, thinned(np.arange(steps)[:, None], width)[:, 0],

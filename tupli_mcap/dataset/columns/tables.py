@@ -11,12 +11,12 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
-from tupli_mcap.dataset.items.beside import info_column
 from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
+from tupli_mcap.messages.infos import columns_in
 from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.schema.keys import name_within
-from tupli_mcap.spaces.labels import common_labels, distinct, element_names, indexed_names
+from tupli_mcap.spaces.labels import common_labels, distinct, element_names
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,40 +150,10 @@ def _column(values: list[Any]) -> Any:
 
 
 def _info_columns(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A column for each key of any info; for each element, if all values are arrays of numbers of one shape; and for
-    each key of theirs, if all are dicts of such arrays and numbers."""
-    columns: dict[str, Any] = {}
-    for key in dict.fromkeys(key for info in infos for key in info):
-        name, values = name_within("info", key), [info.get(key) for info in infos]
-        columns |= _numbers(name, values) or {name: _column(values)}
-    return columns
-
-
-def _numbers(name: str, values: list[Any]) -> dict[str, Any] | None:
-    """A column for each number in the values; None if they are not the same numbers in all that are there, or many."""
-    given = [value for value in values if value is not None]
-    if given and all(isinstance(value, dict) for value in given):
-        columns: dict[str, Any] = {}
-        for key in dict.fromkeys(key for value in given for key in value):
-            parts = _numbers(
-                name_within(name, key), [value if value is None else value.get(key) for value in values]
-            )
-            if parts is None or len(columns) > _MOST_COLUMNS:
-                return None
-            columns |= parts
-        return columns
-    if given and all(isinstance(value, np.ndarray) for value in given):
-        column = info_column(values)
-        if isinstance(column, list) or not 0 < column[0].size <= _MOST_COLUMNS:
-            return None
-        flat = column.reshape(len(column), column[0].size)
-        if len(given) < len(values):
-            flat = np.ma.masked_array(flat)
-            flat[[value is None for value in values]] = np.ma.masked
-        names = indexed_names(name, column.shape[1:], np.arange(column[0].size))
-        return {own: flat[:, i] for i, own in enumerate(names)}
-    alike = given and all(isinstance(value, (*_REAL, np.bool_)) for value in given)
-    return {name: _column(values)} if alike else None
+    return {
+        name: values if isinstance(values, np.ndarray) else _column(values)
+        for _, name, values in columns_in(infos, _MOST_COLUMNS)
+    }
 
 
 def _floats(values: Sequence[Any]) -> Any:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array, are_floats
+from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, following, pick, rows_of_runs
 from tupli_mcap.errors import FilterError, did_you_mean
-from tupli_mcap.messages.infos import paths_in
+from tupli_mcap.messages.infos import info_column, paths_in
 from tupli_mcap.recording.frames import Frames, gathered
 from tupli_mcap.schema import split_key
 from tupli_mcap.schema.keys import name_within
@@ -125,19 +125,3 @@ def _values_of(key: str, infos: Sequence[Mapping[str, Any]], known: Sequence[str
     names = {path: name_within("info", *path) for info in infos for path in paths_in(info)}
     hint = did_you_mean(f"info.{key}", names.values())
     raise SamplingError(f"no info of these steps has the key {key!r:.80}{hint}")
-
-
-def info_column(values: list[Any]) -> Any:
-    """Values of infos as one column; see `info_columns`."""
-    if any(isinstance(value, list | tuple | dict) for value in values):
-        return values
-    there = [np.asarray(value) for value in values if value is not None]
-    alike = len({value.shape for value in there}) == 1 and all(value.dtype.kind in "biuf" for value in there)
-    if not alike:
-        return values
-    if len(there) == len(values):
-        column = np.stack(there)
-    else:
-        column = np.full((len(values), *there[0].shape), np.nan)
-        column[[value is not None for value in values]] = there
-    return column if column.dtype.kind != "f" or are_floats(there) else values

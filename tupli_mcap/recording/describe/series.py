@@ -11,12 +11,11 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
-from tupli_mcap.messages.infos import with_text_keys
+from tupli_mcap.messages.infos import numbers_in, with_text_keys
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -55,7 +54,7 @@ class Sketch(NamedTuple):
         distributions: counts of steps, from the smallest value to the largest.
         sampled: number of steps that the distributions count.
         hidden: number of dimensions that are left out.
-        infos_hidden: keys of infos without a distribution.
+        infos_hidden: keys of infos without a distribution, or with more numbers than have one.
         error: why the steps could not be read; empty if there was no error.
     """
 
@@ -98,10 +97,11 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
     )
     dimensions = sum(leaf.size for leaf in layout.leaves if leaf.kind != "variable" and not leaf.apart)
     hidden = dimensions - len(shown)
-    of_infos = dict(itertools.islice(_of_infos(infos, points), _MOST_INFOS))
-    others = tuple(sorted({key for info in infos for key in info} - of_infos.keys()))
-    shown += tuple(of_infos.values())
-    return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden, others)
+    numbers = numbers_in(infos)
+    drawn, left = numbers[:_MOST_INFOS], {one.key for one in numbers[_MOST_INFOS:]}
+    shown += tuple(_distribution(None, one.name, one.values.compressed(), points) for one in drawn)
+    others = {key for info in infos for key in info} - {one.key for one in drawn} | left
+    return Sketch(courses, shown, sum(len(piece) for piece in pieces), hidden, tuple(sorted(others)))
 
 
 def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS) -> list[dict[str, Any]]:
@@ -120,14 +120,6 @@ def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS
     starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
     bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)
     return [with_text_keys(info) for episode, _, info in map(codec.decode, bodies) if episode in wanted]
-
-
-def _of_infos(infos: list[dict[str, Any]], points: int) -> Iterator[tuple[str, Series]]:
-    """The distribution of each number of infos, by its key."""
-    for key in dict.fromkeys(key for info in infos for key in info):
-        found = [info[key] for info in infos if key in info]
-        if all(isinstance(value, int | float | np.number | np.bool_) for value in found):
-            yield key, _distribution(None, name_within("info", key), np.array(found, np.float64), points)
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:
