@@ -77,8 +77,8 @@ def shown(path: Path) -> list[int]:
 @pytest.mark.parametrize("shape", [(20, 30, 3), (20, 30, 1)])
 def test_of_an_image_in_the_states(kind: str, shape: tuple[int, ...], tmp_path: Path) -> None:
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera(shape)))[1]
-    assert episode.video(tmp_path / f"film{kind}").pictures == 5
-    np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90], atol=6)
+    assert episode.video(tmp_path / f"film{kind}").pictures == 6
+    np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90, 50], atol=6)
 
 
 def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
     assert film(episodes, tmp_path / "a.gif").pictures == 12
     np.testing.assert_allclose(shown(tmp_path / "a.gif"), [0, 10, 20, 30, 40, 50] * 2, atol=3)
     for i, name in enumerate(["state['wrist']", "state.wrist", "wrist"]):
-        assert film(episodes[:1], tmp_path / f"b{i}.gif", camera=name, fps=5).pictures == 5
+        assert film(episodes[:1], tmp_path / f"b{i}.gif", camera=name, fps=5).pictures == 6
     with pytest.raises(RecordingError, match="it has render, state"):
         film(episodes, tmp_path / "c.gif", camera="front")
 
@@ -139,7 +139,7 @@ def test_pictures_larger_than_films_hold_are_refused(
     ):
         episode.video(tmp_path / f"film{kind}")
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
-    assert episode.video(tmp_path / f"film{kind}", width=320).pictures == 5
+    assert episode.video(tmp_path / f"film{kind}", width=320).pictures == 6
 
 
 @pytest.mark.parametrize("target", [None, "film.mp4", "film.gif"])
@@ -152,7 +152,7 @@ def test_a_notebook_shows_it(target: str | None, tmp_path: Path) -> None:
     assert page.startswith("<img" if target == "film.gif" else "<video")
     copy = tmp_path / f"copy{made.kind}"
     copy.write_bytes(base64.b64decode(content))
-    assert len(shown(copy)) == made.pictures == 5
+    assert len(shown(copy)) == made.pictures == 6
     assert made.path == (None if target is None else tmp_path / target)
     assert made.path is None or made.path.read_bytes() == copy.read_bytes()
     assert len(repr(made)) < 200
@@ -169,7 +169,7 @@ def test_of_a_stack_its_newest_frame(tmp_path: Path) -> None:
     env = gym.wrappers.FrameStackObservation(Gray(), 4)
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", env))[0]
     episode.video(tmp_path / "film.gif")
-    np.testing.assert_allclose(shown(tmp_path / "film.gif"), [250, 210, 170, 130, 90], atol=3)
+    np.testing.assert_allclose(shown(tmp_path / "film.gif"), [250, 210, 170, 130, 90, 50], atol=3)
 
 
 def test_refuses_what_has_no_meaning(tmp_path: Path) -> None:
@@ -190,8 +190,8 @@ def test_command(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", Camera())
     done = CliRunner().invoke(app, ["render", str(path), "-o", str(tmp_path / "f.gif"), "--episodes", "all"])
     assert done.exit_code == 0, done.output
-    assert "10 recorded pictures" in done.output
-    assert len(shown(tmp_path / "f.gif")) == 10
+    assert "12 recorded pictures" in done.output
+    assert len(shown(tmp_path / "f.gif")) == 12
     again = CliRunner().invoke(app, ["render", str(path), "-o", str(tmp_path / "g.gif"), "--rerun"])
     assert again.exit_code == 1
     assert "carries no environment" in again.output

@@ -322,6 +322,24 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
     assert {picture.shape for _, picture in pictures} == {(4, 5, 3)}
 
 
+def test_recorded_frames_are_shown_beside_images_of_states(tmp_path: Path) -> None:
+    class Filmed(Scripted):
+        metadata = {"render_modes": ["rgb_array"]}
+        render_mode = "rgb_array"
+
+        def render(self) -> Any:
+            return np.full((8, 9, 3), 20, np.uint8)
+
+    for i, space in enumerate((spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Box(0, 255, (2,), np.uint8))):
+        env = Filmed(lambda n, space=space: space.low, space, length=10)
+        path = record(tmp_path / f"{i}.mcap", env, 10, frames=True, frame_format="png")
+        ((_, trace),) = report(path).traces
+        frames, *images = trace.pictures
+        assert [title for title, _ in frames] == [f"frame, step {n}" for n in (0, 2, 4, 6, 8, 10)]
+        assert all(picture.shape == (8, 9, 3) and (picture == 20).all() for _, picture in frames)
+        assert len(images) == 1 - i
+
+
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("axis", [0, -1])
 @pytest.mark.parametrize("shape", [(6, 5), (6, 3), (6, 5, 3)])

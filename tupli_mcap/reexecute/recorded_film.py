@@ -113,7 +113,7 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
     if camera is not None and camera not in recording.cameras:
         leaf = leaves_by_name(images).get(camera)
         if leaf is not None:
-            return len(episode), _of_states(episode, leaf)
+            return _of_states(episode, leaf)
         known = [*recording.cameras, *(leaf.path for leaf in images)]
         raise RecordingError(
             f"{recording.name} has no pictures {camera!r:.80}; it has {', '.join(known) or 'none'}"
@@ -122,17 +122,23 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
     if len(frames):
         return len(frames), iter(frames)
     if camera is None and images:
-        return len(episode), _of_states(episode, images[0])
+        return _of_states(episode, images[0])
     raise RecordingError(
         f"{recording.name}: episode {episode.number} was recorded without pictures; make them with `tupli-mcap render`"
     )
 
 
-def _of_states(episode: Episode, leaf: Leaf) -> Iterator[Picture]:
-    for first in range(0, len(episode), _BLOCK):
-        values = leaf.get(episode[first : first + _BLOCK].states)
-        for value in values:
-            yield as_picture(value, leaf)
+def _of_states(episode: Episode, leaf: Leaf) -> tuple[int, Iterator[Picture]]:
+    """The pictures of its states, and of its final state if that is known, as recorded frames show it."""
+    final = episode.final_state
+
+    def values() -> Iterator[Array]:
+        for first in range(0, len(episode), _BLOCK):
+            yield from leaf.get(episode[first : first + _BLOCK].states)
+        if final is not None:
+            yield leaf.get(final)
+
+    return len(episode) + (final is not None), (as_picture(value, leaf) for value in values())
 
 
 def as_picture(value: Array, leaf: Leaf) -> Picture:
