@@ -544,7 +544,7 @@ class Told(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         *rest, _ = self.env.step(action)
         self._number += 1
-        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes", 7: 1}
+        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes", 7: 1, "of": {"a": np.ones(2)}}
 
 
 @pytest.mark.parametrize("num_envs", [0, 12])
@@ -576,6 +576,7 @@ def test_numbers_among_infos_come_to_rerun(num_envs: int, tmp_path: Path) -> Non
     assert len(shown(tmp_path / "r.rrd", f"{root}/return")[0]) > 10
     assert len(shown(tmp_path / "r.rrd", "/info/7")[0]) > 10  # a key that is no text
     assert not len(shown(tmp_path / "r.rrd", "/info/word")[0])
+    assert len(shown(tmp_path / "r.rrd", r"/info/of.a\[1\]")[0]) > 10
 
 
 def test_sub_environments_of_short_episodes_stay_beside_the_others(tmp_path: Path) -> None:

@@ -354,7 +354,8 @@ def test_actions_are_lanes_or_steps(tmp_path: Path) -> None:
 
 def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     def info(step: int) -> dict[str, Any]:
-        told = {"said": f"step {step}", "speed": step / 2, "won": step == 10, "array": np.zeros(3)}
+        told = {"said": f"step {step}", "speed": step / 2, "won": step == 10, "array": np.zeros(17)}
+        told["contact"] = {"left": np.array([step, -step])}
         return told if step % 2 == 0 else {"speed": step / 2}
 
     found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
@@ -362,12 +363,14 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     assert np.array_equal(found.scalars("/info/speed")[:, 0], speeds)
     assert found.rows("/info/won", "step") == [1, 3, 5, 7, 9, 12, 14, 16, 18, 20]
     assert found.rows("/info/said", "TextLog:text")[:2] == [["step 2"], ["step 4"]]
-    assert "info 'array'" in card(found)
+    assert "info 'array'" in card(found) and "info 'contact" not in card(found)
+    sides = found.scalars(r"/info/contact.left\[1\]")[:, 0]
+    assert sides[~np.isnan(sides)].tolist() == [-2, -4, -6, -8, -10] * 2
 
 
 def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
     def info(step: int) -> dict[Any, Any]:
-        return {0: step / 2, "x": 1.0, 7: "said", (1, 2): np.zeros(3)}
+        return {0: step / 2, "x": 1.0, 7: "said", (1, 2): np.zeros(17)}
 
     found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
     assert np.array_equal(found.scalars("/info/0")[:, 0], np.tile(np.arange(1, 11) / 2, 2))

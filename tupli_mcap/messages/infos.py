@@ -6,7 +6,7 @@ A typed field of an entry that is missing or no float64 is marked absent; the JS
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,15 +106,20 @@ class InfoNumbers(NamedTuple):
 
 def numbers_in(infos: Sequence[Mapping[Any, Any]]) -> list[InfoNumbers]:
     """The columns of infos that have numbers: first the infos that are one, then dicts and arrays of few."""
-    found = [InfoNumbers(key, name, _masked(values)) for key, name, values in columns_in(infos, _FEW)]
-    found = [one for one in found if one.values.count()]
-    return sorted(found, key=lambda one: one.name != name_within("info", one.key))
+    columns = _entries_first(columns_in(infos, _FEW))
+    found = [InfoNumbers(key, name, _masked(values)) for key, name, values in columns]
+    return [one for one in found if one.values.count()]
 
 
-def parts_of(info: Mapping[Any, Any]) -> Iterator[tuple[str, Any]]:
-    """The name and value of each of those columns in one info, and of its other entries."""
-    for _, name, values in columns_in([info], _FEW):
-        yield name, values[0]
+def _entries_first(columns: Iterable[tuple[Any, str, Any]]) -> list[tuple[Any, str, Any]]:
+    return sorted(columns, key=lambda column: column[1] != name_within("info", column[0]))
+
+
+def parts_of(info: Mapping[Any, Any]) -> dict[str, Any]:
+    """One info as people are shown it: its entries by their names in it, with those in dicts and arrays of few numbers
+    (`contact.left[0]`) last."""
+    found = _entries_first(columns_in([with_text_keys(info)], _FEW))
+    return {name.removeprefix("info."): values[0] for _, name, values in found}
 
 
 def _masked(values: Any) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:

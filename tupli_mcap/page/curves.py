@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.jsonvalue import spelled
-from tupli_mcap.messages.infos import parts_of, with_text_keys
+from tupli_mcap.messages.infos import parts_of
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.plots.measure import drawable_infos, number_columns, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
@@ -99,8 +99,8 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     if _few_infos(recording):
         info = (episode.infos or [None] * len(episode))[step] or {}
         told["info"] = {
-            name: f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
-            for name, value in parts_of(with_text_keys(info))
+            f"info.{name}": f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
+            for name, value in parts_of(info).items()
         }
     return told
 

@@ -47,7 +47,7 @@ class NewSteps(NamedTuple):
 
 
 class NewInfo(NamedTuple):
-    """The recorded infos of the step in row `row` of a sub-environment's channel, by the texts of their keys; `time_ns`
+    """The recorded infos of the step in row `row` of a sub-environment's channel, as `parts_of` them; `time_ns`
     is wall clock."""
 
     row: int

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.jsonvalue import shown
-from tupli_mcap.messages.infos import with_text_keys
+from tupli_mcap.messages.infos import parts_of
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
@@ -109,7 +109,7 @@ class Infos:
                 breaking = set(self.numbers)
             infos = block.recording.infos(piece.position) or []
             for row, info in enumerate(infos[piece.step : piece.step + piece.end - piece.begin], piece.begin):
-                for key, value in with_text_keys(info or {}).items():
+                for key, value in parts_of(info or {}).items():
                     if key in pairs_of and (
                         isinstance(value, str) if key in self.texts else _is_number(value)
                     ):
@@ -169,7 +169,7 @@ def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple
     kinds: dict[str, str] = {}
     for position in positions:
         for info in recording.infos(position) or ():
-            for key, value in with_text_keys(info or {}).items():
+            for key, value in parts_of(info or {}).items():
                 kind = "text" if isinstance(value, str) else "number" if _is_number(value) else "other"
                 kinds[key] = kind if kinds.get(key, kind) == kind else "other"
     numbers = [key for key, kind in kinds.items() if kind == "number"]
