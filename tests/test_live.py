@@ -544,7 +544,13 @@ class Told(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> Any:
         *rest, _ = self.env.step(action)
         self._number += 1
-        return *rest, {"number": self._number, "half": self._number / 2, "word": "yes", 7: 1, "of": {"a": np.ones(2)}}
+        return *rest, {
+            "number": self._number,
+            "half": self._number / 2,
+            "word": "yes",
+            7: 1,
+            "of": {"a": np.ones(2)},
+        }
 
 
 @pytest.mark.parametrize("num_envs", [0, 12])
