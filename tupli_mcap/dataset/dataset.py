@@ -251,8 +251,8 @@ class Dataset(RandomAccess):
     def filter_steps(self, test: TupleFilter | str) -> Dataset:
         """The episodes with only those of their steps that match a test.
 
-            ds.filter_steps("reward > 0 and state.arm.q[0] < 1").read()
-            ds.filter_steps("info.force > 2").windows(8)  # of steps that follow each other
+            dataset.filter_steps("reward > 0 and state[0] < 1").read()
+            dataset.filter_steps(F("step") >= 10).windows(8)  # of steps that follow each other
 
         It narrows what is read of steps: `read`, `windows`, `transitions`, `loader`, `stats`, `to_pandas("steps")`,
         `lengths`, `n_steps`. The episodes stay, also without a step, and each by itself has all of its steps. What
