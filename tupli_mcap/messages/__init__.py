@@ -7,7 +7,7 @@ encode_rows            the generated functions that write a step into a row and 
 encode_values          the part of these functions that checks and packs one value
 decoder                decodes messages of variable size: one, or many at once
 episodes               `/episode_start`, `/episode_end`, `/final_state`
-infos, frames          `/info`; `/camera` and `/frame`
+infos, frames          `/info`, and infos as columns; `/camera` and `/frame`
 images/                image leaves: stacks, PNG, JPEG
 variable/              Text, Sequence, Graph and OneOf
 shared_dtypes          one dtype for values of several recordings
