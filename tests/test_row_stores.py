@@ -20,7 +20,7 @@ from gymnasium import spaces
 
 from tupli_mcap.journal.committed import CommittedRows, committed_records, rows_of, running_record
 from tupli_mcap.journal.file import Area, Journal, JournalContents, LogArea, RowArea, boot_id, read_journal
-from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.journal.logs import EventLog, ToFile
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.decoder import MessageDecoder
@@ -101,6 +101,20 @@ class Subject:
                 self.add_chunk(rows)
 
         return finish
+
+    def to_file(self) -> ToFile:
+        counts = dict.fromkeys(self.channels, 0)
+        never: Any = None
+        return ToFile(
+            counts,
+            0,
+            lambda: 0,
+            self.add_chunk,
+            self.start_chunks,
+            grow=never,
+            durable=False,
+            sealed=self.sealed,
+        )
 
     def numbers(self, rows: Rows) -> list[int]:
         data = memoryview(rows.data).cast("B")
@@ -190,7 +204,7 @@ class OfRows(Subject):
 
 class Single(OfRows):
     def open(self) -> SingleRows:
-        store: SingleRows = self.kind(BOX, self.journal, "steps", 1, self.add_chunk, [], sealed=self.sealed)
+        store: SingleRows = self.kind(BOX, self.journal, 1, [], self.to_file())
         store.put_state(np.zeros(9))
         return store
 
@@ -202,10 +216,7 @@ class Vector(OfRows):
     channels = (1, 2, 3)
 
     def open(self) -> VectorRows:
-        store: VectorRows = self.kind(
-            BOX, self.journal, "steps", self.channels, self.start_chunks, [], np.zeros(3, np.uint32),
-            sealed=self.sealed,
-        )  # fmt: skip
+        store: VectorRows = self.kind(BOX, self.journal, self.channels, [], self.to_file())
         store.put_state(np.zeros((3, 9)))
         return store
 
@@ -230,7 +241,7 @@ class Variable(OfRecords):
         return LogArea("steps/0", 400, 2)
 
     def open(self) -> StepLog:
-        store: StepLog = self.kind(TEXT, self.journal, "steps/0", 1, self.add_chunk, [])
+        store: StepLog = self.kind(TEXT, self.journal, "steps/0", 1, [], self.to_file())
         store.put_state(self.text(0))
         return store
 
@@ -264,10 +275,8 @@ class Images(Subject):
 
     def open(self) -> ImageRows:
         (leaf,) = IMAGE.images
-        store: ImageRows = self.kind(
-            leaf, self.message, self.journal, "state/0", 1, self.add_chunk, start_chunks=self.start_chunks,
-            sealed=self.sealed,
-        )  # fmt: skip
+        store: ImageRows = self.kind(leaf, self.message, self.journal, "state/0", 1, self.to_file())
+        store._start_chunks = self.start_chunks  # as for large images
         store.put_first(np.zeros((4, 5, 3), np.uint8))
         return store
 
@@ -301,7 +310,7 @@ class Records(OfRecords):
         return LogArea("events", 500)
 
     def open(self) -> EventLog:
-        store: EventLog = self.kind(self.journal, "events", self.add_chunk, {1: 0, 2: 0}, 0, lambda: 0)
+        store: EventLog = self.kind(self.journal, "events", self.channels, self.to_file())
         return store
 
     def put(self, n: int) -> None:
@@ -348,8 +357,7 @@ def moves_with_its_running_row(subject: Subject) -> None:
         subject.write()
     subject.store.flush()
     journal = subject.new_journal("second")
-    name = next(iter(journal.areas))
-    subject.store.move(journal, name)
+    subject.store.move(journal)
     subject.journal = journal
     subject.check_now()
     while subject.done < PUTS:
@@ -391,9 +399,9 @@ class WaitsForNothing(ImageRows):
 class LeavesTheRunningRow(StepLog):
     """Does not take it to another journal."""
 
-    def move(self, journal: Journal, name: str) -> None:
+    def move(self, journal: Journal) -> None:
         self._pending, running = bytearray(), self._pending
-        super().move(journal, name)
+        super().move(journal)
         self._pending = running
 
 

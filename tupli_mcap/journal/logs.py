@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -23,12 +23,36 @@ from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, crc32_each, iter_records
 
-Sink = Callable[[Rows], None]
 FRONT = struct.Struct("<BQHIQ")  # a record up to publish_time, where a journal has a checksum
 _LOG_TIME = FRONT.size - 8
 _SEAL = struct.Struct("<II")
 _SEAL_END = FRONT.size + _SEAL.size
 STATE = BODY + 8  # offset of the state in a step's record
+StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]
+
+
+class ToFile(NamedTuple):
+    """The file that rows go to from the journal.
+
+    Attributes:
+        counts: rows of each channel in it.
+        end_time: `log_time` (ns) of the latest of them.
+        size: returns its size (bytes).
+        add_chunk: writes a chunk, durably where that is asked for.
+        start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
+        grow: called with the size of a step that is larger than the journal.
+        durable: chunks are on the disk before their rows are used again.
+        sealed: rows in the journal carry checksums.
+    """
+
+    counts: Mapping[int, int]
+    end_time: int
+    size: Callable[[], int]
+    add_chunk: Callable[[Rows], None]
+    start_chunks: StartChunks
+    grow: Callable[[int], None]
+    durable: bool
+    sealed: bool
 
 
 def checksum(record: bytes | bytearray | memoryview) -> int:
@@ -94,34 +118,25 @@ class EventLog:
         latest_ns: log_time (ns) of the last message; later ones are not less.
     """
 
-    def __init__(
-        self,
-        journal: Journal,
-        name: str,
-        sink: Sink,
-        sequences: dict[int, int],
-        time_ns: int,
-        file_size: Callable[[], int],
-    ) -> None:
-        self.sequences = sequences
-        self._sink = sink
-        self._file_size = file_size
-        self.latest_ns = time_ns
+    def __init__(self, journal: Journal, name: str, channels: Iterable[int], file: ToFile) -> None:
+        self._name, self._file = name, file
+        self.sequences = {channel: file.counts[channel] for channel in channels}
+        self.latest_ns = file.end_time
         # the records in the journal by channel, so that a flush need not parse it
         self._whole: defaultdict[int, list[bytes]] = defaultdict(list)
         self._last = 0  # where the last message began
         self._last_channel = 0
         self._can_drop = False
-        self.move(journal, name)
+        self.move(journal)
 
-    def move(self, journal: Journal, name: str) -> None:
-        """Goes on in the area `name` of another journal. All records must be in the file."""
-        area, buffer = journal.area(name, LogArea), journal.buffer(name)
+    def move(self, journal: Journal) -> None:
+        """Goes on in another journal. All records must be in the file."""
+        area, buffer = journal.area(self._name, LogArea), journal.buffer(self._name)
         self._records = buffer[LOG_HEADER : LOG_HEADER + area.capacity]
         self._commit, self._behind = buffer[:8].cast("Q"), buffer[8:16].cast("Q")
         self._capacity = area.capacity
         self._position = 0
-        self._behind[0] = self._file_size()
+        self._behind[0] = self._file.size()
         self._commit[0] = 0
 
     def append(self, time_ns: int, *messages: tuple[int, bytes]) -> int:
@@ -185,5 +200,5 @@ class EventLog:
                     self.sequences[channel] - len(records) - (kept if channel == self._last_channel else 0)
                 )
                 sizes = list(map(len, records))
-                self._sink(as_rows(channel, first, bytearray().join(records), sizes, sealed=True))
-        self._behind[0] = self._file_size()
+                self._file.add_chunk(as_rows(channel, first, bytearray().join(records), sizes, sealed=True))
+        self._behind[0] = self._file.size()

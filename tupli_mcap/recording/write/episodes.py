@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
-from tupli_mcap.journal.logs import EventLog, Sink, sealed_records
+from tupli_mcap.journal.logs import EventLog, ToFile, sealed_records
 from tupli_mcap.mcap.records import BODY, HEADER_FIELDS
 from tupli_mcap.messages.episodes import (
     END_FIELDS,
@@ -60,23 +60,11 @@ _new: Callable[[type[StartedEpisode], tuple[Any, ...]], StartedEpisode] = tuple.
 class EpisodeLog(EventLog):
     """The log of `/episode_start`, `/final_state` and `/episode_end`; every end is added to `index`."""
 
-    def __init__(
-        self,
-        journal: Journal,
-        name: str,
-        sink: Sink,
-        channels: Channels,
-        counts: dict[int, int],
-        index: IndexBuilder,
-        time_ns: int,
-        file_size: Callable[[], int],
-    ) -> None:
+    def __init__(self, journal: Journal, channels: Channels, index: IndexBuilder, file: ToFile) -> None:
         self._start, self._final, self._end = ids = channels.start, channels.final_state, channels.end
         self._index = index
         self.running: dict[int, StartedEpisode] = {}  # started and not ended, by number
-        super().__init__(
-            journal, name, sink, {channel: counts[channel] for channel in ids}, time_ns, file_size
-        )
+        super().__init__(journal, "events", ids, file)
 
     def start(self, number: int, env: int, first_row: int, reset: ResetFacts) -> StartedEpisode:
         """Adds an `/episode_start`."""

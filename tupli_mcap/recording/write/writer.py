@@ -20,7 +20,7 @@ import numpy as np
 from tupli_mcap.errors import RecordingError, SpaceError, StepError, TupliError, os_reason
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal, boot_id, sync_directory, sync_file
-from tupli_mcap.journal.logs import EventLog
+from tupli_mcap.journal.logs import EventLog, ToFile
 from tupli_mcap.mcap.container import Container, library
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves
@@ -33,7 +33,7 @@ from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.place import RecordingPlace
-from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore, ToFile
+from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
 
@@ -233,11 +233,14 @@ class RecordingWriter:
     def _make_stores(self, layout: StepLayout) -> None:
         self.journal = self._new_journal()
         self.journal.publish(durable=self._durable, replaced=self.place.replaced)
-        file = ToFile(self._chunks.add, self._chunks.start, self._grow, self._durable, self._sealed)
-        self._stores = stores = Stores(
-            layout, self.channels, self.container, self.journal, self.index, file, vector=self.is_vector,
-            apart=self._apart,
+        container, chunks = self.container, self._chunks
+        file = ToFile(
+            container.counts, container.end_time, lambda: container.position, chunks.add, chunks.start,
+            self._grow, self._durable, self._sealed,
         )  # fmt: skip
+        self._stores = stores = Stores(
+            layout, self.channels, self.journal, self.index, file, vector=self.is_vector, apart=self._apart
+        )
         self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
         self.streams = stores.streams
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames

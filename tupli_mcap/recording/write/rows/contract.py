@@ -9,34 +9,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import Journal
-from tupli_mcap.journal.logs import Sink
-from tupli_mcap.mcap.container import Rows
 
 Put = Callable[[Any, Any, Any, Any, Any], None]
-StartChunks = Callable[[Sequence[Rows]], Callable[[], None]]  # begins to make chunks; the result writes them
-
-
-class ToFile(NamedTuple):
-    """How rows come into the file.
-
-    Attributes:
-        add_chunk: writes a chunk, durably where that is asked for.
-        start_chunks: begins to compress several chunks; what it returns writes them, durably where that is asked for.
-        grow: called with the size of a step that is larger than the journal.
-        durable: chunks are on the disk before their rows are used again.
-        sealed: rows in the journal carry checksums.
-    """
-
-    add_chunk: Sink
-    start_chunks: StartChunks
-    grow: Callable[[int], None]
-    durable: bool = False
-    sealed: bool = False
 
 
 class RowStore(Protocol):
@@ -50,9 +29,8 @@ class RowStore(Protocol):
 class MovingStore(RowStore, Protocol):
     """One that may have a journal together with steps of variable size, for which the journal grows."""
 
-    def move(self, journal: Journal, name: str) -> None:
-        """Goes on in the area `name` of another journal. Everything committed must be in the file: only the running row
-        moves."""
+    def move(self, journal: Journal) -> None:
+        """Goes on in another journal. Everything committed must be in the file: only the running row moves."""
         ...
 
 

@@ -11,55 +11,43 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import Sink, seal
+from tupli_mcap.journal.logs import StartChunks, ToFile, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import CDR_HEADER, HOLE, RECORD_HEADER
 from tupli_mcap.messages.layout import SEQUENCE_OFFSET, ImageLayout
-from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image, which follow each other
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
+_LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
 
 
 class ImageRows:
     """The images of one leaf: row j is the state of step j, so the running row is always one ahead of the steps."""
 
     def __init__(
-        self,
-        leaf: Leaf,
-        layout: ImageLayout,
-        journal: Journal,
-        name: str,
-        channel: int,
-        sink: Sink,
-        first: int = 0,
-        time_ns: int = 0,
-        start_chunks: StartChunks | None = None,
-        *,
-        sealed: bool = False,
+        self, leaf: Leaf, layout: ImageLayout, journal: Journal, name: str, channel: int, file: ToFile
     ) -> None:
-        self._start_chunks = start_chunks
-        self._sealed = sealed
+        self._name, self._file, self._sealed = name, file, file.sealed
+        self._start_chunks = file.start_chunks if leaf.size >= _LARGE_ROW else None
         # write a chunk that is being made, by the half it is in
         self._jobs: dict[int, Callable[[], None]] = {}
         self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
         self._leaf = leaf
         self._layout = layout
         self._channel = channel
-        self._sink = sink
-        self._sequence = first
-        self._time = time_ns
+        self._sequence = file.counts[channel]
+        self._time = file.end_time
         self._half = self._row = 0
         self._uint8 = np.dtype(np.uint8)
-        self.move(journal, name)
+        self.move(journal)
 
-    def move(self, journal: Journal, name: str) -> None:
-        """Goes on in the area `name` of another journal, with the rows before the running one in the file."""
+    def move(self, journal: Journal) -> None:
+        """Goes on in another journal, with the rows before the running one in the file."""
         running = self._rows[self._half, self._row].copy() if hasattr(self, "_rows") else None
-        self._area = area = journal.area(name, RowArea)
-        buffer = journal.buffer(name)
+        self._area = area = journal.area(self._name, RowArea)
+        buffer = journal.buffer(self._name)
         self._full, self._row_size = area.rows, area.row_size
         self._buffer = buffer
         self._row = self._half = self._flushed = self._start = 0
@@ -158,6 +146,6 @@ class ImageRows:
             table["#publish_time"] = times
         rows = Rows(self._channel, first, data, self._offsets[: end - begin], times)
         if start_chunks is None:
-            self._sink(rows)
+            self._file.add_chunk(rows)
         else:
             self._jobs[half] = start_chunks([rows])

@@ -12,7 +12,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.journal.committed import RowDeriver, even_rows
 from tupli_mcap.journal.derive import EpisodeDeriver
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import STATE, Sink, seal
+from tupli_mcap.journal.logs import STATE, ToFile, seal
 from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.encode_rows import ImageSink, make_row_encoder
 from tupli_mcap.messages.layout import NUMBERS
@@ -27,48 +27,43 @@ CHUNKS_PER_HALF = 2
 class SingleRows:
     """The step rows of one environment.
 
-    `put`, `put_state` and `put_whole` are the generated encoders; `channel` is the MCAP channel, `sink` takes full
-    chunks; `block` says which of the area's blocks is this environment's.
+    `put`, `put_state` and `put_whole` are the generated encoders; `block` says which of the area's blocks is this
+    environment's.
     """
 
     def __init__(
         self,
         layout: StepLayout,
         journal: Journal,
-        name: str,
         channel: int,
-        sink: Sink,
         images: Sequence[ImageSink],
-        first: int = 0,
-        deriver: RowDeriver | None = None,
-        *,
-        sealed: bool = False,
+        file: ToFile,
         block: int = 0,
     ) -> None:
-        self._sealed = sealed
+        self._file, self._sealed = file, file.sealed
         self._layout = layout
         self._dtype = layout.step_message.dtype
-        self._area = area = journal.area(name, RowArea)
-        self._buffer = buffer = journal.buffer(name)
+        self._area = area = journal.area("steps", RowArea)
+        self._buffer = buffer = journal.buffer("steps")
         rows: Array = np.frombuffer(buffer, self._dtype).reshape(2, area.channels, area.rows + 1)
         self._rows = rows[:, block]
         self._sequence: Array = self._rows["#sequence"]
         first_half = block * area.block
         self._starts = (first_half, first_half + area.half)  # of the halves of this block
         self._channel = channel
-        self._sink = sink
         self._half = 0
         self._chunk = -(-area.rows // CHUNKS_PER_HALF)  # rows
         self._flushed = 0  # rows of the running half that are in the file
-        self._deriver = deriver or RowDeriver()
+        self._deriver = RowDeriver(time_ns=file.end_time)
         self._header = layout.step_message.header(channel)
         self._hole = layout.step_message.header(channel, HOLE)
         self._heads = np.dtype(
             {"names": ["head"], "formats": [f"V{BODY}"], "offsets": [0], "itemsize": area.row_size}
         )
         encoder = self._encoder = make_row_encoder(
-            layout, buffer, channel, first, images, self._switch, self._seal if sealed else None
-        )
+            layout, buffer, channel, file.counts[channel], images, self._switch,
+            self._seal if file.sealed else None,
+        )  # fmt: skip
         self.put = encoder.put
         self.put_state = encoder.put_state
         self.put_next = encoder.put_next
@@ -229,4 +224,4 @@ class SingleRows:
         for first in range(0, len(rows), self._chunk):
             chunk = rows[first : first + self._chunk]
             part = data[first * size : first * size + chunk.nbytes]
-            self._sink(even_rows(self._channel, int(chunk["#sequence"][0]), part, chunk))
+            self._file.add_chunk(even_rows(self._channel, int(chunk["#sequence"][0]), part, chunk))

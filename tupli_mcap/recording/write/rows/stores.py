@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Sequence
 
-import numpy as np
-
-from tupli_mcap.journal.committed import RowDeriver
 from tupli_mcap.journal.file import FRAMES_AREA, Area, Journal, LogArea, RowArea
-from tupli_mcap.journal.logs import EventLog
-from tupli_mcap.mcap.container import Container
+from tupli_mcap.journal.logs import EventLog, ToFile
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import Channels
 from tupli_mcap.recording.index import IndexBuilder
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.recording.write.rows.contract import MovingStore, RowStore, ToFile
+from tupli_mcap.recording.write.rows.contract import MovingStore, RowStore
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.single import CHUNKS_PER_HALF, SingleRows
 from tupli_mcap.recording.write.rows.variable import StepLog, StepLogs
 from tupli_mcap.recording.write.rows.vector import VectorRows
-from tupli_mcap.spaces.leaves import Leaf
 
 _HALF = 8 << 20  # bytes of images in half a journal
-_LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
 
 
 def plan_areas(
@@ -69,7 +64,6 @@ class Stores:
 
     Args:
         layout, channels: what the stores hold.
-        container: counts the messages that are in the file already.
         journal: has the areas of `plan_areas`.
         index: gets the row of every episode that ends.
         file: where rows go.
@@ -90,94 +84,47 @@ class Stores:
         self,
         layout: StepLayout,
         channels: Channels,
-        container: Container,
         journal: Journal,
         index: IndexBuilder,
         file: ToFile,
         *,
         vector: bool,
-        apart: bool = False,
+        apart: bool,
     ) -> None:
-        self._layout, self._journal, self._container, self._file = layout, journal, container, file
-        self._steps: list[RowStore] = []
-        self._moving: dict[str, MovingStore] = {}  # by their area
-        self.images = [self._images(*of) for of in zip(layout.images, channels.images, strict=True)]
-        self.rows: SingleRows | StepLog | None = None
+        self.images = [
+            [
+                ImageRows(leaf, layout.image_messages[leaf.name], journal, f"{leaf.name}/{i}", channel, file)
+                for i, channel in enumerate(of_leaf)
+            ]
+            for leaf, of_leaf in zip(layout.images, channels.images, strict=True)
+        ]
+        of_each = [
+            (channel, [stores[i] for stores in self.images]) for i, channel in enumerate(channels.steps)
+        ]
         self.vector: VectorRows | StepLogs | None = None
-        self.streams: Sequence[SingleRows | StepLog] = ()
-        if layout.constant and vector and not apart:
-            self.vector = self._vector_rows(channels.steps)
+        self.streams: Sequence[SingleRows | StepLog] = []
+        steps: Sequence[RowStore]
+        logs: list[StepLog] = []
+        if not layout.constant:
+            logs = [StepLog(layout, journal, f"steps/{i}", *each, file) for i, each in enumerate(of_each)]
+            self.streams = steps = logs
+            self.vector = StepLogs(layout, logs) if vector and not apart else None
+        elif vector and not apart:
+            self.vector = together = VectorRows(layout, journal, channels.steps, self.images, file)
+            steps = [together]
         else:
-            make = self._single_rows if layout.constant else self._step_log
-            self.streams = [make(i, channel) for i, channel in enumerate(channels.steps)]
-            if not vector:
-                (self.rows,) = self.streams
-            elif not apart:
-                self.vector = StepLogs(layout, self.streams)  # type: ignore[arg-type]
-        self.infos = None if channels.info is None else self._log("info", [channels.info])
-        self.frames = [self._log(f"{FRAMES_AREA}{i}", pair) for i, pair in enumerate(channels.cameras)]
-        self.events = EpisodeLog(
-            journal, "events", file.add_chunk, channels, container.counts, index, container.end_time,
-            self._file_size,
-        )  # fmt: skip
+            rows = [SingleRows(layout, journal, *each, file, i) for i, each in enumerate(of_each)]
+            self.streams = steps = rows
+        self.rows = None if vector else self.streams[0]
+        self.infos = None if channels.info is None else EventLog(journal, "info", [channels.info], file)
+        self.frames = [
+            EventLog(journal, f"{FRAMES_AREA}{i}", pair, file) for i, pair in enumerate(channels.cameras)
+        ]
+        self.events = EpisodeLog(journal, channels, index, file)
+        infos = [] if self.infos is None else [self.infos]
+        self._moving: list[MovingStore] = [*itertools.chain(*self.images), *logs, *infos, *self.frames]
         # steps first: the file never has more images than steps
-        self._stores = list(dict.fromkeys((*self._steps, *self._moving.values())))
-
-    def _images(self, leaf: Leaf, channels: list[int]) -> list[ImageRows]:
-        """The stores of an image leaf, by sub-environment."""
-        file, found = self._file, []
-        start_chunks = file.start_chunks if leaf.size >= _LARGE_ROW else None
-        for i, channel in enumerate(channels):
-            name = f"{leaf.name}/{i}"
-            store = ImageRows(
-                leaf, self._layout.image_messages[leaf.name], self._journal, name, channel, file.add_chunk,
-                self._container.counts[channel], self._container.end_time, start_chunks, sealed=file.sealed,
-            )  # fmt: skip
-            self._moving[name] = store
-            found.append(store)
-        return found
-
-    def _step_log(self, i: int, channel: int) -> StepLog:
-        """One sub-environment's steps of variable size."""
-        name, images = f"steps/{i}", [stores[i] for stores in self.images]
-        store = StepLog(
-            self._layout, self._journal, name, channel, self._file.add_chunk, images,
-            self._container.counts[channel], self._container.end_time,
-        )  # fmt: skip
-        store.grow = self._file.grow
-        self._steps.append(store)
-        self._moving[name] = store
-        return store
-
-    def _vector_rows(self, channels: list[int]) -> VectorRows:
-        counts = np.array([self._container.counts[channel] for channel in channels], dtype=np.uint32)
-        store = VectorRows(
-            self._layout, self._journal, "steps", channels, self._file.start_chunks, self.images, counts,
-            self._container.end_time, durable=self._file.durable, sealed=self._file.sealed,
-        )  # fmt: skip
-        self._steps.append(store)
-        return store
-
-    def _single_rows(self, i: int, channel: int) -> SingleRows:
-        """The steps of one environment, or of one sub-environment that steps apart from the others."""
-        images, deriver = [stores[i] for stores in self.images], RowDeriver(time_ns=self._container.end_time)
-        store = SingleRows(
-            self._layout, self._journal, "steps", channel, self._file.add_chunk, images,
-            self._container.counts[channel], deriver, sealed=self._file.sealed, block=i,
-        )  # fmt: skip
-        self._steps.append(store)
-        return store
-
-    def _log(self, name: str, channels: Iterable[int]) -> EventLog:
-        counts = {channel: self._container.counts[channel] for channel in channels}
-        log = EventLog(
-            self._journal, name, self._file.add_chunk, counts, self._container.end_time, self._file_size
-        )
-        self._moving[name] = log
-        return log
-
-    def _file_size(self) -> int:
-        return self._container.position
+        self._stores: list[RowStore] = list(dict.fromkeys((*steps, *self._moving)))
 
     def flush(self, *, keep_last: bool) -> None:
         """Writes everything that is committed; with `keep_last` not the last event."""
@@ -187,10 +134,8 @@ class Stores:
 
     def move(self, journal: Journal) -> None:
         """Goes on in another journal: only running records move, for everything must have been flushed."""
-        self._journal = journal
-        for name, store in self._moving.items():
-            store.move(journal, name)
-        self.events.move(journal, "events")
+        for store in (*self._moving, self.events):
+            store.move(journal)
 
     def let_go(self) -> None:
         """Drops every view of the journal; no store can be used afterwards."""

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
-from tupli_mcap.journal.logs import FRONT, STATE, Sink, as_rows, seal
+from tupli_mcap.journal.logs import FRONT, STATE, ToFile, as_rows, seal
 from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
@@ -97,33 +97,29 @@ class StepLog:
         journal: Journal,
         name: str,
         channel: int,
-        sink: Sink,
         images: Sequence[Any],
-        first: int = 0,
-        time_ns: int = 0,
+        file: ToFile,
     ) -> None:
         self._layout = layout
-        self._channel = channel
-        self._sink = sink
+        self._name, self._channel, self._file = name, channel, file
         self._images = images
         self._episode = 0
         self._step = 0
-        self._time = time_ns
+        self._time = file.end_time
         self._pending = bytearray()
         self._check_state = structure_check(layout.observation_space, "state")
         self._check_action = structure_check(layout.action_space, "action")
         self._state = leaf_encoders(layout, [leaf for leaf in layout.state if not leaf.apart])
         self._action = leaf_encoders(layout, layout.action)
         self._reward = leaf_encoders(layout, layout.reward)
-        self.count = first
+        self.count = file.counts[channel]
         self.total: Any = 0.0
-        self.grow: Callable[[int], None] | None = None
-        self.move(journal, name)
+        self.move(journal)
 
-    def move(self, journal: Journal, name: str) -> None:
-        """Goes on in the area `name` of another journal, with everything committed in the file."""
-        self._area = area = journal.area(name, LogArea)
-        buffer = journal.buffer(name)
+    def move(self, journal: Journal) -> None:
+        """Goes on in another journal, with everything committed in the file."""
+        self._area = area = journal.area(self._name, LogArea)
+        buffer = journal.buffer(self._name)
         self._records = [buffer[h * area.half + LOG_HEADER : (h + 1) * area.half] for h in range(2)]
         self._ends = [buffer[h * area.half : h * area.half + 8].cast("Q") for h in range(2)]
         self._half = self._position = self._emitted = 0
@@ -250,11 +246,7 @@ class StepLog:
         if self._position:
             self._switch()
         if size > self._area.capacity:
-            if self.grow is None:
-                raise StepError(
-                    f"a step of {size} bytes does not fit into {self._area.capacity} bytes of journal"
-                )
-            self.grow(size)
+            self._file.grow(size)
 
     def _switch(self) -> None:
         full, end, begin = self._half, self._position, self._emitted
@@ -274,7 +266,7 @@ class StepLog:
         if len(places):
             (first,) = _SEQUENCE.unpack_from(records, _SEQUENCE_AT)
             sizes = places[:, 1] - places[:, 0]
-            self._sink(as_rows(self._channel, first, bytearray(records), sizes, sealed=True))
+            self._file.add_chunk(as_rows(self._channel, first, bytearray(records), sizes, sealed=True))
 
 
 class PreparedBatch(NamedTuple):

@@ -17,12 +17,11 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import EpisodeDeriver, StartedEpisode
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import STATE, seal
+from tupli_mcap.journal.logs import STATE, ToFile, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, HOLE
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
-from tupli_mcap.recording.write.rows.contract import StartChunks
 from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 from tupli_mcap.spaces.leaves import Leaf
@@ -53,28 +52,21 @@ class VectorRows:
         self,
         layout: StepLayout,
         journal: Journal,
-        name: str,
         channels: Sequence[int],
-        start_chunks: StartChunks,
         images: Sequence[Sequence[ImageRows]],
-        counts: Array,
-        time_ns: int = 0,
-        *,
-        durable: bool = False,
-        sealed: bool = False,
+        file: ToFile,
     ) -> None:
-        self._durable, self._sealed = durable, sealed
+        self._file, self._sealed = file, file.sealed
         self._layout = layout
-        self._area = area = journal.area(name, RowArea)
-        self._buffer = journal.buffer(name)
-        self._start_chunks = start_chunks
+        self._area = area = journal.area("steps", RowArea)
+        self._buffer = journal.buffer("steps")
         self._images = list(zip(images, layout.images, strict=True))
         self._channels = list(channels)
         n = len(channels)
-        self.counts = counts  # rows of each channel so far (uint32)
-        self._ones = np.ones_like(counts)
+        self.counts = np.array([file.counts[channel] for channel in channels], np.uint32)  # rows so far
+        self._ones = np.ones_like(self.counts)
         self._half = self._row = self._flushed = 0
-        self._now = time_ns
+        self._now = file.end_time
         self._times = np.zeros((2, area.rows), np.uint64)  # of the rows in the journal, the same for a batch
         self._offsets = np.arange(area.rows, dtype=np.uint64) * np.uint64(area.row_size)
         self._write_chunks: Callable[[], None] | None = None  # of the half that is not running
@@ -259,8 +251,8 @@ class VectorRows:
         end = self._state_end
         self._state_bytes[self._half, :, 0, BODY:end] = self._state_bytes[half, :, rows, BODY:end]
         self._row = self._flushed = self._derived = 0
-        self._write_chunks = self._start_chunks(self._chunks(half, flushed, rows))
-        if self._durable:
+        self._write_chunks = self._file.start_chunks(self._chunks(half, flushed, rows))
+        if self._file.durable:
             self._finish_chunks()
 
     def flush(self) -> None:
@@ -268,7 +260,7 @@ class VectorRows:
         self._finish_chunks()
         flushed, self._flushed = self._flushed, self._row
         self._derive(self._half, self._row)
-        self._write_chunks = self._start_chunks(self._chunks(self._half, flushed, self._row))
+        self._write_chunks = self._file.start_chunks(self._chunks(self._half, flushed, self._row))
         self._finish_chunks()
 
     def _finish_chunks(self) -> None:
