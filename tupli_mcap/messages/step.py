@@ -18,7 +18,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import DType
 from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
-from tupli_mcap.messages.layout import SEPARATOR, ImageLayout, MessageLayout, image_layout
+from tupli_mcap.messages.layout import PREFIX, SEPARATOR, ImageLayout, MessageLayout, image_layout
 from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, own_space, structure
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
@@ -147,6 +147,13 @@ class StepLayout:
         names = {leaf.name for leaf in self.state}
         ends = [field.offset + field.nbytes for field in self.step_message.fields if field.name in names]
         return BODY + max(ends, default=8)
+
+    @cached_property
+    def tells_episodes(self) -> bool:
+        """True if rows of `/step` hold all that an episode is: its return is the sum of a field, and its final state
+        fits into the row after its last one."""
+        is_plain = self.constant and self.reward_space is None and not self.images
+        return is_plain and self.state_end > PREFIX
 
     @cached_property
     def final_message(self) -> MessageLayout:

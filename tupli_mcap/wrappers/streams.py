@@ -22,8 +22,7 @@ from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import StepStore
-from tupli_mcap.recording.write.rows.single import SingleRows
-from tupli_mcap.recording.write.rows.variable import final_encoder, step_check
+from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_array, leaf_value
 
@@ -121,25 +120,15 @@ class Stream:
         infos: Sequence[Mapping[str, Any]],
     ) -> None:
         """Records several steps; StepError if a value cannot be stored exactly; nothing is recorded."""
-        columns, n, writer = (states, actions, rewards), len(terminals), self._writer
-        store = self._ready(*(arrays_at(column, 0) for column in columns))
-        if isinstance(store, SingleRows) and store.can_put_many:
-            number = writer.next_episode if self._episode is None else self._episode.number
-            put = functools.partial(store.put_many, *columns, terminals, timeouts, number)
-            if self._episode is None:
-                self._start(store, put)
-            else:
-                put()
-            self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
-            self.put_infos(infos)
-            return
-        check = step_check(writer.fixed_layout())
-        for i in range(n):
-            check(*(arrays_at(column, i) for column in columns))
-        for i in range(n):
-            state, action, reward = (arrays_at(column, i) for column in columns)
-            self.put(state, action, reward, bool(terminals[i]), bool(timeouts[i]))
-            self.put_infos(infos[i : i + 1])
+        store = self._ready(*(arrays_at(column, 0) for column in (states, actions, rewards)))
+        number = self._writer.next_episode if self._episode is None else self._episode.number
+        put = functools.partial(store.put_many, states, actions, rewards, terminals, timeouts, number)
+        if self._episode is None:
+            self._start(store, put)
+        else:
+            put()
+        self.over = TERMINAL if terminals[-1] else TIMEOUT if timeouts[-1] else None
+        self.put_infos(infos)
 
     def put_episodes(
         self,
@@ -157,7 +146,7 @@ class Stream:
         begin = 0
         for i, stop in enumerate(stops.tolist()):
             store = self._store
-            if isinstance(store, SingleRows) and store.can_put_many and store.can_derive:
+            if store is not None and store.holds_episodes:
                 rest = [arrays_at(column, slice(begin, None)) for column in columns]
                 self._put_together(store, rest, stops[i:] - begin, arrays_at(finals, slice(i, None)))
                 return
@@ -174,7 +163,7 @@ class Stream:
             self.end(final)
             begin = stop
 
-    def _put_together(self, store: SingleRows, columns: Sequence[Any], stops: Array, finals: Any) -> None:
+    def _put_together(self, store: StepStore, columns: Sequence[Any], stops: Array, finals: Any) -> None:
         """Records whole episodes that need no records but rows and final states; StepError if a value cannot be stored
         exactly; nothing is recorded."""
         writer, count, lengths = self._writer, len(stops), np.diff(stops, prepend=0)

@@ -234,7 +234,7 @@ class SingleRecorder:
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
         rows = writer.rows
-        if self.derives_episodes and isinstance(rows, SingleRows) and rows.can_derive:
+        if self.derives_episodes and isinstance(rows, SingleRows) and rows.holds_episodes:
             self._rows, rows.events = rows, writer.events
         self._start_earlier()
         self.reset(first, facts)

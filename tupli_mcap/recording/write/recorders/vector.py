@@ -267,7 +267,7 @@ class VectorRecorder:
         store = self._writer.vector
         assert store is not None
         store.put_state(self._first)
-        if self.derives_episodes and isinstance(store, VectorRows) and store.can_derive:
+        if self.derives_episodes and isinstance(store, VectorRows) and store.holds_episodes:
             self._deriving, store.events = store, self._writer.events
         self._first = None
         return store

@@ -40,6 +40,7 @@ class StepStore(Protocol):
     Attributes:
         count: rows of the channel so far, those of earlier sessions included.
         total: the running episode's return so far.
+        holds_episodes: rows hold all that an episode is.
     """
 
     @property
@@ -47,6 +48,9 @@ class StepStore(Protocol):
 
     @property
     def total(self) -> Any: ...
+
+    @property
+    def holds_episodes(self) -> bool: ...
 
     @property
     def put(self) -> Put:
@@ -63,6 +67,19 @@ class StepStore(Protocol):
     def put_whole(self) -> Put:
         """Writes and commits the running row (state, action, reward, terminal, timeout); the state after it is not
         known. StepError as `put`."""
+        ...
+
+    def put_many(
+        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episodes: Any
+    ) -> None:
+        """As `put_whole` of several steps, which lie along the first axis of all arrays.
+
+        Args:
+            episodes: the number of their episode, which is the running one; with `holds_episodes`, also of each step's.
+
+        Raises:
+            StepError: something cannot be stored exactly; nothing is recorded.
+        """
         ...
 
     def begin_episode(self, episode: int) -> None:

@@ -18,6 +18,7 @@ from tupli_mcap.messages.encode_rows import ImageSink, make_row_encoder
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
+from tupli_mcap.recording.write.rows.variable import put_each
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 
 # Chunks that a half of a single environment becomes. What is done once a half takes as long for few rows as for many.
@@ -72,6 +73,7 @@ class SingleRows:
         self.events: EpisodeLog | None = None  # where derived episodes go; None: none are derived
         self._derived = 0  # offset of the rows that no episodes were derived from yet
         self._episodes = EpisodeDeriver(1, encoder.state_end)
+        self.holds_episodes = layout.tells_episodes and not file.sealed
         self._state_end = encoder.state_end
         self._go_to(0)
         self.begin_episode(0)
@@ -96,23 +98,14 @@ class SingleRows:
 
     # ---- many steps at once
 
-    @property
-    def can_put_many(self) -> bool:
-        """True if `put_many` may be called."""
-        return not self._sealed and not self._layout.images
-
     def put_many(
         self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episodes: Any
     ) -> None:
-        """As `put_whole` of several steps, which lie along the first axis of all arrays.
-
-        Args:
-            episodes: the number of their episode, or of each step's.
-
-        Raises:
-            StepError: something cannot be stored exactly; nothing is recorded.
-        """
+        """As `StepStore.put_many`."""
         n, layout = len(terminals), self._layout
+        if self._sealed or layout.images:
+            put_each(self, layout, (states, actions, rewards), terminals, timeouts)
+            return
         check_structure(layout.observation_space, states, "state")
         check_structure(layout.action_space, actions, "action")
         columns = [("terminal", terminals), ("timeout", timeouts), ("episode", np.broadcast_to(episodes, n))]
@@ -149,13 +142,6 @@ class SingleRows:
         return begin + count
 
     # ---- episodes derived from rows
-
-    @property
-    def can_derive(self) -> bool:
-        """True if rows hold all that an episode is."""
-        layout = self._layout
-        alone = layout.reward_space is None and not layout.images
-        return not self._sealed and alone and self._state_end > STATE
 
     def skip_pending(self) -> None:
         """Says that the records of all episodes up to here are written."""

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.errors import StepError
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.journal.logs import FRONT, STATE, ToFile, as_rows, seal
 from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.write.rows.contract import StepStore
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -90,6 +91,8 @@ class StepLog:
 
     A record starts with its state, so the running record's state is in the journal before its action is known.
     """
+
+    holds_episodes = False
 
     def __init__(
         self,
@@ -213,6 +216,12 @@ class StepLog:
         self.total += total
         for sink in self._images:
             sink.advance()
+
+    def put_many(
+        self, states: Any, actions: Any, rewards: Any, terminals: Array, timeouts: Array, episodes: Any
+    ) -> None:
+        """As `StepStore.put_many`."""
+        put_each(self, self._layout, (states, actions, rewards), terminals, timeouts)
 
     def put_state(self, state: Any) -> None:
         """`commit_state` of `prepare_state`."""
@@ -345,20 +354,25 @@ def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
     return encode
 
 
-def step_check(layout: StepLayout) -> Callable[[Any, Any, Any], None]:
-    """A function that raises StepError unless a step (state, action, reward) can be stored exactly."""
+def put_each(
+    store: StepStore, layout: StepLayout, columns: Sequence[Any], terminals: Array, timeouts: Array
+) -> None:
+    """Puts steps one after another; the states, actions and rewards in `columns` lie along the first axis of all
+    arrays. StepError if one of them cannot be stored exactly; then none is put."""
     check_state = structure_check(layout.observation_space, "state")
     check_action = structure_check(layout.action_space, "action")
     encoders = [leaf_encoders(layout, leaves) for leaves in (layout.state, layout.action, layout.reward)]
-
-    def check(state: Any, action: Any, reward: Any) -> None:
-        check_state(state)
-        check_action(action)
-        for root, each in zip((state, action, reward), encoders, strict=True):
+    steps = [tuple(arrays_at(column, i) for column in columns) for i in range(len(terminals))]
+    for step in steps:
+        check_state(step[0])
+        check_action(step[1])
+        for root, each in zip(step, encoders, strict=True):
             for leaf, encode in each:
                 encode(leaf_value(root, leaf), bytearray(), 0)
-
-    return check
+    for (state, action, reward), terminal, timeout in zip(
+        steps, terminals.tolist(), timeouts.tolist(), strict=True
+    ):
+        store.put_whole(state, action, reward, terminal, timeout)
 
 
 def each_of(space: Any, batch: Any, n: int) -> list[Any]:

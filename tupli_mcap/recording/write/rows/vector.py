@@ -84,6 +84,7 @@ class VectorRows:
         self._nested = any(leaf.keys for leaf in layout.leaves)
         self._flagged = bytearray(2 * area.rows)  # where a flag may be set: a new journal is zeros
         self._state_end = layout.state_end
+        self.holds_episodes = layout.tells_episodes and not file.sealed
 
     def _make_views(self) -> None:
         """The places of the rows' fields in the journal."""
@@ -199,12 +200,6 @@ class VectorRows:
             self._switch()
 
     # ---- episodes derived from rows
-
-    @property
-    def can_derive(self) -> bool:
-        """True if rows hold all that an episode is."""
-        alone = self._layout.reward_space is None and not self._layout.images
-        return not self._sealed and alone and self._state_end > STATE
 
     def begin_episode(self, episode: StartedEpisode) -> None:
         """The next row of a sub-environment is the first one of an episode whose start is written."""
