@@ -42,7 +42,6 @@ class Autoreset:
         mode: the mode that is recorded by; "SameStep" once rule 1 applied.
         is_assumed: neither the environment nor the caller has said which mode it is.
         needs_no_finals: the caller has given same-step autoreset, whether infos hold final states or not.
-        is_plain: next-step autoreset, and not because it is assumed.
         has_ended: ends are recorded by the mode.
         doubt: what the caller should be told, if anything.
     """
@@ -53,7 +52,6 @@ class Autoreset:
         self.needs_no_finals = given and mode == "SameStep"
         self.doubt = ""
         self.has_ended = False
-        self.is_plain = mode == "NextStep" and not assumed
         self._given = given
         self._has_told = False
 
@@ -76,29 +74,32 @@ class Autoreset:
                 return cls(mode, given=given is not None)
         raise StepError(f"autoreset_mode: expected NextStep, SameStep or Disabled, found {found!r:.80}")
 
-    def resets_already(self, *, changed: bool) -> bool:
-        """Takes a batch with ends whose infos hold final states. Returns whether the mode is same-step from now on.
+    @property
+    def is_plain(self) -> bool:
+        """True for next-step autoreset that is not assumed."""
+        return self.mode == "NextStep" and not self.is_assumed
 
-        `changed`: the batch returned other states than these.
+    def note_finals(self, *, changed: bool) -> None:
+        """Takes a batch with ends whose infos hold final states; if it returned other states than these (`changed`),
+        and no mode is declared, the mode is same-step from now on.
 
-        StepError if that contradicts what was recorded, or what the caller has said.
+        StepError if that contradicts what was recorded, or what the environment declares.
         """
         if self.mode == "SameStep" or not changed:
-            return False  # nothing contradicts what is said
+            return  # nothing contradicts what is said
         if self._given:
             self._doubt(
                 f"an episode ended with a final state in infos that is not the state returned, as under same-step "
                 f"autoreset, and is recorded as under {self.mode}, as you have said"
             )
-            return False
+            return
         if self.has_ended or not self.is_assumed:
             raise StepError(
                 f"an episode ended with a final state in infos that is not the state returned, as under same-step "
                 f"autoreset, and is recorded as under {self.mode}; pass "
                 f'autoreset_mode="SameStep", or "{self.mode}" if that is right'
             )
-        self.mode, self.is_assumed, self.is_plain = "SameStep", False, False
-        return True
+        self.mode, self.is_assumed = "SameStep", False
 
     def _doubt(self, text: str) -> None:
         """Tells the caller, once."""

@@ -52,7 +52,7 @@ class VectorRecorder:
         *,
         derives_episodes: bool = False,
     ) -> None:
-        self.derives_episodes = derives_episodes and autoreset.mode == "NextStep" and not autoreset.is_assumed
+        self.derives_episodes = derives_episodes and autoreset.is_plain
         self._deriving: VectorRows | None = None  # the rows, while starts and ends are derived from them
         self._writer = writer
         self._spaces = spaces
@@ -64,8 +64,7 @@ class VectorRecorder:
         self._first: Any = None
         self._facts: list[ResetFacts | None] = [None] * num_envs
         self._earlier: list[list[ResetFacts]] = [[] for _ in range(num_envs)]  # resets that no step followed
-        self._any_waits = False  # whether one of these, which have no episode, must begin one
-        self._waiting = set(range(num_envs))
+        self._waiting = set(range(num_envs))  # those without an episode: their next step begins one
         self._episodes: list[StartedEpisode | None] = [None] * num_envs
         numbers = np.zeros((num_envs, 2), "<u4")  # of the running episodes: number, steps so far
         self._episode_numbers, self._lengths = numbers[:, 0], numbers[:, 1]
@@ -108,7 +107,6 @@ class VectorRecorder:
             ended[int(i)] = False
         self._writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
-        self._any_waits = True
         self._was_reset = True
         self._refused = False
         if self._writer.vector is None:
@@ -162,7 +160,7 @@ class VectorRecorder:
             # the whole batch is checked, then episodes are started, then it is written: recorded or refused as one
             final_states = {i: self._encode_final(state) for i, state in finals.items()} if finals else None
             batch = store.check(actions, states, rewards, terminals, timeouts, active)
-            if self._any_waits:
+            if self._waiting:
                 self._start(store, active)
             if final_states:
                 self._put_finals(final_states)
@@ -283,8 +281,7 @@ class VectorRecorder:
             changed = any(
                 self._encode_final(state) != self._encode_final(after[i]) for i, state in found.items()
             )
-            if resets.resets_already(changed=changed):
-                self._stop_deriving()
+            resets.note_finals(changed=changed)
         if resets.mode != "SameStep":
             resets.note_ends(known=True)
             return {}
@@ -330,7 +327,6 @@ class VectorRecorder:
         self._lengths[waiting] = 0
         self._totals[waiting] = 0.0
         self._waiting.difference_update(waiting)
-        self._any_waits = bool(self._waiting)
 
     # ---- episodes derived from rows
 
@@ -341,7 +337,6 @@ class VectorRecorder:
         self._episode_numbers[begun] = np.arange(first, writer.next_episode)
         self._lengths[begun] = 0
         self._waiting.difference_update(begun.tolist())
-        self._any_waits = bool(self._waiting)
         if infos and any(infos_of(infos, begun.tolist(), self._n)):
             self._stop_deriving()
             self._note_resets(holes, infos)
@@ -366,7 +361,6 @@ class VectorRecorder:
             if self._episodes[i] is not None or i in self._waiting:
                 continue
             self._waiting.add(i)
-            self._any_waits = True
             if not self._ended[i]:  # begun, and no step yet
                 self._writer.next_episode -= 1
                 self._facts[i] = ResetFacts(None, None, "", "{}", now)
@@ -391,7 +385,6 @@ class VectorRecorder:
         found = of(infos, chosen, self._n) if infos else [{}] * len(chosen)
         for i, info in zip(chosen, found, strict=True):
             self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
-        self._any_waits = True
 
     # ---- ends
 
@@ -405,7 +398,6 @@ class VectorRecorder:
             text, self._texts[i] = self._texts[i], "{}"
             if episode is None:
                 continue
-            self._any_waits = True
             self._waiting.add(i)
             now = time.time_ns() if now is None else now
             facts = episode, how, int(self._lengths[i]), float(self._totals[i])
@@ -437,7 +429,6 @@ class VectorRecorder:
         self._facts, self._earlier = before._facts, before._earlier
         self._ended, self._any_ended = before._ended, before._any_ended
         self._was_reset, self._refused = before._was_reset, before._refused
-        self._any_waits = True
         self._first = copy.deepcopy(states)
 
     def refuse(self) -> None:
