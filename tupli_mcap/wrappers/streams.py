@@ -18,7 +18,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import with_success
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, plain_reset
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import decide_layout
 from tupli_mcap.recording.write.rows.contract import StepStore
@@ -69,7 +69,7 @@ class Stream:
         self._streams, self._writer, self._env = streams, streams.writer, env
         self.is_running = False
         self.over: int | None = None
-        self._facts = ResetFacts(None, None, "", "{}", 0)
+        self._facts = plain_reset(0)
         self._metadata: dict[str, Any] = {}
         self._episode: StartedEpisode | None = None
         self._store: StepStore | None = None
@@ -142,7 +142,7 @@ class Stream:
     ) -> None:
         """Records whole episodes, which end before the steps `stops`: together if possible, else one by one."""
         columns = (states, actions, rewards, terminals, timeouts)
-        facts = ResetFacts(None, None, "", "{}", time.time_ns())
+        facts = plain_reset(time.time_ns())
         begin = 0
         for i, stop in enumerate(stops.tolist()):
             store = self._store

@@ -53,6 +53,11 @@ class ResetFacts(NamedTuple):
         return self.seed is None and self.drawn_seed is None and not self.continued
 
 
+def plain_reset(time_ns: int, *, continued: bool = False) -> ResetFacts:
+    """A reset without arguments and info; or none, if the episode is `continued`."""
+    return ResetFacts(None, None, "", "{}", time_ns, continued)
+
+
 # makes a StartedEpisode of its fields
 _new: Callable[[type[StartedEpisode], tuple[Any, ...]], StartedEpisode] = tuple.__new__
 

@@ -30,7 +30,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.write.chunks import ChunkWriter
-from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts
+from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts, plain_reset
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.place import RecordingPlace
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore
@@ -259,8 +259,12 @@ class RecordingWriter:
         """A start without a step says that the random stream of this episode is not that of the one before."""
         self.lost_streams.discard(env)
         if reset.goes_on:
-            self.start_episode(env, first_row, ResetFacts(None, None, "", "{}", reset.time_ns, True))
-            self.keep_start()
+            self.add_reset(env, first_row, plain_reset(reset.time_ns, continued=True))
+
+    def add_reset(self, env: int, first_row: int, reset: ResetFacts) -> None:
+        """Writes the start of a reset that no step follows."""
+        self.start_episode(env, first_row, reset)
+        self.keep_start()
 
     def drop_start(self) -> None:
         """Takes back the last `/episode_start`, the last event: a reset without a step is no episode."""

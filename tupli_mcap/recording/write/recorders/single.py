@@ -14,7 +14,7 @@ from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.variable.widening import variable_dtypes
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, plain_reset
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
@@ -159,7 +159,7 @@ class SingleRecorder:
         self._episode = writer.events.running.get(episode.number)
         if episode.first_row == rows.count:  # begun, and no step yet
             writer.next_episode -= 1
-            facts = ResetFacts(None, None, "", "{}", time.time_ns())
+            facts = plain_reset(time.time_ns())
             self._episode = writer.start_episode(0, rows.count, facts)
 
     def _keep_start_for(self, facts: ResetFacts) -> None:
@@ -225,8 +225,7 @@ class SingleRecorder:
             self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
 
     def _first(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
-        if self._reset is None:
-            raise StepError("expected a reset before the first step; call env.reset()")
+        assert self._reset is not None
         first, facts = self._reset
         layout = decide_layout(self._spaces, [first, state], [action], [reward], self._writer.layout)
         schema = None if self._infos is None else self._infos.codec.schema()
@@ -234,33 +233,26 @@ class SingleRecorder:
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
         rows = writer.rows
+        assert rows is not None
         if self.derives_episodes and isinstance(rows, SingleRows) and rows.holds_episodes:
             self._rows, rows.events = rows, writer.events
-        self._start_earlier()
+        for earlier in self._earlier:
+            writer.add_reset(0, rows.count, earlier)
+        self._earlier = []
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
         writer.take_place()
-
-    def _start_earlier(self) -> None:
-        rows = self._writer.rows
-        if rows is None or not self._earlier:
-            return
-        for facts in self._earlier:
-            self._writer.start_episode(0, rows.count, facts)
-            self._writer.keep_start()
-        self._earlier = []
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""
         self._derive_pending()
         if self.resets_itself:
-            self.reset(state, ResetFacts(None, None, "", "{}", time.time_ns()))
+            self.reset(state, plain_reset(time.time_ns()))
             return
         rows = self._writer.rows
-        if rows is None:
-            raise StepError("expected a reset before the first step; call env.reset()")
+        assert rows is not None
         rows.begin_episode(self._writer.next_episode)
-        facts = ResetFacts(None, None, "", "{}", 0, continued=True)
+        facts = plain_reset(0, continued=True)
         self._episode = self._writer.start_episode(0, rows.count, facts)
         self.put = rows.put
         rows.put(action, state, reward, terminal, timeout)
@@ -274,7 +266,7 @@ class SingleRecorder:
         if self.resets_itself and before._episode is None:
             self.put = self._continue
             return
-        facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
+        facts = plain_reset(time.time_ns(), continued=True)
         self._reset = (copy.deepcopy(state), facts)
         self.put = self._first
 

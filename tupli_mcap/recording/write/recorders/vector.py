@@ -17,7 +17,7 @@ from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.success import tells_success
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, plain_reset
 from tupli_mcap.recording.write.recorders.autoreset import Autoreset
 from tupli_mcap.recording.write.recorders.infos import (
     InfoRecorder,
@@ -313,12 +313,10 @@ class VectorRecorder:
         for i in waiting:
             facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset
-                facts = ResetFacts(None, None, "", "{}", time.time_ns(), continued=True)
-            if self._earlier[i]:
-                for earlier in self._earlier[i]:
-                    writer.start_episode(i, counts[i], earlier)
-                    writer.keep_start()
-                self._earlier[i] = []
+                facts = plain_reset(time.time_ns(), continued=True)
+            for earlier in self._earlier[i]:
+                writer.add_reset(i, counts[i], earlier)
+            self._earlier[i] = []
             self._episodes[i] = episode = writer.start_episode(i, counts[i], facts)
             if self._deriving:
                 self._deriving.begin_episode(episode)
@@ -363,7 +361,7 @@ class VectorRecorder:
             self._waiting.add(i)
             if not self._ended[i]:  # begun, and no step yet
                 self._writer.next_episode -= 1
-                self._facts[i] = ResetFacts(None, None, "", "{}", now)
+                self._facts[i] = plain_reset(now)
 
     def _put_finals(self, finals: dict[int, bytes]) -> None:
         """Ahead of the steps: the states that these bring are the next episodes' first ones."""
@@ -381,7 +379,7 @@ class VectorRecorder:
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
         of = reset_infos_of if self._autoreset.mode == "SameStep" else infos_of
-        plain, chosen = ResetFacts(None, None, "", "{}", time.time_ns()), holes.nonzero()[0].tolist()
+        plain, chosen = plain_reset(time.time_ns()), holes.nonzero()[0].tolist()
         found = of(infos, chosen, self._n) if infos else [{}] * len(chosen)
         for i, info in zip(chosen, found, strict=True):
             self._facts[i] = plain._replace(info=jsonvalue.dumps_any(info)) if info else plain
