@@ -33,12 +33,9 @@ CLOSED: Final = 3
 
 
 class FileRecorder(Protocol):
-    """Records the episodes that go to one file."""
+    """Records the episodes that go to one file, which `writer` writes."""
 
-    @property
-    def writer(self) -> RecordingWriter:
-        """Writes the file."""
-        ...
+    writer: RecordingWriter
 
     def close(self) -> None:
         """Ends what runs as interrupted and finishes the file."""

@@ -77,7 +77,7 @@ class SingleRecorder:
     ) -> None:
         self.derives_episodes = derives_episodes
         self.metadata = "{}"
-        self._writer = writer
+        self.writer = writer
         self._spaces = spaces
         self._infos = infos
         self._reset: tuple[Any, ResetFacts] | None = None
@@ -90,11 +90,6 @@ class SingleRecorder:
         writer.on_close = self._stop
         writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
 
-    @property
-    def writer(self) -> RecordingWriter:
-        """Writes the file."""
-        return self._writer
-
     def _stop(self) -> None:
         self.put = self._closed
         self._over = self._rows = None  # or `begin_next` would go on
@@ -102,21 +97,21 @@ class SingleRecorder:
     def reset(self, state: Any, facts: ResetFacts) -> None:
         """Starts an episode at `state`; a running one ends as interrupted. StepError if the state cannot be stored
         exactly."""
-        if self._writer.closed:
+        if self.writer.closed:
             self._closed()
         self._derive_pending()
         if self._reset is not None or self._episode is not None:
             self._keep_start_for(facts)
             self.end(INTERRUPTED)
-            self._writer.sync_step()  # before the running state is written over
-        rows = self._writer.rows
+            self.writer.sync_step()  # before the running state is written over
+        rows = self.writer.rows
         self.put = self._unreset
         if rows is None:
             check_structure(self._spaces.observation_space, state, "state")
             self._reset = (copy.deepcopy(state), facts)
             self.put = self._first
             return
-        writer = self._writer
+        writer = self.writer
         rows.begin_episode(writer.next_episode)
         rows.put_state(state)
         self._episode = writer.start_episode(0, rows.count, facts)
@@ -134,7 +129,7 @@ class SingleRecorder:
     def begin_next(self, state: Any) -> bool:
         """As `reset` without facts, where `leave_end` was the last call; False if it was not, and nothing is done.
         StepError if the state cannot be stored exactly."""
-        over, writer, rows = self._over, self._writer, self._rows
+        over, writer, rows = self._over, self.writer, self._rows
         if over is None or rows is None or writer.lost_streams:
             return False
         number = writer.next_episode
@@ -147,7 +142,7 @@ class SingleRecorder:
 
     def _derive_pending(self) -> None:
         """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
-        writer, rows, episode = self._writer, self._rows, self._episode
+        writer, rows, episode = self.writer, self._rows, self._episode
         if rows is None or writer.events is None or episode is None:
             return
         over, self._over = self._over, None
@@ -167,13 +162,13 @@ class SingleRecorder:
         if self._reset is not None:
             self._earlier = [*self._earlier, self._reset[1]] if facts.goes_on else []
         elif self._episode is not None and self.step_index == 0 and facts.goes_on:
-            self._writer.keep_start()
+            self.writer.keep_start()
             self._episode = None
 
     def end(self, end: int, *, has_final_state: bool = True) -> None:
         """Ends the running episode; an episode without a step is dropped."""
         self._derive_pending()
-        episode, writer = self._episode, self._writer
+        episode, writer = self._episode, self.writer
         metadata, self.metadata = self.metadata, "{}"
         rows = writer.rows
         if episode is None or rows is None or writer.closed:
@@ -195,24 +190,24 @@ class SingleRecorder:
     def refuse(self) -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""
         self.end(INTERRUPTED)
-        self._writer.lost_streams.add(0)
-        if not self._writer.closed:
+        self.writer.lost_streams.add(0)
+        if not self.writer.closed:
             self.put = self._refused
 
     def forget_reset(self) -> None:
         """After a reset that failed, wherever it left the environment: the episode ends, and a reset must follow."""
         self.end(INTERRUPTED)
         self._reset, self._earlier = None, []
-        self._writer.lost_streams.add(0)
-        if not self._writer.closed:
+        self.writer.lost_streams.add(0)
+        if not self.writer.closed:
             self.put = self._unreset
 
     @property
     def step_index(self) -> int:
         """Steps of the running episode so far."""
-        if self._episode is None or self._writer.rows is None:
+        if self._episode is None or self.writer.rows is None:
             return 0
-        return self._writer.rows.count - self._episode.first_row
+        return self.writer.rows.count - self._episode.first_row
 
     @property
     def running(self) -> tuple[int, int]:
@@ -222,14 +217,14 @@ class SingleRecorder:
     def put_info(self, info: Mapping[str, Any]) -> None:
         """Records the info of the step just put."""
         if self._infos is not None and self._episode is not None:
-            self._infos.put(self._writer, self._episode.number, self.step_index - 1, info)
+            self._infos.put(self.writer, self._episode.number, self.step_index - 1, info)
 
     def _first(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         assert self._reset is not None
         first, facts = self._reset
-        layout = decide_layout(self._spaces, [first, state], [action], [reward], self._writer.layout)
+        layout = decide_layout(self._spaces, [first, state], [action], [reward], self.writer.layout)
         schema = None if self._infos is None else self._infos.codec.schema()
-        writer = self._writer
+        writer = self.writer
         writer.begin(layout, 1, vector=False, info_schema=schema)
         self._reset = None
         rows = writer.rows
@@ -249,11 +244,11 @@ class SingleRecorder:
         if self.resets_itself:
             self.reset(state, plain_reset(time.time_ns()))
             return
-        rows = self._writer.rows
+        rows = self.writer.rows
         assert rows is not None
-        rows.begin_episode(self._writer.next_episode)
+        rows.begin_episode(self.writer.next_episode)
         facts = plain_reset(0, continued=True)
-        self._episode = self._writer.start_episode(0, rows.count, facts)
+        self._episode = self.writer.start_episode(0, rows.count, facts)
         self.put = rows.put
         rows.put(action, state, reward, terminal, timeout)
 
@@ -261,8 +256,8 @@ class SingleRecorder:
         """Takes over from the recorder of the file before, between episodes, with the environment at `state`: a step
         without a reset begins an episode there."""
         before._derive_pending()
-        self._writer.layout = before._writer.layout
-        self._writer.lost_streams = {0}
+        self.writer.layout = before.writer.layout
+        self.writer.lost_streams = {0}
         if self.resets_itself and before._episode is None:
             self.put = self._continue
             return
@@ -280,10 +275,10 @@ class SingleRecorder:
 
     def close(self) -> None:
         """Ends the running episode as interrupted and closes the recording."""
-        if self._writer.closed:
+        if self.writer.closed:
             return
         self.end(INTERRUPTED)
-        self._writer.close()
+        self.writer.close()
 
     def _closed(self, *_: Any) -> None:
-        raise self._writer.why_stopped()
+        raise self.writer.why_stopped()

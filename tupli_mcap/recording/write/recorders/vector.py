@@ -54,7 +54,7 @@ class VectorRecorder:
     ) -> None:
         self.derives_episodes = derives_episodes and autoreset.is_plain
         self._deriving: VectorRows | None = None  # the rows, while starts and ends are derived from them
-        self._writer = writer
+        self.writer = writer
         self._spaces = spaces
         self._n = num_envs
         self._autoreset = autoreset
@@ -82,18 +82,13 @@ class VectorRecorder:
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
         self._late: list[tuple[int, int]] = []  # ends that wait for the batch after them
 
-    @property
-    def writer(self) -> RecordingWriter:
-        """Writes the file."""
-        return self._writer
-
     # ---- resets
 
     def reset(self, states: Any, facts: Sequence[ResetFacts], mask: Array | None = None) -> None:
         """All sub-environments, or those in `mask`, start over; running episodes end as interrupted. StepError if a
         state cannot be stored exactly, or after `refuse` if `mask` leaves some out, whose states nobody knows."""
-        if self._writer.closed:
-            raise self._writer.why_stopped()
+        if self.writer.closed:
+            raise self.writer.why_stopped()
         if self._refused and mask is not None and not mask.all():
             raise StepError(
                 "the step before this reset could not be recorded; call env.reset() without a reset_mask to go on"
@@ -105,15 +100,15 @@ class VectorRecorder:
         for i in chosen:
             self._replace_facts(int(i), facts[int(i)])
             ended[int(i)] = False
-        self._writer.sync_step()  # before the running states are written over
+        self.writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
         self._was_reset = True
         self._refused = False
-        if self._writer.vector is None:
+        if self.writer.vector is None:
             self._first = copy.deepcopy(states)
             return
-        self._writer.vector.put_state(states, mask)
-        self._writer.sync_step()
+        self.writer.vector.put_state(states, mask)
+        self.writer.sync_step()
 
     def _replace_facts(self, i: int, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
@@ -130,8 +125,8 @@ class VectorRecorder:
     ) -> Array:
         """Records a batch; returns which sub-environments took a step (bool, `num_envs`). StepError if something cannot
         be stored exactly; nothing of this batch is recorded."""
-        if self._writer.closed:
-            raise self._writer.why_stopped()
+        if self.writer.closed:
+            raise self.writer.why_stopped()
         if not self._was_reset or self._refused:
             raise self._needs_reset()
         resets = self._autoreset
@@ -142,8 +137,8 @@ class VectorRecorder:
             )  # fmt: skip
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
-            begins = self._writer.vector is None
-            store = self._writer.vector or self._begin(actions, states, rewards)
+            begins = self.writer.vector is None
+            store = self.writer.vector or self._begin(actions, states, rewards)
             done = terminals | timeouts
             flags = done.tobytes()
             any_done = flags != self._none
@@ -166,7 +161,7 @@ class VectorRecorder:
                 self._put_finals(final_states)
             store.put(batch, self._numbers, ends=any_done)
             if begins:
-                self._writer.take_place()
+                self.writer.take_place()
         except StepError:
             self.refuse()
             raise
@@ -250,10 +245,10 @@ class VectorRecorder:
         for i in np.flatnonzero(stepped).tolist():
             episode = self._episodes[i]
             if episode is not None:
-                self._infos.put(self._writer, episode.number, int(self._lengths[i]) - 1, entries[i])
+                self._infos.put(self.writer, episode.number, int(self._lengths[i]) - 1, entries[i])
 
     def _begin(self, actions: Any, states: Any, rewards: Array) -> BatchStore:
-        spaces, known, first = self._spaces, self._writer.layout, self._first
+        spaces, known, first = self._spaces, self.writer.layout, self._first
         if spaces.constant:
             layout = decide_layout(spaces, [first, states], [actions], [rewards], known, batched=True)
         else:
@@ -261,12 +256,12 @@ class VectorRecorder:
             each = self._each(self._actions, actions)
             layout = decide_layout(spaces, firsts, each, list(rewards), known)
         schema = None if self._infos is None else self._infos.codec.schema()
-        self._writer.begin(layout, self._n, vector=True, info_schema=schema)
-        store = self._writer.vector
+        self.writer.begin(layout, self._n, vector=True, info_schema=schema)
+        store = self.writer.vector
         assert store is not None
         store.put_state(self._first)
         if self.derives_episodes and isinstance(store, VectorRows) and store.holds_episodes:
-            self._deriving, store.events = store, self._writer.events
+            self._deriving, store.events = store, self.writer.events
         self._first = None
         return store
 
@@ -309,7 +304,7 @@ class VectorRecorder:
         waiting = sorted(i for i in self._waiting if active is None or active[i])
         if not waiting:
             return
-        writer, counts, facts_of = self._writer, store.row_counts(), self._facts
+        writer, counts, facts_of = self.writer, store.row_counts(), self._facts
         for i in waiting:
             facts, facts_of[i] = facts_of[i], None
             if facts is None:  # stepped on after an end, without a reset
@@ -330,7 +325,7 @@ class VectorRecorder:
 
     def _begin_derived(self, holes: Array, infos: Mapping[str, Any]) -> None:
         """The episodes that begin with the batch just put, which was a reset to these sub-environments."""
-        begun, writer = holes.nonzero()[0], self._writer
+        begun, writer = holes.nonzero()[0], self.writer
         first, writer.next_episode = writer.next_episode, writer.next_episode + len(begun)
         self._episode_numbers[begun] = np.arange(first, writer.next_episode)
         self._lengths[begun] = 0
@@ -350,7 +345,7 @@ class VectorRecorder:
         """Writes the ends and starts that were put off, so that all is as if each had been written when it happened."""
         late, self._late = self._late, []
         self._end(late)
-        store, events = self._deriving, self._writer.events
+        store, events = self._deriving, self.writer.events
         if store is None or events is None:
             return
         now = time.time_ns()
@@ -360,21 +355,21 @@ class VectorRecorder:
                 continue
             self._waiting.add(i)
             if not self._ended[i]:  # begun, and no step yet
-                self._writer.next_episode -= 1
+                self.writer.next_episode -= 1
                 self._facts[i] = plain_reset(now)
 
     def _put_finals(self, finals: dict[int, bytes]) -> None:
         """Ahead of the steps: the states that these bring are the next episodes' first ones."""
         running = [(i, episode) for i in finals if (episode := self._episodes[i]) is not None]
         if running:
-            row = self._writer.put_final_states([(episode, finals[i]) for i, episode in running])
+            row = self.writer.put_final_states([(episode, finals[i]) for i, episode in running])
             self._final_rows.update((i, row + k) for k, (i, _) in enumerate(running))
 
     def _encode_final(self, state: Any) -> bytes:
         """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
         if self._final_encoder is None:
-            assert self._writer.layout is not None
-            self._final_encoder = final_encoder(self._writer.layout)
+            assert self.writer.layout is not None
+            self._final_encoder = final_encoder(self.writer.layout)
         return self._final_encoder(state)
 
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
@@ -389,7 +384,7 @@ class VectorRecorder:
     def _end(self, ends: Iterable[tuple[int, int]], *, known: bool = True) -> None:
         """Ends the running episodes of sub-environments: (sub-environment, how). `known`: the running states are their
         final ones."""
-        writer, final_rows, now = self._writer, self._final_rows, None
+        writer, final_rows, now = self.writer, self._final_rows, None
         store = writer.vector
         for i, how in ends:
             episode, self._episodes[i] = self._episodes[i], None
@@ -407,7 +402,7 @@ class VectorRecorder:
 
     def _pending_state(self, store: BatchStore, i: int) -> bytes:
         final = store.pending_state(i)
-        for stores in self._writer.images:
+        for stores in self.writer.images:
             final += stores[i].pending()
         return final
 
@@ -422,8 +417,8 @@ class VectorRecorder:
         """Takes over from the recorder of the file before, between episodes, with the sub-environments at `states`."""
         before._derive_pending()
         self.derives_episodes = before.derives_episodes
-        self._writer.layout = before._writer.layout
-        self._writer.lost_streams = set(range(self._n))
+        self.writer.layout = before.writer.layout
+        self.writer.lost_streams = set(range(self._n))
         self._facts, self._earlier = before._facts, before._earlier
         self._ended, self._any_ended = before._ended, before._any_ended
         self._was_reset, self._refused = before._was_reset, before._refused
@@ -433,16 +428,16 @@ class VectorRecorder:
         """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
         self._refused = True
         self._final_rows.clear()
-        self._writer.lost_streams.update(range(self._n))
-        if not self._writer.closed:
+        self.writer.lost_streams.update(range(self._n))
+        if not self.writer.closed:
             self._derive_pending()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
-        if self._writer.closed:
+        if self.writer.closed:
             return
         self._derive_pending()
         self._end([(i, INTERRUPTED) for i in range(self._n)])
         self._refused = True
-        self._writer.close()
+        self.writer.close()
