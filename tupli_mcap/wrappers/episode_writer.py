@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -152,7 +152,7 @@ class EpisodeWriter(Recorder):
         told = "" if options is None else jsonvalue.dumps_any(options)
         facts = ResetFacts(None if seed is None else int(seed), None, told, "{}", time.time_ns())
         entries = _metadata(metadata)
-        with _Whole(self._work, self._writer):
+        with self._work:
             self._next(env).begin(facts, entries)
 
     def _next(self, env: int) -> Stream:
@@ -245,7 +245,7 @@ class EpisodeWriter(Recorder):
         _check_lengths(n, "step", states=states, actions=actions, rewards=rewards)
         entries = [entries_of(info, "info") for info in infos or ()]
         if n:
-            with _Whole(self._work, self._writer):
+            with self._work:
                 stream.put_many(states, actions, rewards, *flags, entries)
                 self._writer.flush_if_due()
                 self._writer.sync_step()
@@ -286,7 +286,7 @@ class EpisodeWriter(Recorder):
             )
         _check_lengths(n, "step", states=states, actions=actions, rewards=rewards)
         _check_lengths(len(stops), "episode", final_states=final_states)
-        with _Whole(self._work, self._writer):
+        with self._work:
             self._next(env).put_episodes(states, actions, rewards, *flags, stops, final_states)
             self._writer.flush_if_due()
             self._writer.sync_step()
@@ -307,7 +307,7 @@ class EpisodeWriter(Recorder):
         """
         stream = self._running(env)
         entries = _metadata(metadata)
-        with _Whole(self._work, self._writer):
+        with self._work:
             stream.end(final_state, entries)
             self._writer.sync_step()
 
@@ -321,7 +321,7 @@ class EpisodeWriter(Recorder):
             StepError: no episode is running.
         """
         stream = self._running(env)
-        with _Whole(self._work, self._writer):
+        with self._work:
             number = stream.discard()
             if number is not None:
                 self._discarded.setdefault(self._writer.place.file, []).append(number)
@@ -365,28 +365,6 @@ class EpisodeWriter(Recorder):
         if not stream.is_running:
             raise StepError(f"no episode is running{_in(self._num_envs, env)}; call begin() first")
         return stream
-
-
-class _Whole:
-    """Marks `work` as unfinished during the block; it stays so if anything but a refused step interrupts the block."""
-
-    __slots__ = ("_work", "_writer")
-
-    def __init__(self, work: Work, writer: RecordingWriter) -> None:
-        self._work, self._writer = work, writer
-
-    def __enter__(self) -> None:
-        self._work.state = BEGUN
-
-    def __exit__(self, _: object, err: BaseException | None, __: object) -> Literal[False]:
-        work = self._work
-        if err is None:
-            work.finish()
-        elif work.is_whole_after(err):
-            work.state = DONE
-        else:
-            self._writer.stop(err)
-        return False
 
 
 def _in(num_envs: int | None, env: int) -> str:

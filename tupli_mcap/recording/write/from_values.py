@@ -20,7 +20,7 @@ from tupli_mcap.recording.write.options import Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.frames import put_frame
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
-from tupli_mcap.recording.write.work import BEGUN, DONE, Work
+from tupli_mcap.recording.write.work import Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_flag, shorten
 
@@ -85,13 +85,8 @@ def write_recording(
     try:
         writer.check_spaces(spaces, 1, vector=False)
         for episode in episodes:
-            work.state = BEGUN
-            try:
+            with work:  # what was recorded before stays if a step is refused
                 _write(writer, recorder, episode)
-            except StepError:  # what was recorded before stays
-                work.state = DONE
-                raise
-            work.state = DONE
     finally:
         work.close()
 

@@ -11,7 +11,7 @@ keeps steps safe waits for an exception handler:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NoReturn, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, Protocol, TypeVar
 
 from tupli_mcap.errors import RecordingError, StepError
 
@@ -45,6 +45,8 @@ class FileRecorder(Protocol):
 class Work:
     """What one wrapper records: the recorders whose files are not finished, and the mark. Not thread-safe.
 
+    As a context manager it marks a block, which stays marked if anything but a refused step breaks it off.
+
     Attributes:
         state: DONE, BEGUN, ASKING or CLOSED.
         recorders: the last one takes the steps; those before it were left by a rotation that was interrupted.
@@ -55,6 +57,18 @@ class Work:
     def __init__(self) -> None:
         self.state = DONE
         self.recorders: list[FileRecorder] = []
+
+    def __enter__(self) -> None:
+        self.state = BEGUN
+
+    def __exit__(self, _: object, err: BaseException | None, __: object) -> Literal[False]:
+        if err is None:
+            self.finish()
+        elif self.is_whole_after(err):
+            self.state = DONE
+        else:
+            self.recorders[-1].writer.stop(err)
+        return False
 
     def ask(self, function: Callable[..., T], *args: Any) -> T:
         """Calls what is not the recorder's within a step: a callback, or what renders."""
