@@ -34,7 +34,6 @@ from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts, plain_re
 from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.place import RecordingPlace
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore
-from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
 
 _live: weakref.WeakSet[RecordingWriter] = weakref.WeakSet()
@@ -70,7 +69,6 @@ class RecordingWriter:
         self.streams: Sequence[StepStore] = ()
         self._durable = options.durability != "os"
         self._sealed = options.durability == "step"
-        self.images: list[list[ImageRows]] = []
         self.events: EpisodeLog | None = None
         self.infos: EventLog | None = None
         self.frames: list[EventLog] = []
@@ -241,8 +239,7 @@ class RecordingWriter:
         self._stores = stores = Stores(
             layout, self.channels, self.journal, self.index, file, vector=self.is_vector, apart=self._apart
         )
-        self.rows, self.vector, self.images = stores.rows, stores.vector, stores.images
-        self.streams = stores.streams
+        self.rows, self.vector, self.streams = stores.rows, stores.vector, stores.streams
         self.events, self.infos, self.frames = stores.events, stores.infos, stores.frames
 
     # ---- episodes
@@ -445,7 +442,7 @@ class RecordingWriter:
             if self._stores is not None:
                 self._stores.let_go()
                 self._stores = self.rows = self.vector = self.events = self.infos = None
-                self.images, self.frames, self.streams = [], [], ()
+                self.frames, self.streams = [], ()
             if self.journal is not None:
                 self.journal.close()
         finally:

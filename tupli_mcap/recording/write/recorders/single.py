@@ -179,9 +179,6 @@ class SingleRecorder:
             writer.drop_start()
             return
         final = rows.pending_state() if has_final_state else None
-        if final is not None:
-            for sinks in writer.images:
-                final += sinks[0].pending()
         if self._rows is not None:
             self._rows.skip_pending()
         writer.end_episode(episode, end, length, rows.total, final, metadata)

@@ -78,7 +78,8 @@ class VectorRecorder:
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
-        self._final_encoder: Callable[[Any], bytes] | None = None
+        # of a final state that is in no row, as it follows `episode` and `env` in `/final_state`; set by `_begin`
+        self._encode_final: Callable[[Any], bytes]
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
         self._late: list[tuple[int, int]] = []  # ends that wait for the batch after them
 
@@ -255,6 +256,7 @@ class VectorRecorder:
             firsts = [*self._each(self._observations, first), *self._each(self._observations, states)]
             each = self._each(self._actions, actions)
             layout = decide_layout(spaces, firsts, each, list(rewards), known)
+        self._encode_final = final_encoder(layout)
         schema = None if self._infos is None else self._infos.codec.schema()
         self.writer.begin(layout, self._n, vector=True, info_schema=schema)
         store = self.writer.vector
@@ -365,13 +367,6 @@ class VectorRecorder:
             row = self.writer.put_final_states([(episode, finals[i]) for i, episode in running])
             self._final_rows.update((i, row + k) for k, (i, _) in enumerate(running))
 
-    def _encode_final(self, state: Any) -> bytes:
-        """A final state that is in no row, as it follows `episode` and `env` in `/final_state`."""
-        if self._final_encoder is None:
-            assert self.writer.layout is not None
-            self._final_encoder = final_encoder(self.writer.layout)
-        return self._final_encoder(state)
-
     def _note_resets(self, holes: Array, infos: Mapping[str, Any]) -> None:
         of = reset_infos_of if self._autoreset.mode == "SameStep" else infos_of
         plain, chosen = plain_reset(time.time_ns()), holes.nonzero()[0].tolist()
@@ -397,14 +392,8 @@ class VectorRecorder:
             if i in final_rows:
                 writer.end_episode(*facts, None, text, final_rows.pop(i), now)
             else:
-                state = self._pending_state(store, i) if known and store is not None else None
+                state = store.pending_state(i) if known and store is not None else None
                 writer.end_episode(*facts, state, text, -1, now)
-
-    def _pending_state(self, store: BatchStore, i: int) -> bytes:
-        final = store.pending_state(i)
-        for stores in self.writer.images:
-            final += stores[i].pending()
-        return final
 
     @property
     def is_running(self) -> bool:

@@ -14,10 +14,11 @@ from tupli_mcap.journal.derive import EpisodeDeriver
 from tupli_mcap.journal.file import Journal, RowArea
 from tupli_mcap.journal.logs import STATE, ToFile, seal
 from tupli_mcap.mcap.records import BODY, HOLE
-from tupli_mcap.messages.encode_rows import ImageSink, make_row_encoder
+from tupli_mcap.messages.encode_rows import make_row_encoder
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import EpisodeLog
+from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.recording.write.rows.variable import put_each
 from tupli_mcap.spaces.exact import check_structure, exact_array, leaf_value
 
@@ -37,12 +38,12 @@ class SingleRows:
         layout: StepLayout,
         journal: Journal,
         channel: int,
-        images: Sequence[ImageSink],
+        images: Sequence[ImageRows],
         file: ToFile,
         block: int = 0,
     ) -> None:
         self._file, self._sealed = file, file.sealed
-        self._layout = layout
+        self._layout, self._images = layout, images
         self._dtype = layout.step_message.dtype
         self._area = area = journal.area("steps", RowArea)
         self._buffer = buffer = journal.buffer("steps")
@@ -157,9 +158,10 @@ class SingleRows:
             self.events.extend(self._episodes.derive(rows[None], pending))
 
     def pending_state(self) -> bytes:
-        """The CDR bytes of the running row's state, as they follow `episode` and `env` in `/final_state`."""
+        """As `StepStore.pending_state`."""
         start = self._offset()
-        return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+        state = bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+        return state + b"".join(images.pending() for images in self._images)
 
     def _seal(self, offset: int, *, alone: bool = False) -> None:
         end = offset + self._area.row_size

@@ -74,7 +74,6 @@ class Stores:
         rows: of a single environment.
         vector: of sub-environments that step together.
         streams: of a single environment, or of sub-environments that step apart, each its own.
-        images: by image leaf, then by sub-environment.
         events: starts, ends and final states.
         infos: None where none are recorded.
         frames: pictures and what they show, by sub-environment; empty where none are recorded.
@@ -91,16 +90,14 @@ class Stores:
         vector: bool,
         apart: bool,
     ) -> None:
-        self.images = [
+        images = [  # by leaf, then by sub-environment
             [
                 ImageRows(leaf, layout.image_messages[leaf.name], journal, f"{leaf.name}/{i}", channel, file)
                 for i, channel in enumerate(of_leaf)
             ]
             for leaf, of_leaf in zip(layout.images, channels.images, strict=True)
         ]
-        of_each = [
-            (channel, [stores[i] for stores in self.images]) for i, channel in enumerate(channels.steps)
-        ]
+        of_each = [(channel, [stores[i] for stores in images]) for i, channel in enumerate(channels.steps)]
         self.vector: VectorRows | StepLogs | None = None
         self.streams: Sequence[SingleRows | StepLog] = []
         steps: Sequence[RowStore]
@@ -110,7 +107,7 @@ class Stores:
             self.streams = steps = logs
             self.vector = StepLogs(layout, logs) if vector and not apart else None
         elif vector and not apart:
-            self.vector = together = VectorRows(layout, journal, channels.steps, self.images, file)
+            self.vector = together = VectorRows(layout, journal, channels.steps, images, file)
             steps = [together]
         else:
             rows = [SingleRows(layout, journal, *each, file, i) for i, each in enumerate(of_each)]
@@ -122,7 +119,7 @@ class Stores:
         ]
         self.events = EpisodeLog(journal, channels, index, file)
         infos = [] if self.infos is None else [self.infos]
-        self._moving: list[MovingStore] = [*itertools.chain(*self.images), *logs, *infos, *self.frames]
+        self._moving: list[MovingStore] = [*itertools.chain(*images), *logs, *infos, *self.frames]
         # steps first: the file never has more images than steps
         self._stores: list[RowStore] = list(dict.fromkeys((*steps, *self._moving)))
 

@@ -238,8 +238,8 @@ class StepLog:
         )
 
     def pending_state(self) -> bytes:
-        """The CDR bytes of the running record's state, as they follow `episode` and `env` in `/final_state`."""
-        return bytes(self._pending[BODY + 8 :])
+        """As `StepStore.pending_state`."""
+        return bytes(self._pending[BODY + 8 :]) + b"".join(images.pending() for images in self._images)
 
     @staticmethod
     def _encode(out: bytearray, encoders: Sequence[tuple[Leaf, Encoder]], root: Any) -> None:

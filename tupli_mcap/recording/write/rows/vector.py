@@ -227,7 +227,8 @@ class VectorRows:
         """As `BatchStore.pending_state`."""
         area = self._area
         start = self._half * area.half + i * area.block + self._row * area.row_size
-        return bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+        state = bytes(self._buffer[start + BODY + 8 : start + self._state_end])
+        return state + b"".join(stores[i].pending() for stores, _ in self._images)
 
     def _seal(self, active: Array | None) -> None:
         size = self._area.row_size
