@@ -55,15 +55,15 @@ def _events_taken_off_first() -> None:
 
 
 def _chunks_late() -> None:
-    """Every chunk is written only when the next one is due: halves are used again before they are in the file."""
-    place, kept = Container.place, []
+    """Every chunk is written only when later ones are due: halves are used again before they are in the file."""
+    place, kept = Container._place, []
 
-    def late(self: Any, chunk: Any, packed: bytes) -> None:
-        kept.append((self, chunk, packed))
+    def late(self: Any, chunks: Any, packed: Any) -> None:
+        kept.append((self, chunks, packed))
         if len(kept) > 3:
             place(*kept.pop(0))
 
-    Container.place = late  # type: ignore[method-assign]
+    Container._place = late  # type: ignore[method-assign]
 
 
 BREAKAGES: dict[str, Callable[[], None]] = {

@@ -91,9 +91,9 @@ MOMENTS = {
             times=4,
         ),
         Moment("flush", ("RecordingWriter._flush",), times=3, flushes=True),
-        Moment("chunk", ("Container.place", "Container.finish_chunks"), times=8, flushes=True),
+        Moment("chunk", ("Container._place", "Container.finish_chunks"), times=8, flushes=True),
         Moment(
-            "after chunk", ("Container.place", "Container.finish_chunks"), after=True, times=8, flushes=True
+            "after chunk", ("Container._place", "Container.finish_chunks"), after=True, times=8, flushes=True
         ),
         Moment("compression", times=6, flushes=True),
         Moment("torn chunk", call="pwrite", starts=(_CHUNK,), times=6, flushes=True),
