@@ -64,9 +64,9 @@ def made_up_world(number: int) -> Iterator[None]:
     with (
         mock.patch("time.time_ns", side_effect=clock),
         mock.patch("uuid.uuid4", return_value=known),
-        mock.patch("tupli_mcap.recording.write.writer.library", return_value="tupli-mcap 1"),
+        mock.patch("tupli_mcap.mcap.container.library", return_value="tupli-mcap 1"),
         mock.patch(BOOT_ID, return_value=BOOT),
-        mock.patch("tupli_mcap.recording.edit.assemble.library", return_value="tupli-mcap 1"),
+        mock.patch("tupli_mcap.recording.contents.library", return_value="tupli-mcap 1"),
     ):
         yield
 

@@ -158,10 +158,10 @@ class Container:
             ) from err
         self.position = position
 
-    def start(self, library: str) -> None:
+    def start(self) -> None:
         """Magic and header."""
         builder = RecordBuilder()
-        Header(PROFILE, library).write(builder)
+        Header(PROFILE, library()).write(builder)
         self.write(MAGIC + built(builder))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:

@@ -11,7 +11,7 @@ from mcap.records import AttachmentIndex, Channel, MetadataIndex, Schema
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import CHUNK_ROWS, REPEATED, Rows
+from tupli_mcap.mcap.container import CHUNK_ROWS, REPEATED, Rows, library
 from tupli_mcap.mcap.records import check_crc
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.topics import FINAL_STATE, INFO, Topic, parse
@@ -120,6 +120,17 @@ def is_ours(topic: str) -> bool:
         return True
     place = parse(topic)
     return place is not None and place.kind != "camera"
+
+
+def first_metadata(uuid: str, format_version: str, benchmark_id: str, time_ns: int) -> dict[str, str]:
+    """The metadata that every recording has from its beginning."""
+    return {
+        "uuid": uuid,
+        "format_version": format_version,
+        "library": library(),
+        "created_ns": str(time_ns),
+        "benchmark_id": benchmark_id,
+    }
 
 
 def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:

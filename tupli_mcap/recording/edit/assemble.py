@@ -18,7 +18,7 @@ from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.journal.logs import group_records
 from tupli_mcap.mcap.chunks import decompress
-from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows, library
+from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.lock import writers_kept_out
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
@@ -70,7 +70,7 @@ class Assembler:
         self, metadata: Mapping[str, str], attachments: Mapping[str, tuple[str, bytes]], time_ns: int
     ) -> None:
         """Writes the header, the recording's metadata, and attachments: name -> (media type, bytes)."""
-        self.container.start(library())
+        self.container.start()
         self.container.add_metadata(RECORDING_METADATA, metadata)
         for name, (media_type, data) in attachments.items():
             self.container.add_attachment(name, media_type, data, time_ns)

@@ -19,13 +19,14 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, warn
-from tupli_mcap.mcap.container import Container, library
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
 from tupli_mcap.recording.about.described import MADE_OF_NAME, MAX_MADE_OF
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
 from tupli_mcap.recording.episode import reward_getter
@@ -91,14 +92,9 @@ def kept_metadata(source: Recording) -> dict[str, str]:
 def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str, str]:
     """The metadata of a recording with a new UUID made of `source`; `next_episode` is the source's by default."""
     free = source.file.contents.next_episode if next_episode is None else next_episode
-    return {
-        "uuid": uuid.uuid4().hex,
-        "format_version": source.metadata["format_version"],
-        "library": library(),
-        "created_ns": str(time.time_ns()),
-        "benchmark_id": source.benchmark_id,
-        "next_episode": str(free),
-    }
+    version = source.metadata["format_version"]
+    made = first_metadata(uuid.uuid4().hex, version, source.benchmark_id, time.time_ns())
+    return {**made, "next_episode": str(free)}
 
 
 def return_of(layout: StepLayout, rewards: Any, steps: int) -> float:

@@ -21,13 +21,13 @@ from tupli_mcap.errors import RecordingError, SpaceError, StepError, TupliError,
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal, boot_id, sync_directory, sync_file
 from tupli_mcap.journal.logs import EventLog, ToFile
-from tupli_mcap.mcap.container import Container, library
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.contents import RECORDING_METADATA, first_metadata
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts, plain_reset
@@ -117,19 +117,13 @@ class RecordingWriter:
                 f"{self.path} cannot be emptied ({os_reason(err)}); choose a regular file"
             ) from err
         now = time.time_ns()
-        values = {
-            "uuid": self.place.uuid,
-            "format_version": self.format_version,
-            "library": library(),
-            "created_ns": str(now),
-            "benchmark_id": self.options.benchmark_id,
-        }
+        values = first_metadata(self.place.uuid, self.format_version, self.options.benchmark_id, now)
         if self.options.journal_dir is not None:
             values["journal"] = str(self.place.journal)
         if self.place.replaced:
             # whoever comes next shall know, if this process dies before it removes that journal
             values["replaced"] = self.place.replaced
-        self.container.start(values["library"])
+        self.container.start()
         self.container.add_metadata(RECORDING_METADATA, values)
         for name, (media_type, data) in (self.options.attachments or {}).items():
             self.container.add_attachment(name, media_type, data, now)

@@ -16,7 +16,7 @@ import numpy as np
 from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.mcap.container import Container, library
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
     CAMERA_SCHEMA,
@@ -30,6 +30,7 @@ from tupli_mcap.messages.layout import NUMBERS, renumbered
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, camera_names, parse
 from tupli_mcap.recording.channels import register_channels
+from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
@@ -81,13 +82,8 @@ class RepairWriter:
         old = dict(self._evidence.metadata or {})
         for key in ("journal", "replaced"):
             old.pop(key, None)
-        made = {
-            "uuid": uuid.uuid4().hex,
-            "format_version": "2" if uses_codecs(self._evidence.channels) else "1",
-            "library": library(),
-            "created_ns": str(self._now),
-            "benchmark_id": "",
-        }
+        version = "2" if uses_codecs(self._evidence.channels) else "1"
+        made = first_metadata(uuid.uuid4().hex, version, "", self._now)
         kept = {key: old[key] for key in made if key in old and _METADATA[key].fullmatch(old[key])}
         self.metadata_lost = [key for key in made if key not in kept]
         others = {key: value for key, value in old.items() if key not in made}
