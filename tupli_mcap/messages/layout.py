@@ -22,9 +22,8 @@ from tupli_mcap.spaces.leaves import Leaf
 
 SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
 PREFIX = BODY + 8  # bytes of a step's record that are the same for a whole episode: headers, episode, step
-NUMBERS = struct.Struct(
-    "<II"
-)  # of an episode, and of its step or its sub-environment: messages begin with them
+# Of an episode, and of its step or its sub-environment: messages begin with them.
+NUMBERS = struct.Struct("<II")
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds
 _TIME_MSG = "int32 sec\nuint32 nanosec\n"
 SEPARATOR = "=" * 80 + "\n"  # before a nested message in a ros2msg text

@@ -189,8 +189,7 @@ class BaseFilter(BaseModel):
     def __repr__(self) -> str:
         return _expression(self)
 
-    def __str__(self) -> str:
-        return _expression(self)
+    __str__ = __repr__
 
     def to_params_dict(self, params: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """The filter as JSON-able query parameters, together with those in `params`, which is not changed."""

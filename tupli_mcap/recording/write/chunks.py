@@ -24,9 +24,8 @@ _MOST_ROWS = LAST_ROW - (1 << 26)  # of a channel in the file: those in the jour
 T = TypeVar("T")
 # Seconds of work from which a job is handed over: that costs the recording thread time, too, on virtual machines most.
 WORTH_A_THREAD = 0.001
-LARGE = (
-    3 << 20
-)  # bytes of a first job that is handed over; how long a job takes is known from the second one on
+# Bytes of a first job that is handed over; how long a job takes is known from the second one on.
+LARGE = 3 << 20
 
 
 class ChunkWorker:

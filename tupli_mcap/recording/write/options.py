@@ -27,9 +27,8 @@ Durability = Literal["os", "chunk", "step"]
 CaptureEnv = Literal["spec", "pickle"] | None
 Capture = Literal["all", "versions", "none"]
 RecordInfo = bool | Sequence[str] | Callable[[dict[str, Any]], Mapping[str, Any]]
-MetadataCallback = Callable[
-    ["RLTuple"], Mapping[str, Any]
-]  # also an EpisodeMetadataCallback, which has reset()
+# Also an EpisodeMetadataCallback, which has reset().
+MetadataCallback = Callable[["RLTuple"], Mapping[str, Any]]
 StepCallback = Callable[["Step"], Mapping[str, Any] | None]
 
 CAMERA: Final = "render"

@@ -66,20 +66,14 @@ class Rotation:
         if self._folder is None and not (options.mode == "a" and os.path.lexists(path)):
             _check_name(path)
         self._options, self._format_version = options, format_version
-        self._limited, self._max_bytes, self._max_seconds = (
-            options.has_limits,
-            options.max_bytes,
-            options.max_seconds,
-        )
-        if self._limited:  # the program may change its directory before the next file
+        self._max_bytes, self._max_seconds = options.max_bytes, options.max_seconds
+        if options.has_limits:  # the program may change its directory before the next file
             path = Path(path).absolute()
             self._folder = None if self._folder is None else path
         self._paths = [Path(path) if self._folder is None else self._new_in(self._folder)]
-        self._base: Path | None = (
-            None  # after which the next files are called, and the number of the last one
-        )
-        self._number = 0
-        if self._limited and self._folder is None:
+        self._base: Path | None = None  # after which the next files are called
+        self._number = 0  # of the last one
+        if options.has_limits and self._folder is None:
             self._join(options.mode)
         self._opened = 0.0
         self._head = 0  # bytes of attachments
