@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.file import LOG_HEADER, JournalContents, LogArea, RowArea
-from tupli_mcap.journal.logs import STATE, as_rows, checksum, seal_of
+from tupli_mcap.journal.logs import STATE, checksum, joined_rows, seal_of
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import BODY, HOLE, RECORD_HEADER, iter_records
 from tupli_mcap.messages.decoder import MessageDecoder
@@ -269,9 +269,7 @@ class CommittedRecords(Committed[Rows]):
     def take(self, places: Array) -> Rows:
         """The records at `places`."""
         chosen = [self._records[i] for i in places.tolist()]
-        sizes = np.fromiter(map(len, chosen), np.uint64)
-        first = int(self.numbers[places[0]])
-        return as_rows(self._channel, first, bytearray().join(chosen), sizes, sealed=True)
+        return joined_rows(self._channel, int(self.numbers[places[0]]), chosen, sealed=True)
 
 
 def committed_records(

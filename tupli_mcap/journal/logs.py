@@ -21,7 +21,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import LOG_HEADER, Journal, LogArea
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import BODY, CDR_HEADER, crc32_each, iter_records
+from tupli_mcap.mcap.records import BODY, CDR_HEADER, crc32_each
 
 FRONT = struct.Struct("<BQHIQ")  # a record up to publish_time, where a journal has a checksum
 _LOG_TIME = FRONT.size - 8
@@ -83,18 +83,6 @@ def sealed_records(table: Array) -> bytes:
     return table.tobytes()
 
 
-def group_records(data: memoryview) -> list[Rows]:
-    """The records in `data`, which have no checksums, by channel, in their order."""
-    whole = bytes(data)
-    groups: dict[int, tuple[int, list[bytes]]] = {}
-    for start, end, channel, sequence, _ in iter_records(data):
-        groups.setdefault(channel, (sequence, []))[1].append(whole[start:end])
-    return [
-        as_rows(channel, first, bytearray().join(records), list(map(len, records)), sealed=False)
-        for channel, (first, records) in groups.items()
-    ]
-
-
 def as_rows(channel: int, first: int, joined: bytearray, sizes: Any, *, sealed: bool) -> Rows:
     """Whole records of one channel that lie in `joined` one after the other; `sizes` are their numbers of bytes.
 
@@ -108,6 +96,11 @@ def as_rows(channel: int, first: int, joined: bytearray, sizes: Any, *, sealed: 
     if sealed:  # the journal's checksums are there
         content[log_times + np.uint64(8)] = times
     return Rows(channel, first, joined, offsets, times.reshape(-1).view("<u8"))
+
+
+def joined_rows(channel: int, first: int, records: Sequence[bytes], *, sealed: bool) -> Rows:
+    """The same of records that lie apart."""
+    return as_rows(channel, first, bytearray().join(records), list(map(len, records)), sealed=sealed)
 
 
 class EventLog:
@@ -199,6 +192,5 @@ class EventLog:
                 first = (
                     self.sequences[channel] - len(records) - (kept if channel == self._last_channel else 0)
                 )
-                sizes = list(map(len, records))
-                self._file.add_chunk(as_rows(channel, first, bytearray().join(records), sizes, sealed=True))
+                self._file.add_chunk(joined_rows(channel, first, records, sealed=True))
         self._behind[0] = self._file.size()

@@ -16,7 +16,7 @@ from tupli_mcap import files
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.committed import even_rows
-from tupli_mcap.journal.logs import group_records
+from tupli_mcap.journal.logs import joined_rows
 from tupli_mcap.mcap.chunks import decompress
 from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
 from tupli_mcap.mcap.lock import writers_kept_out
@@ -127,20 +127,19 @@ class Assembler:
     def add_messages(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
         """Adds messages (log_time, body) of any size, in chunks of the usual size."""
         sequence, latest = self.next_row(channel), self.latest(channel)
-        batch = bytearray()
+        batch: list[bytes] = []
+        size = 0
         for log_time, body in messages:
             self.held += log_time < latest
             latest = max(log_time, latest)
-            batch += record(channel, sequence, latest, body)
-            sequence += 1
-            if len(batch) >= _CHUNK:
-                self._emit(batch)
-        self._emit(batch)
-
-    def _emit(self, batch: bytearray) -> None:
-        for rows in group_records(memoryview(bytes(batch))):
-            self.add_chunk(rows)
-        batch.clear()
+            batch.append(record(channel, sequence + len(batch), latest, body))
+            size += len(batch[-1])
+            if size >= _CHUNK:
+                self.add_chunk(joined_rows(channel, sequence, batch, sealed=False))
+                sequence += len(batch)
+                batch, size = [], 0
+        if batch:
+            self.add_chunk(joined_rows(channel, sequence, batch, sealed=False))
 
     def add_chunk(self, rows: Rows) -> None:
         """Adds rows to their channel."""

@@ -14,7 +14,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, warn
 from tupli_mcap.journal.committed import size_behind
 from tupli_mcap.journal.file import JournalContents, recorded_journal
-from tupli_mcap.journal.logs import group_records
+from tupli_mcap.journal.logs import joined_rows
 from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import Source
@@ -150,7 +150,10 @@ class _Made:
 
     def rows(self) -> list[Rows]:
         """All messages."""
-        return [rows for made in self._records.values() for rows in group_records(memoryview(b"".join(made)))]
+        return [
+            joined_rows(channel, self._next[channel][0] - len(made), made, sealed=False)
+            for channel, made in self._records.items()
+        ]
 
 
 def _beyond_frames(evidence: Evidence, store: PackedStore) -> int:

@@ -18,6 +18,7 @@ from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.rows.contract import StepStore
+from tupli_mcap.recording.write.rows.images import ImageRows
 from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -100,7 +101,7 @@ class StepLog:
         journal: Journal,
         name: str,
         channel: int,
-        images: Sequence[Any],
+        images: Sequence[ImageRows],
         file: ToFile,
     ) -> None:
         self._layout = layout
