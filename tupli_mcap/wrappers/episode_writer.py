@@ -201,8 +201,7 @@ class EpisodeWriter(Recorder):
             if entries:
                 stream.put_infos([entries])
             if not self._is_plain:
-                self._writer.flush_if_due()
-                self._writer.sync_step()
+                self._writer.after_steps()
         except StepError:
             work.state = DONE
             raise
@@ -247,8 +246,7 @@ class EpisodeWriter(Recorder):
         if n:
             with self._work:
                 stream.put_many(states, actions, rewards, *flags, entries)
-                self._writer.flush_if_due()
-                self._writer.sync_step()
+                self._writer.after_steps()
             if entries and stream.over is not None:
                 self._check_flag(self.path, entries[-1])
 
@@ -288,8 +286,7 @@ class EpisodeWriter(Recorder):
         _check_lengths(len(stops), "episode", final_states=final_states)
         with self._work:
             self._next(env).put_episodes(states, actions, rewards, *flags, stops, final_states)
-            self._writer.flush_if_due()
-            self._writer.sync_step()
+            self._writer.after_steps()
 
     def end(
         self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0

@@ -303,8 +303,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         state, _, terminal, timeout, _ = result
         if (terminal or timeout) and self.rotation.is_due(self._writer):
             self._rotate(state)
-        self._writer.flush_if_due()
-        self._writer.sync_step()
+        self._writer.after_steps()
 
     def _when_closed(self) -> None:
         if self._stepped:  # the episode was interrupted

@@ -178,8 +178,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     def _go_on(self, taken: Any, result: Any) -> None:
         """Flushes and syncs if that is due, and begins a new file if this one is full."""
-        self._writer.flush_if_due()
-        self._writer.sync_step()
+        self._writer.after_steps()
         if self.rotation.is_due(self._writer) and not self._recorder.is_running:
             self._rotate(result[0])
 

@@ -284,8 +284,7 @@ class RecordingWriter:
         total = total if type(total) is float else float(np.sum(total))
         now = time.time_ns() if time_ns is None else time_ns
         events.end(now, episode, end, length, total, final_state, final_row, metadata)
-        if self._flush_seconds is not None:
-            self.flush_if_due()
+        self._flush_if_due()
 
     def put_final_states(self, finals: Sequence[tuple[StartedEpisode, bytes]]) -> int:
         """Writes `/final_state` ahead of the step that ends the episodes; returns the first one's row."""
@@ -300,7 +299,12 @@ class RecordingWriter:
         self._events().extend(batch)
         self.next_episode += len(batch.starts)
 
-    def flush_if_due(self) -> None:
+    def after_steps(self) -> None:
+        """Flushes if that is due, and waits for the disk where durability of steps is asked for."""
+        self._flush_if_due()
+        self.sync_step()
+
+    def _flush_if_due(self) -> None:
         """Flushes if `flush_seconds` were asked for and have passed since the last flush."""
         seconds = self._flush_seconds
         if seconds is not None and time.monotonic() - self._flushed_at > seconds:
