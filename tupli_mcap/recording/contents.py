@@ -49,9 +49,8 @@ class Contents:
         schemas, channels: by id.
         attachments: by name, without the episode index.
         metadata_indexes: offsets of the metadata records.
-        table: the chunks (CHUNK_ROWS); those in `memory` have offsets from IN_MEMORY on.
-        memory: the bytes of rows that are in no chunk of the file.
-        tail: the same rows, as a writer takes them.
+        table: the chunks (CHUNK_ROWS); those in `tail` have offsets from IN_MEMORY on.
+        tail: the rows that are in no chunk of the file.
         index: the episode index.
         complete: the writer finished the file.
         data_end: the offset where the episode index begins; a writer that appends cuts the file there.
@@ -65,7 +64,6 @@ class Contents:
     attachments: dict[str, AttachmentIndex] = field(default_factory=dict)
     metadata_indexes: list[MetadataIndex] = field(default_factory=list)
     table: Array = field(default_factory=lambda: np.empty(0, CHUNK_ROWS))
-    memory: list[bytes] = field(default_factory=list)
     tail: list[Rows] = field(default_factory=list)
     index: EpisodeIndex = field(
         default_factory=lambda: EpisodeIndex(np.empty(0, EPISODE_ROWS), np.empty(0, CHUNK_ROWS), b"")

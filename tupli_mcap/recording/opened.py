@@ -134,9 +134,8 @@ class OpenedRecording:
         try:
             with memory_for(lambda: f"{self.name}: opening a file of {self._source.size} bytes"):
                 self._contents: Contents = read_contents(self._source)
-                self._store = ChunkStore(
-                    self._source, self._contents.table, self._contents.memory, cache_bytes
-                )
+                memory = [bytes(rows.data) for rows in self._contents.tail]
+                self._store = ChunkStore(self._source, self._contents.table, memory, cache_bytes)
                 self._prepare()
         except BaseException:
             self._source.close()

@@ -113,7 +113,6 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
         places[e.number] = row, time, -1 if final is None else final
     in_memory = [place for place in evidence.loaded.places if isinstance(place, Rows)]
     contents.tail = sorted([*in_memory, *made.rows()], key=lambda rows: (rows.channel, rows.first))
-    contents.memory = [bytes(rows.data) for rows in contents.tail]
     entries = sorted(piece.entry for pieces in evidence.pieces.values() for piece in pieces)
     in_file = [entry for entry in entries if entry[0] < IN_MEMORY]
     extra = [
