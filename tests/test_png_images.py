@@ -161,7 +161,7 @@ def encoded_rows(layout: StepLayout, pixels: Any) -> tuple[PngCodec, Any, Rows]:
     rows["#opcode"], rows["#length"] = 5, image.dtype.itemsize - 9
     rows["data"] = pixels
     codec = PngCodec(leaf, image)
-    return codec, rows, codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+    return codec, rows, codec.encode(even_rows(1, rows.tobytes(), rows))
 
 
 def test_a_chunk_of_other_pictures_is_a_format_error() -> None:
@@ -251,7 +251,7 @@ def test_a_stamp_comes_back_whatever_it_says() -> None:
     layout = StepLayout(spaces.Box(0, 255, (4, 5, 3), np.uint8), spaces.Discrete(2))
     codec, rows, _ = encoded_rows(layout, np.zeros((2, 4, 5, 3), np.uint8))
     rows["sec"], rows["nanosec"] = (1 << 31) - 1, (1 << 32) - 1  # more seconds together than 31 bits hold
-    encoded = codec.encode(even_rows(1, 0, rows.tobytes(), rows))
+    encoded = codec.encode(even_rows(1, rows.tobytes(), rows))
     found = np.frombuffer(codec.decode(bytes(encoded.data), 2), rows.dtype)
     for name in ("sec", "nanosec", "data"):
         assert np.array_equal(found[name], rows[name])

@@ -342,7 +342,7 @@ def test_a_chunk_that_holds_no_stacks_is_a_format_error() -> None:
     rows["#opcode"], rows["#length"] = 5, image.dtype.itemsize - 9
     frames = np.random.default_rng(0).integers(0, 256, (8, 4, 5)).astype(np.uint8)
     rows["data"] = [frames[i : i + 3] for i in range(6)]
-    raw = even_rows(1, 0, rows.tobytes(), rows)
+    raw = even_rows(1, rows.tobytes(), rows)
     encoded = codec.encode(raw)
     data = bytes(encoded.data)
     assert len(data) < len(raw.data) and bytes(codec.decode(data, 6)) == raw.data

@@ -251,10 +251,10 @@ class RowDeriver:
         self._episode, self._step, self._time = int(episodes[-1]), int(steps[-1]), int(times[-1])
 
 
-def even_rows(channel: int, first: int, data: Any, rows: Array) -> Rows:
-    """`Rows` of constant size: `rows` is the structured view of `data`."""
+def even_rows(channel: int, data: Any, rows: Array) -> Rows:
+    """`Rows` of constant size, at least one: `rows` is the structured view of `data`."""
     offsets = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.dtype.itemsize)
-    return Rows(channel, first, data, offsets, rows["#log_time"].astype(np.uint64))
+    return Rows(channel, int(rows["#sequence"][0]), data, offsets, rows["#log_time"].astype(np.uint64))
 
 
 class CommittedRecords(Committed[Rows]):

@@ -122,7 +122,7 @@ class Assembler:
             self.held += int(early.sum())
             for name in ("#log_time", "#publish_time"):
                 rows[name] = np.maximum(rows[name], latest)
-        self.add_chunk(even_rows(channel, first, data, rows))
+        self.add_chunk(even_rows(channel, data, rows))
 
     def add_messages(self, channel: int, messages: Iterable[tuple[int, bytes]]) -> None:
         """Adds messages (log_time, body) of any size, in chunks of the usual size."""
@@ -234,11 +234,11 @@ def _first_chunks(
 
 
 def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtype[Any] | None) -> Rows:
-    first = int(store.table[chunk]["first"])
     if dtype is not None:
-        return even_rows(channel, first, data, store.rows(chunk, dtype, keep=False))
+        return even_rows(channel, data, store.rows(chunk, dtype, keep=False))
     starts = store.records(chunk)[1][:, 0].tolist()
     times = [int.from_bytes(memoryview(data)[start + 15 : start + 23], "little") for start in starts]
+    first = int(store.table[chunk]["first"])
     return Rows(channel, first, data, np.array(starts, np.uint64), np.array(times, np.uint64))
 
 

@@ -248,10 +248,7 @@ def _take_log(
 
 def _take_tables(evidence: Evidence, channel: int, tables: Iterable[Array]) -> None:
     """Takes tables of completed rows."""
-    completed = [
-        even_rows(channel, int(rows["#sequence"][0]), rows.view(np.uint8).tobytes(), rows) for rows in tables
-    ]
-    evidence.add_rows(channel, completed)
+    evidence.add_rows(channel, [even_rows(channel, rows.view(np.uint8).tobytes(), rows) for rows in tables])
 
 
 class _Steps:

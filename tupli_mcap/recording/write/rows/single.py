@@ -212,4 +212,4 @@ class SingleRows:
         for first in range(0, len(rows), self._chunk):
             chunk = rows[first : first + self._chunk]
             part = data[first * size : first * size + chunk.nbytes]
-            self._file.add_chunk(even_rows(self._channel, int(chunk["#sequence"][0]), part, chunk))
+            self._file.add_chunk(even_rows(self._channel, part, chunk))
