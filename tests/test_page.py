@@ -19,6 +19,7 @@ import gymnasium as gym
 import httpx
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from pages import EVIL, browsing, carts, robot, serving_app
 from typer.testing import CliRunner
 
@@ -493,6 +494,36 @@ class TestOneFile:
                 assert "bad.mcap" in told(client, "/")["skipped"]
                 (tmp_path / "bad.mcap").unlink()
                 assert told(client, "/")["skipped"] == {}
+
+    @pytest.mark.parametrize("topic", ["/step", "/info", "/episode_start"])
+    def test_an_episode_is_shown_as_far_as_it_can_be_read(self, topic: str, tmp_path: Path) -> None:
+        path = tmp_path / "run.mcap"
+        env = gym.make("CartPole-v1")
+        with tupli_mcap.RecordEpisodes(env, path, step_callback=lambda step: {"speed": 3.0}) as recorder:
+            recorder.reset(seed=5, options={"low": -0.01})
+            recorder.step(0)
+        with path.open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None
+        (channel,) = (one.id for one in summary.channels.values() if one.topic == topic)
+        (chunk,) = (one for one in summary.chunk_indexes if channel in one.message_index_offsets)
+        data = bytearray(path.read_bytes())
+        data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 255
+        path.write_bytes(data)
+        with browsing(path) as address, httpx.Client(base_url=address) as client:
+            (uri,) = (one["id"] for one in told(client, "/episodes")["episodes"])
+            text, facts = client.get(f"/episode/{uri}").text, told(client, f"/episode/{uri}")
+            assert told(client, f"/episode/{uri}/step/0") == {
+                key: value for key, value in facts["step"].items() if key != "number"
+            }
+            assert ("Its steps cannot be read: the recording is damaged" in text) == (topic == "/step")
+            assert ("Its infos cannot be read: the recording is damaged" in text) == (topic == "/info")
+            assert ("Pole Angle" in text, "state" in facts["step"]) == (topic != "/step",) * 2
+            assert facts["step"]["info"] == ({} if topic == "/info" else {"info.speed": "3"})
+            assert facts["reset"]["seed"] == 5
+            assert facts["reset"]["options"] == (None if topic == "/episode_start" else {"low": -0.01})
+            key = told(client, "/")["datasets"][0]["key"]
+            assert ("Its steps cannot be read" in client.get(f"/dataset/{key}").text) == (topic == "/step")
 
 
 class TestNothingActs:

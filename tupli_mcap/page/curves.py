@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.messages.infos import parts_of
 from tupli_mcap.messages.topics import INFO
@@ -18,6 +19,8 @@ from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.spaces.leaves import Leaf
+
+_T = TypeVar("_T")
 
 SO_FAR: Final = "return so far"
 _POINTS: Final = 800  # most points of a track
@@ -62,27 +65,53 @@ class Curves:
 
 
 def curves_of(episode: Episode) -> Curves:
-    """Reads an episode, or the beginning of a long one."""
+    """Reads an episode, or the beginning of a long one. What is damaged has no tracks, and a note says so."""
     recording, layout = episode.recording, episode.recording.layout
     most = max(1, _READ_BYTES // step_bytes(layout, images=False))
     read = min(len(episode), most)
-    columns = recording.read_steps(episode.position, 0, read, ("states", "actions", "rewards"), images=False)
     tracks: list[Track] = []
     notes: list[str] = []
-    for field, leaf, column in number_columns(layout, columns):
+    fields = ("states", "actions", "rewards")
+    columns = readable(
+        "steps", lambda: recording.read_steps(episode.position, 0, read, fields, images=False), notes
+    )
+    for field, leaf, column in () if columns is None else number_columns(layout, columns):
         tracks += _tracks(field, leaf, recording.labels, column, notes)
         if field == "reward" and leaf.size == 1:
             with np.errstate(over="ignore", invalid="ignore"):  # returns beyond all floats are not drawn
                 so_far = drawable_numbers(column[:, 0].astype(np.float64).cumsum())
             tracks.append(_track("reward", SO_FAR, np.arange(read, dtype=np.float64), so_far))
-    tracks += _info_tracks(recording, episode, read, notes)
+    tracks += readable("infos", lambda: list(_info_tracks(recording, episode, read, notes)), notes) or ()
     if read < len(episode):
         notes.append(f"Of its {len(episode):,} steps, the first {read:,} are shown.")
     return Curves(tracks, read, notes)
 
 
+def readable(what: str, read: Callable[[], _T], notes: list[str]) -> _T | None:
+    """What `read` returns; None if that is damaged, which becomes one of the notes."""
+    try:
+        return read()
+    except FormatError:
+        notes.append(
+            f"Its {what} cannot be read: the recording is damaged. Save the rest: tupli-mcap recover"
+        )
+        return None
+
+
 def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
-    """The values at a step as texts, by field and name. A value that has a track has the track's name."""
+    """The values at a step as texts, by field and name. A value that has a track has the track's name. What is damaged
+    is left out."""
+    told = readable("steps", lambda: _step_values(episode, step), []) or {}
+    if _few_infos(episode.recording):
+        info = (readable("infos", lambda: episode.infos, []) or [None] * len(episode))[step] or {}
+        told["info"] = {
+            f"info.{name}": f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
+            for name, value in parts_of(info).items()
+        }
+    return told
+
+
+def _step_values(episode: Episode, step: int) -> dict[str, dict[str, str]]:
     recording, layout = episode.recording, episode.recording.layout
     columns = recording.read_steps(episode.position, step, step + 1, images=False)
     told = {
@@ -96,12 +125,6 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
             told["reward"][SO_FAR] = f"{np.asarray(rewards, np.float64).sum():.5g}"
     if columns.terminals[0] or columns.timeouts[0]:
         told["end"] = {"end": "terminal" if columns.terminals[0] else "timeout"}
-    if _few_infos(recording):
-        info = (episode.infos or [None] * len(episode))[step] or {}
-        told["info"] = {
-            f"info.{name}": f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
-            for name, value in parts_of(info).items()
-        }
     return told
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Request, Response
@@ -15,7 +15,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, page
-from tupli_mcap.page.curves import Curves, Track, curves_of, values_at
+from tupli_mcap.page.curves import Curves, Track, curves_of, readable, values_at
 from tupli_mcap.page.datasets import Dataset, dataset_of, of_recording, seen_in
 from tupli_mcap.page.pictures import Camera, cameras_of
 from tupli_mcap.page.shelf import Shelf, find_episode, opened, python_line
@@ -60,11 +60,7 @@ def episode(
     seen = look(shelf, header, step)
     facts = {
         **dict(header),
-        "reset": {
-            "seed": seen.episode.seed,
-            "options": seen.episode.options,
-            "info": seen.episode.reset_info,
-        },
+        "reset": _reset(seen.episode, header),
         "annotations": [
             {"by": note.by, "at": note.at, "values": note.values}
             for note in seen.episode.recording.annotations.of(header.episode)
@@ -88,6 +84,14 @@ def one_step(shelf: Shown, uri: str, step: int) -> Response:
     if not 0 <= step < len(shown):
         raise NotFoundError(f"expected a step from 0 to {len(shown) - 1}, found {step}")
     return Response(jsonvalue.dumps(values_at(shown, step)), media_type="application/json")
+
+
+def _reset(shown: Episode, header: EpisodeHeader) -> dict[str, Any]:
+    """What its reset was told and said; if that is damaged, only the seed that the header has."""
+    start = readable("reset", lambda: shown.start, [])
+    if start is None:
+        return {"seed": header.seed, "options": None, "info": {}}
+    return {"seed": shown.seed, "options": shown.options, "info": shown.reset_info}
 
 
 def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Episode) -> str:
