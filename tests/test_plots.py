@@ -313,7 +313,7 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
 
     path = scripted(tmp_path / "r.mcap", frame, spaces.Box(0, 255, (4, 5, 3), np.uint8), 10, length=10)
     ((_, trace),) = report(path).traces
-    (pictures,) = trace.pictures
+    (pictures,) = trace.pictures.values()
     shown = {title: int(picture[0, 0, 0]) for title, picture in pictures}
     assert shown == {
         "step 0": 0, "step 1": 5, "step 3": 15, "step 5": 25, "step 7": 35, "step 9": 45,
@@ -334,8 +334,8 @@ def test_recorded_frames_are_shown_beside_images_of_states(tmp_path: Path) -> No
         env = Filmed(lambda n, space=space: space.low, space, length=10)
         path = record(tmp_path / f"{i}.mcap", env, 10, frames=True, frame_format="png")
         ((_, trace),) = report(path).traces
-        frames, *images = trace.pictures
-        assert [title for title, _ in frames] == [f"frame, step {n}" for n in (0, 2, 4, 6, 8, 10)]
+        frames, *images = trace.pictures.values()
+        assert [title for title, _ in frames] == [f"step {n}" for n in (0, 2, 4, 6, 8, 10)]
         assert all(picture.shape == (8, 9, 3) and (picture == 20).all() for _, picture in frames)
         assert len(images) == 1 - i
 
@@ -352,7 +352,7 @@ def test_the_newest_frame_of_a_stack_is_shown(tmp_path: Path, shape: tuple[int, 
     space = spaces.Box(0, 255, (*shape, 4) if axis else (4, *shape), np.uint8)
     moved = gym.wrappers.TransformObservation(stack, lambda frames: np.moveaxis(frames, 0, axis), space)
     ((_, trace),) = report(record(tmp_path / "r.mcap", moved, 10)).traces
-    (pictures,) = trace.pictures
+    (pictures,) = trace.pictures.values()
     assert [(one.shape, int(one.flat[0])) for _, one in pictures[:-1]] == [
         (shape, n) for n in (0, 5, 15, 25, 35, 45)
     ]
@@ -422,6 +422,12 @@ def test_what_is_not_shown_is_noted(tmp_path: Path) -> None:
     assert "state.list is of variable size (Sequence) and not shown." in made.notes
     assert "state.none has no elements (shape (0, 3))." in made.notes
     assert set(made.notes) <= {text.replace("\n", " ") for text in texts(made)}
+
+
+def test_each_row_of_pictures_has_the_name_of_its_camera(tmp_path: Path) -> None:
+    made = report(record(tmp_path / "r.mcap", Sampler(NESTED, spaces.Discrete(2)), 40))
+    found = texts(made)
+    assert found.count("state.eye\nstep 0") == found.count("state.stack\nstep 0") == 1
 
 
 def test_names_and_labels_are_in_the_picture(tmp_path: Path) -> None:

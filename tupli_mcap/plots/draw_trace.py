@@ -34,11 +34,13 @@ def add_trace(page: Page, measured: Measured, trace: Trace, *, several: bool) ->
         f"Episode {trace.episode}{where}: {trace.length:,} step{'' if trace.length == 1 else 's'}, "
         f"return {trace.total:.6g}, {_ENDS[trace.end]}{seed}{env}"
     )
-    for pictures in trace.pictures:
+    for name, pictures in trace.pictures.items():
         height, width = pictures[-1][1].shape[:2]
         height = float(np.clip(_FRAME_WIDTH * height / width, 0.4, 1.6))
+        (first, frame), *others = pictures
         cells = [
-            Cell(partial(_draw_picture, *picture), height, right=0.06, left=0.06) for picture in pictures
+            Cell(partial(_draw_picture, *picture), height, right=0.06, left=0.06)
+            for picture in [(f"{cut(name, 60)}\n{first}", frame), *others]
         ]
         page.add(cells, 7, tight=True)
     if trace.length == 1:  # a panel of one point shows nothing more

@@ -244,8 +244,8 @@ class Trace(NamedTuple):
 
     values: leaf name -> (points, elements), float64, at the steps `at` (points); NaN for what cannot be drawn.
     infos: `info.key` -> (points), as well; only where all infos of the recording are read.
-    totals: the running return. pictures: some recorded frames, and some images of each leaf that holds them (H x W or
-    H x W x 1|3|4), with their titles.
+    totals: the running return. pictures: some recorded frames ("frame"), and some images of each leaf that holds them,
+    by its name (H x W or H x W x 1|3|4), with their titles.
     """
 
     episode: int
@@ -259,7 +259,7 @@ class Trace(NamedTuple):
     values: dict[str, Array]
     infos: dict[str, Array]
     totals: Array
-    pictures: list[list[tuple[str, Array]]]
+    pictures: dict[str, list[tuple[str, Array]]]
 
 
 def trace(recording: Recording, position: int, measured: Measured) -> Trace:
@@ -282,17 +282,18 @@ def trace(recording: Recording, position: int, measured: Measured) -> Trace:
     if measured.info_steps and measured.read_infos == measured.info_steps:
         said = [info or {} for info in recording.infos(position) or ()]
         infos = {name: values for _, name, values in drawable_infos(said)}
-    images = [
-        _pictures(recording, position, length, leaf.leaf)
+    pictures = {"frame": _frames(recording, position)}
+    pictures |= {
+        leaf.leaf.path: _pictures(recording, position, length, leaf.leaf)
         for leaf in measured.leaves
         if leaf.kind == "picture"
-    ]
+    }
     return Trace(
         int(row["episode"]), int(row["env"]), length, float(row["return"]), END_NAMES[row["end"]],
         recording.episode_start(position).seed_number, width, thinned(np.arange(steps)[:, None], width)[:, 0],
         values, {key: thinned(column[:steps, None], width)[:, 0] for key, column in infos.items()},
         thinned(totals[:, None], width)[:, 0],
-        list(filter(None, [_frames(recording, position), *images])),
+        {name: shown for name, shown in pictures.items() if shown},
     )  # fmt: skip
 
 
@@ -315,7 +316,7 @@ def _frames(recording: Recording, position: int) -> list[tuple[str, Array]]:
     """Recorded frames of an episode at even distances; none if none were recorded."""
     frames = recording.frames(position)
     chosen = np.unique(np.linspace(0, len(frames) - 1, _FRAMES).astype(np.int64)) if len(frames) else ()
-    return [(f"frame, step {frames.steps[i]}", frames[int(i)]) for i in chosen]
+    return [(f"step {frames.steps[i]}", frames[int(i)]) for i in chosen]
 
 
 def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> list[tuple[str, Array]]:
