@@ -1121,6 +1121,19 @@ def test_a_recording_beside_those_it_was_made_of_is_named(tmp_path: Path) -> Non
         assert len(tupli_mcap.open([tmp_path / "b.mcap", tmp_path / "trimmed.mcap"])) == 4
 
 
+def test_of_a_recording_and_its_filtered_copy_the_recording_is_named_as_the_source(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", 0, 3)
+    source = tupli_mcap.open(tmp_path / "a.mcap")
+    source[:2].save(tmp_path / "chosen.mcap")
+    source.trim(slice(0, 3), tmp_path / "trimmed.mcap")
+    names = [tmp_path / f"{name}.mcap" for name in ("a", "chosen", "trimmed")]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert len(tupli_mcap.open(names)) == 6
+    texts = [str(one.message) for one in said]
+    assert any(f"trimmed.mcap was made of {names[0]}, and both are here" in text for text in texts), texts
+
+
 def test_numbers_of_infos_keep_their_digits_in_tables(tmp_path: Path) -> None:
     with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:
         writer.begin()

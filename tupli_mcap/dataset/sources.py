@@ -166,13 +166,15 @@ class FilesSource:
         of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
         listed: dict[str, list[EpisodeHeader]] = {}  # by name
-        by_uuid: dict[str, str] = {}  # the names of recordings
+        by_uuid: dict[str, str] = {}  # the names of recordings; of copies, that of the largest, which counts
         made_of: dict[str, set[str]] = {}  # by name, the UUIDs of others
         for name, recording in self._each():
             if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
             listed[name] = list(episode_headers(recording, name, deleted_of(recording)))
-            by_uuid[recording.uuid] = name
+            by_uuid[recording.uuid] = max(
+                by_uuid.get(recording.uuid, name), name, key=lambda one: len(listed[one])
+            )
             made_of[name] = _made_of(recording)
         for name, uuids in made_of.items():
             if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
