@@ -19,6 +19,7 @@ _TRY_AGAIN = 1.0  # seconds between two looks for a viewer that is not there
 _PATIENCE = 0.5  # seconds for a viewer to take what it was sent
 _FAREWELL = 20.0  # the same for the rest, when the rollout is over: the recorder does not wait so long
 _STARTING = 20.0  # seconds for a viewer that we have started to answer
+_SILENCE = 3.0  # seconds after which what listens and has taken nothing is no viewer
 
 
 class RerunView:
@@ -38,6 +39,8 @@ class RerunView:
         self._url = target.url or f"rerun+http://{target.host}:{target.port}/proxy"
         self._stream: Any = None
         self._is_behind = False
+        self._connected = 0.0
+        self._has_taken = False  # steps, of this stream
         self._next_try = 0.0
         self._answers = False
         self._viewer: subprocess.Popen[bytes] | None = None
@@ -62,11 +65,13 @@ class RerunView:
             return True
         if self._stream is None:
             self._connect()
-        patience = _FAREWELL if follower.is_over else _PATIENCE
+        patience = _PATIENCE
+        if follower.is_over:
+            patience = _FAREWELL if self._has_taken else _SILENCE
         if self._is_behind and not self._caught_up(patience):
             return True
         self._panels.send(self._stream, follower)
-        self._caught_up(patience)
+        self._has_taken |= self._caught_up(patience)
         return True
 
     def go_on(self, path: Path) -> None:
@@ -98,6 +103,7 @@ class RerunView:
         self._stream.send_recording_name(self._title)
         panels.declare(self._stream)
         self._is_behind = True
+        self._connected, self._has_taken = time.monotonic(), False
 
     def _caught_up(self, patience: float) -> bool:
         """True if the viewer has taken everything. Until then, nothing more is sent to it."""
@@ -107,6 +113,11 @@ class RerunView:
             self._is_behind = True
             if "timed out" not in str(err) or not self._target.answers():
                 self._lose()
+            elif not self._has_taken and time.monotonic() > self._connected + _SILENCE:
+                self._say(
+                    f"what listens at {self._url} takes nothing, as if it were no Rerun viewer; name another port "
+                    "with live=, or end it"
+                )
             return False
         self._is_behind = False
         return True
