@@ -28,7 +28,7 @@ import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord, capture
-from tupli_mcap.errors import FormatError, StorageError, UntrustedError
+from tupli_mcap.errors import FormatError, RecordingError, StorageError, UntrustedError
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BenchmarkMetadata,
@@ -102,6 +102,16 @@ def test_the_command_deletes_on_a_server(admin: TupliAPIClient, tmp_path: Path) 
     refused = CliRunner().invoke(app, ["delete", admin.url, "--filter", "episode < 2"])
     assert (refused.exit_code, refused.output.count("no episode that matches")) == (1, 1)
     assert admin.count_episodes() == 10
+
+
+def test_episodes_of_a_server_cannot_be_annotated_there(admin: TupliAPIClient, tmp_path: Path) -> None:
+    pushed(admin, tmp_path / "lab")
+    dataset = tupli_mcap.open(admin)
+    for annotate in (dataset[0].annotate, dataset.head(1).annotate):
+        with pytest.raises(RecordingError, match="pull") as refused:
+            annotate(success=True)
+        assert str(refused.value).startswith(f"episode {dataset[0].id} cannot be changed here; download it")
+        assert "recordings/" not in str(refused.value)
 
 
 def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient, tmp_path: Path) -> None:
@@ -528,7 +538,7 @@ def test_publishing_own_episodes_of_somebody_else_s_benchmark(admin: TupliAPICli
 
 def test_nothing_is_hidden_from_a_group_that_sees_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     uri = pushed(admin, tmp_path / "lab")
-    admin.create_group(Group(name="robots"))
+    assert admin.create_group("robots") == Group(name="robots")
     for words in ([uri], ["--filter", "episode >= 0"]):
         for group, why in (
             ("robots", "of this, nothing that is yours is published in robots"),

@@ -92,7 +92,11 @@ class Recording(DescribedRecording, DatasetVerbs):
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
         if self.path is None:
-            raise RecordingError(f"{self.name} cannot be changed here; download it, and open the copy")
+            # a user knows an episode of a server by its id, not by the path of its recording there
+            what = f"episode {self.uuid}-{episodes[0]}" if episodes else self.name
+            raise RecordingError(
+                f"{what} cannot be changed here; download it (from a server: tupli-mcap pull), and open the copy"
+            )
         with Recording(self.path) as there:
             if there.uuid != self.uuid:
                 raise RecordingError(f"{self.path} is another recording now; open it again")
