@@ -58,9 +58,10 @@ class People:
 
     # --- groups ---
 
-    def create_group(self, group: Group) -> Group:
-        """Create a group with you as its admin."""
-        return as_told(Group, self._session.ask("POST", "/v1/groups", group.model_dump()))
+    def create_group(self, group: Group | str) -> Group:
+        """Create a group with you as its admin. `group`: a Group, or just its name."""
+        wanted = Group(name=group) if isinstance(group, str) else group
+        return as_told(Group, self._session.ask("POST", "/v1/groups", wanted.model_dump()))
 
     def list_groups(self) -> list[Group]:
         """The groups that you may see."""
