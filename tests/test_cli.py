@@ -1641,6 +1641,19 @@ class TestProgram:
                 width == 60 and args[0][:5] in ("list-", "episo")
             )
 
+    @pytest.mark.parametrize("width", [100, 110, 130])
+    def test_runs_keep_their_whole_names(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch, width: int
+    ) -> None:
+        for seed in (1, 2):
+            ok("record", "CartPole-v1", "-o", f"runs-of-cartpole/ppo-seed{seed}.mcap", "--seed", str(seed))
+            ok("tag", f"runs-of-cartpole/ppo-seed{seed}.mcap", "--episodes", "0", "success=true")
+        monkeypatch.setenv("COLUMNS", str(width))
+        title, *lines = ok("ls", "runs-of-cartpole").splitlines()
+        assert "STARTED" in title
+        for line, seed in zip(lines, (1, 2), strict=True):
+            assert f"  ppo-seed{seed}  " in line and not line.endswith("…")
+
     @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
     def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:
         pid, fd = pty.fork()

@@ -37,7 +37,7 @@ from tupli_mcap.cli.output import (
     short_value,
     when,
 )
-from tupli_mcap.cli.terminal import fail, is_roomy
+from tupli_mcap.cli.terminal import fail, is_roomy, is_wide
 from tupli_mcap.errors import bytes_of, did_you_mean
 from tupli_mcap.remote import is_server, is_url, path_of
 
@@ -257,18 +257,18 @@ def _setting(path: Sequence[str], item: ListedRecording) -> Any:
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
-    roomy = is_roomy()
+    roomy, wide = is_roomy(), is_wide()
     paths = {item.path for item in items}
     # whether the path of a run says which it is
     by_path = len(paths) == len(items) and all(item.name in item.path for item in items)
     shown = {
         "files": any(item.files > 1 for item in items),
         "run": roomy or not by_path,
-        "environment": roomy,
+        "environment": wide,
         "success": any(item.success is not None for item in items),
         "started": roomy,
-        "size": roomy or by_path,
-        "state": roomy or by_path or any(item.state != "complete" for item in items),
+        "size": wide or (by_path and not roomy),
+        "state": wide or (by_path and not roomy) or any(item.state != "complete" for item in items),
     }
     return [_COLUMNS[name] for name in _IN_TABLE if shown.get(name, True)]
 

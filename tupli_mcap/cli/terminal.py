@@ -20,7 +20,7 @@ from typing import TextIO
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _UNUSUAL = re.compile(r"[^\n -~]")
-_ROOMY = 100  # columns
+_ROOMY, _WIDE = 100, 130  # columns
 _hide_bar: Callable[[], None] | None = None
 
 
@@ -104,6 +104,11 @@ def terminal_width() -> int | None:
 def is_roomy() -> bool:
     """Whether a table has room for more columns than the most important ones."""
     return (terminal_width() or _ROOMY) >= _ROOMY
+
+
+def is_wide() -> bool:
+    """Whether a table of many columns has room for all of them."""
+    return (terminal_width() or _WIDE) >= _WIDE
 
 
 def _write(stream: TextIO, text: str) -> None:
