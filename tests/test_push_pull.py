@@ -278,6 +278,16 @@ def test_push_says_how_to_publish(
     assert run("push", tmp_path / "3.mcap", "--url", admin.url).endswith(f" --url {admin.url}\n")
 
 
+def test_publishing_nothing_is_an_error(admin: TupliAPIClient, tmp_path: Path) -> None:
+    run("publish", pushed(admin, tmp_path / "lab"))
+    bob = signed_in(admin, "bob")
+    for filter_text in ("return > 5000", "episode >= 0"):  # Bob has none
+        for dry in ([], ["--dry-run"]):
+            refused = CliRunner().invoke(app, ["publish", "--filter", filter_text, *dry])
+            assert (refused.exit_code, "no episode of yours matches" in refused.stderr) == (1, True)
+    assert bob.count_episodes(F("created_by") == "bob") == 0
+
+
 def test_publish_only_the_episodes_that_match(admin: TupliAPIClient, tmp_path: Path) -> None:
     uri = fill(tmp_path / "lab")
     run("push", tmp_path / "lab")

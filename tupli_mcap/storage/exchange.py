@@ -296,7 +296,7 @@ def publish_benchmark(
         client.publish_benchmark(uri, group)
     if is_own:
         _publish_artifacts(client, benchmark, group, dry_run=dry_run)
-    return Published(publish_own(client, group, of_it, dry_run=dry_run), is_own)
+    return Published(_show(client, group, of_it, dry_run=dry_run), is_own)
 
 
 def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str, *, dry_run: bool) -> None:
@@ -317,7 +317,15 @@ def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str,
 
 
 def publish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
-    """Makes the caller's episodes that match a filter visible to a group; returns their number."""
+    """Makes the caller's episodes that match a filter visible to a group; returns their number.
+    StorageError if there are none."""
+    episodes = _show(client, group, chosen, dry_run=dry_run)
+    if not episodes:
+        raise StorageError("no episode of yours matches; what others recorded, only they can publish")
+    return episodes
+
+
+def _show(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool) -> int:
     own = _own(client, chosen)
     if dry_run:
         _check_group(client, group)
