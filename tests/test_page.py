@@ -495,6 +495,21 @@ class TestOneFile:
                 (tmp_path / "bad.mcap").unlink()
                 assert told(client, "/")["skipped"] == {}
 
+    @pytest.mark.parametrize("known", [1, 3])
+    def test_of_how_many_episodes_the_success_is_known(self, known: int, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=1, episodes=3)
+        path = tmp_path / "ppo0.mcap"
+        for episode in tupli_mcap.open(path)[:known]:
+            episode.annotate(success=True)
+        with browsing(path) as address, httpx.Client(base_url=address) as client:
+            key = told(client, "/")["datasets"][0]["key"]
+            whole, said = (
+                client.get(f"/dataset/{key}").text,
+                "1 in every episode" if known == 3 else "1 in 1 episode",
+            )
+            assert f"<b>Success</b> {said}<" in whole
+            assert ("100% of 1" in whole, "100% of 1" in client.get("/").text) == (known == 1,) * 2
+
     @pytest.mark.parametrize("topic", ["/step", "/info", "/episode_start"])
     def test_an_episode_is_shown_as_far_as_it_can_be_read(self, topic: str, tmp_path: Path) -> None:
         path = tmp_path / "run.mcap"

@@ -36,9 +36,9 @@ def names(given: Sequence[str]) -> str:
     return f"{', '.join(given[:3])} and {len(given) - 3} more"
 
 
-def percent(part: int, whole: int) -> str:
-    """A share such as `40%`; a dash if the whole is 0."""
-    return f"{100 * part / whole:.0f}%" if whole else "–"
+def percent(part: int, known: int, of: int) -> str:
+    """A share of the episodes of which it is known, such as `40%`, or `40% of 5` if there are more episodes."""
+    return f"{100 * part / known:.0f}%{'' if known == of else f' of {known:,}'}"
 
 
 def iso(ns: int) -> str:

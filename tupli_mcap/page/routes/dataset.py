@@ -12,7 +12,7 @@ from markupsafe import Markup
 from sqlalchemy import Connection
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import TupliError, plural
 from tupli_mcap.page import charts, texts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_recording, seen_in
@@ -121,7 +121,8 @@ def _ends(values: Array) -> str:
 
 
 class Chart(NamedTuple):
-    """A number of episodes over time, and its distribution; instead, `alike` is the value that all episodes have."""
+    """A number of episodes over time, and its distribution; instead, `alike` says which value all episodes have
+    of which it is known, and how many these are."""
 
     title: str
     over_time: Markup = Markup("")
@@ -139,7 +140,8 @@ def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[
         drawable = np.where(np.isfinite(values), values, np.nan)
         known = drawable[np.isfinite(drawable)]
         if len(known) and known.min() == known.max():
-            yield Chart(title, alike=texts.number(float(known[0])))
+            which = "every episode" if len(known) == len(values) else plural(len(known), "episode")
+            yield Chart(title, alike=f"{texts.number(float(known[0]))} in {which}")
         elif len(known):
             what = f"{title} of episodes over time"
             drawn = (
