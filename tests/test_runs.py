@@ -966,6 +966,19 @@ class TestCommands:
         command(verb, str(paths[0]), str(paths[3]), *rest, *dry)
         assert (paths[0].read_bytes() == before["a.mcap"]) == bool(dry)
 
+    def test_a_recording_is_named_as_it_was_given(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = record(tmp_path / "a.mcap")
+        monkeypatch.chdir(tmp_path)
+        words = ["tag", "a.mcap", "--episodes", "0", "good=true"]
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a"):
+            refused = CliRunner().invoke(app, words)
+        assert refused.stderr.startswith("error: a.mcap is being recorded by another writer")
+        path.write_bytes(path.read_bytes()[:-300])
+        refused = CliRunner().invoke(app, words)
+        assert refused.stderr.splitlines()[-1].startswith("error: a.mcap is not finished")
+
     @pytest.mark.parametrize("dry", [(), ("--dry-run",)])
     def test_what_may_not_be_written_is_said_first(self, dry: tuple[str, ...], tmp_path: Path) -> None:
         path, locked, closed = (record(tmp_path / name / "r.mcap") for name in ("a", "b", "c"))

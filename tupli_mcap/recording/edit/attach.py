@@ -44,7 +44,8 @@ def held(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     RecordingError if there is no file, or another writer holds the lock for longer than a moment.
     """
-    place = Path(os.path.realpath(path))  # the file that a symbolic link names is replaced, not the link
+    # the file that a symbolic link names is replaced, not the link; any other path stays as given, for messages
+    place = Path(os.path.realpath(path) if os.path.islink(path) else path)  # noqa: PTH114
     if not place.exists():
         raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)")
     lock = FileLock(place, "a")

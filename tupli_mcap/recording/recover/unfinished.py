@@ -233,7 +233,7 @@ def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str
     elif "journal" in metadata:
         what = f"its journal was {expected}: bring that back"
     else:
-        what = "keep the two files together"
+        what = "keep the two files together, or fetch the recording again if it was cut off"
     return (
         f"{source.name} was not finished and has no journal {expected.name} beside it: steps not "
         f"yet in a chunk cannot be recovered; {what}"
