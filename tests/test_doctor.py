@@ -237,6 +237,11 @@ def test_outside_of_the_space(
     assert examine(good_path).of("outside-space") == ()
 
 
+def test_the_letters_of_a_space_are_counted(tmp_path: Path) -> None:
+    path = scripted(tmp_path / "bad.mcap", lambda n: "äa", spaces.Text(10, min_length=0))
+    assert "outside of Text(0..10, 62 characters)" in found(examine(path), "outside-space").message
+
+
 def test_choices_beyond_all_integers(tmp_path: Path) -> None:
     huge = spaces.Discrete(2**62 + 5, start=2**62)
     path = scripted(

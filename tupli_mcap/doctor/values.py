@@ -15,6 +15,7 @@ from tupli_mcap.doctor.measurements import Measurements, Statistic, StepPlace, v
 from tupli_mcap.errors import plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
+from tupli_mcap.recording.describe.description import describe_space
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import ElementStatistics, columns_of
 
@@ -192,7 +193,7 @@ def outside_space(measured: Measurements) -> Iterator[Finding]:
         leaf, mask = values.leaf, values.counts["outside"] > 0
         if not mask.any():
             continue
-        what, elements = f"outside of {leaf.space!r:.80}", values.of_elements
+        what, elements = f"outside of {describe_space(leaf.space):.80}", values.of_elements
         if elements is not None:
             least, most = elements.least[mask].min(), elements.most[mask].max()
             low, high = elements.low[mask].min(), elements.high[mask].max()
