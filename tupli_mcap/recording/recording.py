@@ -401,7 +401,8 @@ class Recording(DescribedRecording, DatasetVerbs):
     def plot(self, **options: Any) -> Any:
         """A `tupli_mcap.plots.Report`: returns, lengths, success, states, actions and one episode.
 
-        `options` are those of `tupli_mcap.plots.report`. A notebook shows it; `.save(path)` writes it.
+        A notebook shows it; `.plot().save("report.png")` writes it. `options` are those of `tupli_mcap.plots.report`:
+        `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
 
         Raises:
             MissingExtraError: matplotlib (the extra `plot`) is not installed.
