@@ -46,7 +46,7 @@ from tupli_mcap.plots.draw_values import LEVELS, most_varying, quantiles
 from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
-from tupli_mcap.plots.style import BLUE
+from tupli_mcap.plots.style import BLUE, Page
 from tupli_mcap.recording import edit_run
 from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.recording.describe.series import sketch
@@ -68,16 +68,26 @@ def scripted(
     return record(path, Scripted(observe, space, **options), steps)
 
 
-@pytest.fixture
-def cartpole(tmp_path: Path) -> Path:
-    return record(tmp_path / "cartpole.mcap", gym.make("CartPole-v1"), 400)
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    """Few panels: quickly drawn."""
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """By name, a recording of many steps, and one of few panels, which is quickly drawn."""
+    parent = tmp_path_factory.mktemp("recorded")
     space = spaces.Box(-99, 99, (1,), np.float32)
-    return scripted(tmp_path / "tiny.mcap", lambda n: np.float32([n]), space, 55, length=10)
+    record(parent / "cartpole.mcap", gym.make("CartPole-v1"), 400)
+    scripted(parent / "tiny.mcap", lambda n: np.float32([n]), space, 55, length=10)
+    return {path.name: path.read_bytes() for path in parent.iterdir()}
+
+
+@pytest.fixture
+def cartpole(recorded: dict[str, bytes], tmp_path: Path) -> Path:
+    (tmp_path / "cartpole.mcap").write_bytes(recorded["cartpole.mcap"])
+    return tmp_path / "cartpole.mcap"
+
+
+@pytest.fixture
+def tiny(recorded: dict[str, bytes], tmp_path: Path) -> Path:
+    (tmp_path / "tiny.mcap").write_bytes(recorded["tiny.mcap"])
+    return tmp_path / "tiny.mcap"
 
 
 def measured(path: Path) -> Measured:
@@ -297,9 +307,11 @@ def test_a_long_episode_keeps_its_extremes(tmp_path: Path, monkeypatch: pytest.M
         317,
         length=999,
     )
-    ((_, trace),) = report(path).traces
+    made = report(path)
+    ((_, trace),) = made.traces
     states = values[:317]
     assert trace.thinned == 32
+    assert "step; smallest and largest of every 32 steps" in texts(made)
     assert len(trace.at) == len(trace.totals) == len(trace.values["state"]) == 20
     parts = [states[k : k + 32] for k in range(0, 317, 32)]
     np.testing.assert_array_equal(trace.values["state"][::2, 0], [part.min() for part in parts])
@@ -412,7 +424,7 @@ def test_every_kind_of_space_is_drawn_without_a_warning(tmp_path: Path, kind: st
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "Blackjack-v1"])
 def test_real_environments_are_drawn(tmp_path: Path, env_id: str) -> None:
-    check_formats(report(record(tmp_path / "r.mcap", gym.make(env_id), 300)), tmp_path)
+    check_formats(report(record(tmp_path / "r.mcap", gym.make(env_id), 300)), tmp_path, page=False)
 
 
 def test_what_is_not_shown_is_noted(tmp_path: Path) -> None:
@@ -506,6 +518,7 @@ def test_returns_that_are_nan_are_counted(
     made = report(tmp_path / "r.mcap")
     assert dict(made.facts).get("return") == told
     assert [text for text in made.notes if text.startswith("return: ")] == note
+    assert made.figure
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 7])
@@ -541,11 +554,11 @@ def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     assert dict(seedless.facts)["seeds"] == "none known"
 
 
-def test_a_recording_that_is_open(cartpole: Path) -> None:
-    with Recording(cartpole) as recording:
-        made = recording.plot(episode=3, episode_filter=F("n_tuples") > 10)
+def test_a_recording_that_is_open(tiny: Path) -> None:
+    with Recording(tiny) as recording:
+        made = recording.plot(episode=3, episode_filter=F("n_tuples") > 9)
         assert recording.episodes[3].states is not None  # still open
-        assert len(made.measured[0].rows) == int((recording.index["length"] > 10).sum())
+        assert len(made.measured[0].rows) == int((recording.index["length"] > 9).sum()) == 5
     assert [trace.episode for _, trace in made.traces] == [3]
     assert made._repr_png_().startswith(b"\x89PNG")
     assert made._repr_html_().startswith('<div class="tupli-report">')
@@ -987,12 +1000,26 @@ def test_a_dataset_is_plotted(tmp_path: Path) -> None:
 # --- files ---
 
 
+def test_a_picture_is_drawn_once_and_only_if_asked_for(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Page] = []
+    draw = Page.draw
+    monkeypatch.setattr(Page, "draw", lambda page: drawn.append(page) or draw(page))
+    made = report(tiny)
+    assert dict(made.facts) and not drawn
+    made.html()
+    assert len(drawn) == 1
+    assert made.figure is made.figure
+    made.figure.axes[0].set_visible(False)
+    assert made.svg() != report(tiny).svg()  # what a user has changed
+    assert len(drawn) == 3
+
 def test_the_same_recording_gives_the_same_bytes(tiny: Path) -> None:
     first, second = report(tiny), report(tiny)
     drawn = first.svg()
     assert drawn == second.svg() == first.svg() and drawn.startswith(b"<?xml")
     assert first.html() == second.html()
-    assert first.pdf() == second.pdf() and first.pdf().startswith(b"%PDF-")
+    pages = first.pdf(), second.pdf()
+    assert pages[0] == pages[1] and pages[0].startswith(b"%PDF-")
 
 
 HOSTILE = "</svg><script>alert(1)</script><img src=x onerror=alert(2)>\"'&$\\frac{--><!--\u202e"

@@ -204,7 +204,7 @@ def operations(path: Path, work: Path) -> Iterator[tuple[str, Callable[[], Any]]
     )
     yield "import", lambda: _import(path, work / "lab")
     yield "view", lambda: viewer.save(path, work / f"{name}.rrd", overwrite=True)
-    yield "plot", lambda: plots.report(path)
+    yield "plot", lambda: plots.report(path).figure
     yield "render", lambda: render(path, work / f"rendered_{name}", overwrite=True)
     yield "layout", lambda: write_layout(path, work / f"{name}.json", overwrite=True)
     for command in ("info", "ls", "episodes", "verify", "doctor"):

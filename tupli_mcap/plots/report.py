@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -91,7 +92,7 @@ def report(
 class Report:
     """A page of pictures.
 
-    figure: the matplotlib figure, which you may change, or save in other ways. measured: its numbers, by recording.
+    measured: its numbers, by recording.
     groups: each has a colour of its own: a recording, or runs that differ only by their seeds.
     traces: the episodes that are shown step by step, each with its recording.
     notes: sentences on what is not shown, and what is a sample.
@@ -107,8 +108,12 @@ class Report:
         self.traces = list(traces)
         self._x: X = x or ("episodes" if len(measured) == 1 else "steps")
         self.notes = [*notes, *(shown_numbers(self.groups)[1]), *texts.notes_of(measured)]
+
+    @cached_property
+    def figure(self) -> Any:
+        """The matplotlib figure, which you may change, or save in other ways; drawn when it is first asked for."""
         with styled():
-            self.figure: Any = self._draw(whole=True)
+            return self._draw(whole=True)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write a .png, .svg, .pdf or .html file, whole or not at all; the same report gives the same bytes.
