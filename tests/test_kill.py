@@ -46,7 +46,7 @@ def _chains() -> list[tuple[str, list[str]]]:
     return chains
 
 
-@pytest.mark.sampled(16)
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize(("kind", "moments"), _chains())
 def test_a_killed_process_loses_no_finished_step(tmp_path: Path, kind: str, moments: list[str]) -> None:
     for death in lives(kind, moments, 7, tmp_path):

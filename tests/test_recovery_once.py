@@ -48,7 +48,7 @@ def test_of_an_unfinished_one_that_was_cut_off(name: str, tmp_path: Path) -> Non
     assert differences(path, tmp_path) == []
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("durability", ["step", "os"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_after_a_power_loss(kind: str, durability: str, tmp_path: Path) -> None:

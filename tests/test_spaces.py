@@ -242,7 +242,7 @@ def test_copies_gymnasium_would_make_are_counted():
         space_from_json(obj)
 
 
-@pytest.mark.sampled(10)
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("space", [*FUNDAMENTAL_SPACES[::3], *COMPOSITE_SPACES], ids=space_id)
 @given(data=st.data())
 def test_a_damaged_object_is_a_space_or_a_format_error(space, data):

@@ -368,7 +368,7 @@ def test_truncation_anywhere_is_a_format_error(space):
             field.decode(memoryview(data)[:end], 4, 4)
 
 
-@pytest.mark.sampled(20)
+@pytest.mark.sampled(10)
 @pytest.mark.parametrize("space", FIELDS, ids=space_id)
 @settings(max_examples=25)
 @given(data=st.data())
