@@ -1013,6 +1013,7 @@ def test_a_picture_is_drawn_once_and_only_if_asked_for(tiny: Path, monkeypatch: 
     assert made.svg() != report(tiny).svg()  # what a user has changed
     assert len(drawn) == 3
 
+
 def test_the_same_recording_gives_the_same_bytes(tiny: Path) -> None:
     first, second = report(tiny), report(tiny)
     drawn = first.svg()
