@@ -19,7 +19,15 @@ import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import merge_recordings, say_made_of, verify_recording
+from tupli_mcap.recording import (
+    merge_recordings,
+    recover_recording,
+    rewrite_recording,
+    say_made_of,
+    split_recording,
+    verify_recording,
+    write_recording,
+)
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
@@ -251,9 +259,27 @@ def test_a_name_or_a_field_that_is_missing_is_named(tmp_path: Path) -> None:
     dataset = tupli_mcap.open(record(tmp_path / "r.mcap", 1))
     with pytest.raises(RecordingError, match=r"found a dict of actions; pass fields=\['actions'\]"):
         dataset.map(lambda episode: {"actions": episode.actions}, tmp_path / "new.mcap")
-    for verb in (dataset.save, lambda path: dataset.map(lambda episode: episode.rewards, path)):
-        with pytest.raises(DatasetError, match=r"expected a name that ends in \.mcap, found .*good; add it"):
+    source = tmp_path / "r.mcap"
+    for verb in (
+        dataset.save,
+        lambda path: dataset.map(lambda episode: episode.rewards, path),
+        lambda path: dataset.trim(slice(1, None), path),
+        lambda path: merge_recordings([source], path),
+        lambda path: split_recording(source, path, episodes=1),
+        lambda path: recover_recording(source, path),
+        lambda path: rewrite_recording(Recording(source), path),
+        lambda path: write_recording(
+            path,
+            [],
+            observation_space=dataset[0].recording.observation_space,
+            action_space=spaces.Discrete(2),
+        ),
+    ):
+        with pytest.raises(
+            RecordingError, match=r"expected a name that ends in \.mcap, found .*good; add \.mcap"
+        ):
             verb(tmp_path / "good")
+        assert not (tmp_path / "good").exists()
 
 
 def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:

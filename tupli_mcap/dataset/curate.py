@@ -35,6 +35,7 @@ from tupli_mcap.recording.edit.relabel import relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.recording.recover.evidence import metadata_at
+from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.listing import recordings_at
@@ -222,11 +223,10 @@ def _excerpts(dataset: Episodes) -> list[Excerpt]:
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
-    """The path of a new file; raises DatasetError if it is a directory, or a name that no directory is searched for."""
+    """The path of a new file. DatasetError if it is a directory, RecordingError if its name does not end in .mcap."""
     if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
         raise DatasetError(f"{os.fspath(place)} is a directory; give the path of a file (.mcap)")
-    if Path(place).suffix != ".mcap":
-        raise DatasetError(f"expected a name that ends in .mcap, found {os.fspath(place)}; add it")
+    check_name(place)
     return Path(place)
 
 

@@ -37,6 +37,7 @@ from tupli_mcap.recording.edit.rewrite import (
 )
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, common_labels
 
 _MOST_TURNS = 100
@@ -112,6 +113,7 @@ def merge_recordings(
         FormatError: one is damaged.
     """
     target = Path(target)
+    check_name(target)
     if isinstance(sources, str | os.PathLike) or not isinstance(sources, Iterable):
         raise RecordingError(f"expected a list of recordings to merge, found {sources!r:.80}")
     with contextlib.ExitStack() as stack:

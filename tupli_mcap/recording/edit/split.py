@@ -16,6 +16,7 @@ from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.rewrite import new_metadata, say_made_of, write
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
+from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.recording.write.rotation import series
 
 
@@ -66,6 +67,7 @@ def split_recording(
             f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
         )
     target = Path(target)
+    check_name(target)
     with Recording(source) as recording:
         rows = recording.index if positions is None else recording.index[positions(recording)]
         groups = _groups(recording, rows, episodes, max_bytes)

@@ -166,6 +166,15 @@ def _check_directory(place: str | os.PathLike[str] | None) -> None:
         raise RecordingError(f"{expected}: {os_reason(err)}") from err
 
 
+def check_name(path: str | os.PathLike[str], *, or_directory: bool = False) -> None:
+    """Raises RecordingError unless a new recording may have this name: with another one, no directory would show it."""
+    if Path(path).suffix != ".mcap":
+        also, then = (", or a directory", f", or {os.sep} for a directory") if or_directory else ("", "")
+        raise RecordingError(
+            f"expected a name that ends in .mcap{also}, found {os.fspath(path)}; add .mcap{then}"
+        )
+
+
 def check_place(path: str | os.PathLike[str]) -> None:
     """Raises RecordingError unless a recording can be written at `path`, as it was given, and now: as a `Path` a URL no
     longer looks like one."""

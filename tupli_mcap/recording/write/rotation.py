@@ -22,7 +22,7 @@ from tupli_mcap.errors import FormatError, RecordingError, asking, os_reason
 from tupli_mcap.files import as_file_name
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.write.options import Mode, RecordOptions, check_place
+from tupli_mcap.recording.write.options import Mode, RecordOptions, check_name, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_in_place
 
 _NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
@@ -63,8 +63,8 @@ class Rotation:
         check_place(path)
         self._name = as_file_name(name) or "run"
         self._folder = Path(path) if _is_folder(path) else None
-        if self._folder is None and not (options.mode == "a" and os.path.lexists(path)):
-            _check_name(path)
+        if self._folder is None and not os.path.lexists(path):
+            check_name(path, or_directory=True)
         self._options, self._format_version = options, format_version
         self._max_bytes, self._max_seconds = options.max_bytes, options.max_seconds
         if options.has_limits:  # the program may change its directory before the next file
@@ -184,14 +184,6 @@ def _is_folder(path: str | os.PathLike[str]) -> bool:
         return not Path(path).suffix and not os.path.lexists(path)
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
-
-
-def _check_name(path: str | os.PathLike[str]) -> None:
-    if Path(path).suffix != ".mcap":
-        raise RecordingError(
-            f"expected a name that ends in .mcap, or a directory, found {os.fspath(path)}; "
-            f"add .mcap, or {os.sep} for a directory"
-        )
 
 
 def _make_folders(path: Path) -> list[Path]:

@@ -32,7 +32,7 @@ from tupli_mcap.recording.recover.episodes import Plan, losses, make_plan
 from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
 from tupli_mcap.recording.recover.from_journal import add_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.recording.write.options import RecordOptions, check_name
 from tupli_mcap.recording.write.writer import finish_in_place
 
 
@@ -152,6 +152,7 @@ def recover_recording(
     """
     path = Path(source)
     goal = recovered_path(path) if target is None else Path(target)
+    check_name(goal)
     try:
         _check(path, goal, overwrite=overwrite, dry_run=dry_run)
     except OSError as err:
