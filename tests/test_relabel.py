@@ -22,11 +22,9 @@ from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import (
     merge_recordings,
     recover_recording,
-    rewrite_recording,
     say_made_of,
     split_recording,
     verify_recording,
-    write_recording,
 )
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.relabel import relabel_excerpts
@@ -267,13 +265,6 @@ def test_a_name_or_a_field_that_is_missing_is_named(tmp_path: Path) -> None:
         lambda path: merge_recordings([source], path),
         lambda path: split_recording(source, path, episodes=1),
         lambda path: recover_recording(source, path),
-        lambda path: rewrite_recording(Recording(source), path),
-        lambda path: write_recording(
-            path,
-            [],
-            observation_space=dataset[0].recording.observation_space,
-            action_space=spaces.Discrete(2),
-        ),
     ):
         with pytest.raises(
             RecordingError, match=r"expected a name that ends in \.mcap, found .*good; add \.mcap"

@@ -466,8 +466,8 @@ def _an_older_attachment(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The environment is in the file twice: the summary lists the signed one only."""
     real = Container.start
 
-    def start(self: Container, library: str) -> None:
-        real(self, library)
+    def start(self: Container) -> None:
+        real(self)
         self.add_attachment("benchmark.json", "application/json", b"{}", 0)
         self.attachment_indexes.clear()
 

@@ -32,7 +32,6 @@ from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Tr
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
-from tupli_mcap.recording.write.options import check_name
 
 
 def rewrite_recording(
@@ -61,7 +60,6 @@ def rewrite_recording(
         FormatError: the source is damaged.
     """
     target = Path(target)
-    check_name(target)
     metadata = kept_metadata(source)
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id

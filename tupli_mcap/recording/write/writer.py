@@ -31,7 +31,7 @@ from tupli_mcap.recording.contents import RECORDING_METADATA, first_metadata
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts, plain_reset
-from tupli_mcap.recording.write.options import RecordOptions, check_name, check_place
+from tupli_mcap.recording.write.options import RecordOptions, check_place
 from tupli_mcap.recording.write.place import RecordingPlace
 from tupli_mcap.recording.write.rows.contract import BatchStore, StepStore
 from tupli_mcap.recording.write.rows.stores import Stores, plan_areas
@@ -54,8 +54,6 @@ class RecordingWriter:
         keep_empty: bool = False,
     ) -> None:
         check_place(path)
-        if not os.path.lexists(path):
-            check_name(path)
         self.path = Path(path)
         self.place = RecordingPlace(path, options.journal_dir)
         self.options, self.format_version, self._keep_empty = options, format_version, keep_empty
