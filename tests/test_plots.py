@@ -47,7 +47,7 @@ from tupli_mcap.plots.groups import groups_of
 from tupli_mcap.plots.measure import measure
 from tupli_mcap.plots.statistics import bands, bin_edges, drawable_numbers, mean_interval, running_mean
 from tupli_mcap.plots.style import BLUE, Page
-from tupli_mcap.recording import edit_run
+from tupli_mcap.recording import edit_runs
 from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.recording.describe.series import sketch
 from tupli_mcap.schema.times import local_text
@@ -711,7 +711,7 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     np.testing.assert_array_equal(one.numbers["metadata.score"], [9.5, np.nan, 4, np.nan])
     np.testing.assert_array_equal(one.numbers["info.distance"], [1, 1.5, 2, 2.5])
     assert dict(made.facts)["success"] == "50%"
-    edit_run(path, name="ppo", metadata={"lr": 0.1, "algo": "p$o"}, split="eval")
+    edit_runs(path, name="ppo", metadata={"lr": 0.1, "algo": "p$o"}, split="eval")
     facts = dict(report(path).facts)
     assert (facts["run"], facts["settings"]) == ("ppo (eval)", "lr=0.1, algo=p$o")
     np.testing.assert_array_equal(panel(made, "success rate").lines[0].get_ydata(), [1, 0, 1, 0])

@@ -41,7 +41,7 @@ from tupli_mcap.errors import FilterError, SpaceError
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.recording import (
     annotate_episodes,
-    edit_run,
+    edit_runs,
     merge_recordings,
     rewrite_recording,
     undo_annotation,
@@ -287,8 +287,6 @@ class TestRun:
         assert [episode.run.name for episode in some.episodes] == ["worker-0", "worker-1", "worker-2"]
         assert [episode.metadata for episode in some.episodes] == [{}, {"success": True}, {}]
         assert len(tupli_mcap.open(tmp_path / "some.mcap").filter("run.name = 'worker-2'")) == 1
-        with pytest.raises(RecordingError, match="3 runs"):
-            edit_run(tmp_path / "all.mcap", name="x")
         assert verify_recording(tmp_path / "some.mcap").ok
 
     def test_of_the_episodes_that_ls_chooses(self, tmp_path: Path) -> None:
@@ -316,9 +314,9 @@ class TestRun:
     def test_can_be_edited(self, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap", metadata={"lr": 1, "old": 2})
         before = Recording(path)
-        edit_run(path, name="dry", dry_run=True)
+        edit_runs(path, name="dry", dry_run=True)
         assert Recording(path).run == before.run
-        edit_run(path, name="better", metadata={"lr": 2, "old": None}, tags=["x"], split="eval")
+        edit_runs(path, name="better", metadata={"lr": 2, "old": None}, tags=["x"], split="eval")
         after = Recording(path)
         assert (after.run.name, after.run.metadata, after.run.tags, after.run.split) == (
             "better", {"lr": 2}, ("x",), "eval",
@@ -334,7 +332,8 @@ class TestRun:
     @pytest.mark.parametrize(
         "data",
         [b"{", b"[]", b'{"runs": []}', b'{"runs": [3]}', b'{"runs": [{"name": 3}]}', b'{"runs": [{"tags": "a"}]}',
-         b'{"runs": [{}], "spans": [[1, 1]]}', b'{"runs": [{}], "spans": [[true, 0]]}', b"\xff"],
+         b'{"runs": [{}], "spans": [[1, 1]]}', b'{"runs": [{}], "spans": [[true, 0]]}', b"\xff",
+         b'{"runs": [{}], "before": [{"place": 1}]}', b'{"runs": [{}], "before": [3]}'],
     )  # fmt: skip
     def test_that_is_damaged_is_said(self, data: bytes, tmp_path: Path) -> None:
         path = record(tmp_path / "r.mcap")
@@ -363,7 +362,7 @@ class TestEdits:
             "tags",
             "settings",
         ]
-        run = undo_edit(path)
+        (run,) = undo_edit(path)
         assert (run.name, run.tags, run.split, run.metadata) == ("sac", ("a",), "", {"lr": 2, "seed": 3})
         assert "ppo" in command("edit", str(path), "--undo")
         again = Recording(path).run
@@ -371,11 +370,53 @@ class TestEdits:
         with pytest.raises(RecordingError, match="there is no edit to undo"):
             undo_edit(path)
         assert CliRunner().invoke(app, ["edit", str(path), "--undo", "--name", "x"]).exit_code == 2
-        for edit in range(30):
-            edit_run(path, name=f"{edit}")
+        for number in range(30):
+            edit_runs(path, name=f"{number}")
         document = json.loads(Recording(path).read_attachment("run.json"))
         jsonschema.validate(document, json.loads((SCHEMAS / "run.schema.json").read_text()))
         assert len(document["before"]) == 20
+
+    def test_of_several_runs_change_those_that_are_chosen(self, tmp_path: Path) -> None:
+        path = tmp_path / "all.mcap"
+        runs = [{"name": f"w{i}", "metadata": {"lr": i}} for i in range(3)]
+        merge_recordings([record(tmp_path / f"{i}.mcap", 2, **runs[i]) for i in range(3)], path)
+
+        def names() -> list[str]:
+            return [run.name for run in Recording(path).runs]
+
+        told = json.loads(
+            command("edit", str(path), "--filter", "run.metadata.lr > 0", "--name", "x", "--json")
+        )["result"]
+        assert [(one["path"], one["run"]["metadata"]) for one in told] == [
+            (str(path), {"lr": i}) for i in (1, 2)
+        ]
+        assert names() == ["w0", "x", "x"]
+        check_schema(path, "run")
+        edit_runs(path, [0, 1], metadata={"lr": None, "gamma": 1})
+        assert [run.metadata for run in Recording(path).runs] == [{"gamma": 1}, {"gamma": 1}, {"lr": 2}]
+        record(path, 1, mode="a", name="w2", metadata={"lr": 2})  # as the last one was given
+        assert names() == ["w0", "x", "x"]
+        rewrite_recording(Recording(path), tmp_path / "some.mcap", episodes=[3, 4])
+        assert [run.name for run in undo_edit(tmp_path / "some.mcap")] == ["x", "w2"]
+        assert [run.metadata for run in undo_edit(path, [1])] == [{"lr": 1}]
+        told = json.loads(command("edit", str(path), "--undo", "--json"))["result"]
+        assert [one["run"]["name"] for one in told] == ["w0", "w1", "w2"]
+        assert [(run.name, run.metadata) for run in Recording(path).runs] == [
+            (run["name"], run["metadata"]) for run in runs
+        ]
+        with pytest.raises(RecordingError, match="there is no edit to undo"):
+            undo_edit(path)
+        with pytest.raises(RecordingError, match="expected places of its 3 runs, from 0, found 3"):
+            edit_runs(path, [0, 3], name="x")
+        assert verify_recording(path).ok
+
+    def test_before_there_were_places_are_of_the_only_run(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", 1, name="new")
+        document = json.loads(Recording(path).read_attachment("run.json"))
+        document["before"] = [{"name": "old"}]
+        add_attachments(path, {"run.json": ("application/json", json.dumps(document).encode())})
+        record(path, 1, mode="a", name="other")
+        assert [run.name for run in undo_edit(path)] == ["old"]
 
 
 class TestAnnotations:
@@ -763,7 +804,7 @@ class TestCommands:
             assert f"{here}\n" in command("info", str(tmp_path / "2.mcap"))
             assert f"{below}\n" in command("info", str(tmp_path))
         with pytest.raises(RecordingError, match="is a directory; give one file"):
-            edit_run(tmp_path, name="x")
+            edit_runs(tmp_path, name="x")
         dated = CliRunner().invoke(app, ["ls", str(tmp_path), "--sort", "date"])
         assert "did you mean 'started'" in dated.output
         (tmp_path / "empty").mkdir()
@@ -1119,7 +1160,7 @@ def test_keys_are_texts(tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["tag", str(path), "--episodes", "all", "success=no"])
     assert refused.exit_code == 2 and "expected success=true or success=false, found 'no'" in refused.output
     for change in (
-        lambda: edit_run(path, metadata={(1, 2): 2}),  # type: ignore[dict-item]
+        lambda: edit_runs(path, metadata={(1, 2): 2}),  # type: ignore[dict-item]
         lambda: annotate_episodes(path, {1: 2}),  # type: ignore[dict-item]
         lambda: annotate_episodes(path, {"a": 2}, [1.9]),  # type: ignore[list-item]
     ):
@@ -1157,7 +1198,7 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     for given in ({"name": "one", "metadata": {"lr": 1}}, {"name": "one", "metadata": {"lr": 1}}, {}):
         record(path, 2, mode="a", **given)
     assert [run.name for run in Recording(path).runs] == ["one"]  # the same goes on
-    edit_run(path, metadata={"lr": 1.5})
+    edit_runs(path, metadata={"lr": 1.5})
     record(path, 1, mode="a", name="one", metadata={"lr": 1})  # as it was given
     pid = os.fork()
     if pid == 0:
@@ -1179,8 +1220,6 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
         ("killed", 3),
         ("two", 2),
     ]
-    with pytest.raises(RecordingError, match="has 3 runs, and only a recording of one run"):
-        edit_run(path, name="x")
     before = path.read_bytes()
     with pytest.raises(SpaceError, match="records a single environment, found a vector environment of 1"):
         RecordVectorEpisodes(gym.make_vec("CartPole-v1", 1), path, mode="a", name="wrong").reset()
@@ -1203,18 +1242,18 @@ def test_the_parts_of_a_run_are_one_run_again(name: str | None, tmp_path: Path) 
     merged = tmp_path / "m.mcap"
     merge_recordings(parts, merged)
     assert len(Recording(merged).runs) == 1
-    assert edit_run(merged, name="x").name == "x"
-    edit_run(parts[0], name="edited")
+    assert [run.name for run in edit_runs(merged, name="x")] == ["x"]
+    edit_runs(parts[0], name="edited")
     merge_recordings(parts, merged, overwrite=True)
     assert [run.name for run in Recording(merged).runs] == ["edited", name or "p_0001"]
 
 
 def test_compacted_it_keeps_its_edits(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", 3, name="one")
-    edit_run(path, name="better")
+    edit_runs(path, name="better")
     tupli_mcap.open(path)[:1].delete()
     with tupli_mcap.FileStorage(tmp_path) as storage:
         assert storage.compact() > 0
     record(path, 1, mode="a", name="one")  # as it was given
     assert [run.name for run in Recording(path).runs] == ["better"]
-    assert undo_edit(path).name == "one"
+    assert [run.name for run in undo_edit(path)] == ["one"]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
-from operator import attrgetter
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -159,7 +158,8 @@ def tag(
     done: list[dict[str, Any]] = []
     if undo:
         gathered = Gathered()
-        files = _changed_in(paths, filter_text, "note", attrgetter("annotations.said"), gathered)
+        files = _files_in(paths, filter_text, gathered)
+        files = _changed_in(paths, files, "note", lambda _, recording: recording.annotations.said, gathered)
         lasts = change_all(
             files, lambda file, dry: undo_annotation(file, dry_run=dry), dry_run=dry_run, gathered=gathered
         )
@@ -231,17 +231,18 @@ def edit(
     run_split: Annotated[
         str | None, typer.Option("--split", metavar="WORD", help="What the run is for: train, eval, …")
     ] = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit of each recording.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Take back the last edit of each run.")] = False,
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Change the name, metadata, tags or split of runs.
 
-    The recordings keep their ids, and their steps are not touched. A signature is dropped. If
-    one recording cannot be changed, none is. With --filter, only recordings are changed that
-    have an episode which matches; with --undo, of a directory, only those that were edited.
+    All runs of the recordings are changed; with --filter, those that have an episode which
+    matches. --undo takes the last edit of each of them back. The recordings keep their ids,
+    and their steps are not touched. A signature is dropped. If one recording cannot be
+    changed, none is.
     """
-    from tupli_mcap.recording import edit_run, undo_edit
+    from tupli_mcap.recording import edit_runs, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
 
     meant = [str(place) for place in places if "=" in str(place) and not place.exists()]
@@ -254,23 +255,44 @@ def edit(
             "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
         )
     metadata, gathered = dict(pair_of(text) for text in settings or ()), Gathered()
-    if undo:
-        files = _changed_in(places, filter_text, "edit", attrgetter("recorded_runs.before"), gathered)
-    else:
-        files = _files_in(places, filter_text, gathered)
+    chosen = _runs_in(places, filter_text, gathered)
 
-    def change(file: str, dry: bool) -> Run:
+    def edits(file: str, recording: Recording) -> list[int]:
+        """The places of the chosen runs that were edited."""
+        some = chosen[file]
+        return [place for place, _ in recording.recorded_runs.before if some is None or place in some]
+
+    def change(file: str, dry: bool) -> list[Run]:
         if undo:
-            return undo_edit(file, dry_run=dry)
-        return edit_run(file, name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry)
+            return undo_edit(file, chosen[file], dry_run=dry)
+        return edit_runs(
+            file, chosen[file], name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry
+        )
 
-    runs = change_all(files, change, dry_run=dry_run, gathered=gathered)
+    files = _changed_in(places, chosen, "edit", edits, gathered) if undo else list(chosen)
+    edited = zip(files, change_all(files, change, dry_run=dry_run, gathered=gathered), strict=True)
+    changed = [(file, run) for file, runs in edited for run in runs]
     if as_json:
-        edited = zip(files, runs, strict=True)
-        print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in edited])
+        print_json([{"dry_run": dry_run, "path": file, "run": run.as_dict()} for file, run in changed])
         return
-    for file, run in zip(files, runs, strict=True):
+    for file, run in changed:
         _tell_run(file, run, dry_run=dry_run)
+
+
+def _runs_in(
+    places: Sequence[Path], filter_text: str | None, gathered: Gathered
+) -> dict[str, list[int] | None]:
+    """The recordings of paths, and the places of the runs that have an episode which matches; None for all."""
+    from tupli_mcap.recording import Recording
+
+    if filter_text is None:
+        return dict.fromkeys(_files_in(places, None, gathered))
+    found: dict[str, list[int] | None] = {}
+    for (file, _), numbers in chosen_in(places, None, filter_text, gathered).items():
+        with Recording(file) as recording:
+            place_of = dict(zip(recording.index["episode"].tolist(), recording.run_places, strict=True))
+            found[file] = sorted({place_of[number] for number in numbers})
+    return found
 
 
 def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
@@ -298,19 +320,19 @@ def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathere
 
 def _changed_in(
     places: Sequence[Path],
-    filter_text: str | None,
+    files: Iterable[str],
     what: str,
-    changes_of: Callable[[Recording], Sequence[object]],
+    changes_of: Callable[[str, Recording], Sequence[object]],
     gathered: Gathered,
 ) -> list[str]:
-    """The recordings of `_files_in` whose last change is taken back: those that are named, and of directories those
-    that have one. RecordingError if none has."""
+    """The recordings of paths whose last change is taken back: those that are named, and of directories those that
+    have one. RecordingError if none has."""
     from tupli_mcap.recording import Recording
 
     named, found = set(map(str, places)), []
-    for file in _files_in(places, filter_text, gathered):
+    for file in files:
         with gathered.keep(), Recording(file) as recording:
-            if file in named or changes_of(recording):
+            if file in named or changes_of(file, recording):
                 found.append(file)
     if not found:
         gathered.raise_all()

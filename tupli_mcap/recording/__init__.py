@@ -27,7 +27,7 @@ from tupli_mcap.recording.recording import Recording
 if TYPE_CHECKING:
     from tupli_mcap.recording.check.report import Problem, VerifyReport
     from tupli_mcap.recording.check.verify import verify_recording
-    from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_run, undo_annotation, undo_edit
+    from tupli_mcap.recording.edit.annotate import annotate_episodes, edit_runs, undo_annotation, undo_edit
     from tupli_mcap.recording.edit.merge import MergeReport, merge_recordings
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording, say_made_of
@@ -41,7 +41,7 @@ __getattr__ = imported_on_use(
     {
         "check.report": "Problem VerifyReport",
         "check.verify": "verify_recording",
-        "edit.annotate": "annotate_episodes edit_run undo_annotation undo_edit",
+        "edit.annotate": "annotate_episodes edit_runs undo_annotation undo_edit",
         "edit.merge": "MergeReport merge_recordings",
         "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
         "edit.rewrite": "rewrite_recording say_made_of",
@@ -66,7 +66,7 @@ __all__ = [
     "Step",
     "VerifyReport",
     "annotate_episodes",
-    "edit_run",
+    "edit_runs",
     "finish_recording",
     "journal_path",
     "merge_recordings",

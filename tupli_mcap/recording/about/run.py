@@ -144,12 +144,12 @@ class RecordedRuns(NamedTuple):
         runs: several if the recording was made of others, or other runs were appended to it.
         spans: (number of episodes, index in `runs`) in the order of the index; episodes beyond the last span belong to
             the last run.
-        before: earlier versions of an edited run, the latest last.
+        before: (index in `runs`, earlier version) of edited runs, the latest last.
     """
 
     runs: Sequence[Run]
     spans: Sequence[tuple[int, int]] = ()
-    before: Sequence[Run] = ()
+    before: Sequence[tuple[int, Run]] = ()
 
     def places(self, episodes: int) -> list[int]:
         """The index in `runs` of each episode's run."""
@@ -163,8 +163,8 @@ class RecordedRuns(NamedTuple):
         It goes on with the last one if it is of the same environment, and the user gives it the same name, metadata,
         tags and split, or none of them.
         """
-        last = self.runs[-1]
-        known = [_given(each) for each in (Run(), last, *self.before)]
+        last, earlier = self.runs[-1], [was for place, was in self.before if place == len(self.runs) - 1]
+        known = [_given(each) for each in (Run(), last, *earlier)]
         if _given(run) in known and run.environment in ("", last.environment):
             return self
         places = itertools.groupby(self.places(episodes))
@@ -178,7 +178,7 @@ class RecordedRuns(NamedTuple):
         if self.spans:
             document["spans"] = [list(span) for span in self.spans]
         if self.before:
-            document["before"] = [_document(run) for run in self.before]
+            document["before"] = [{"place": place, **_document(run)} for place, run in self.before]
         try:
             data = jsonvalue.dumps_plain(document).encode()
         except (TypeError, ValueError) as err:
@@ -202,12 +202,20 @@ class RecordedRuns(NamedTuple):
             raise FormatError(f"{where}: found {spans!r:.80} as the spans of runs; see run.schema.json")
         before = document.get("before", [])
         if not isinstance(before, list):
-            raise FormatError(f"{where}: expected a list of what a run was before, found {before!r:.80}")
+            raise FormatError(f"{where}: expected a list of what runs were before, found {before!r:.80}")
         return cls(
             [Run.of_document(run, where) for run in runs],
             [(span[0], span[1]) for span in spans],
-            [Run.of_document(run, where) for run in before],
+            [(_place(run, len(runs), where), Run.of_document(run, where)) for run in before],
         )
+
+
+def _place(earlier: object, runs: int, where: str) -> int:
+    """Of which of so many runs this is an earlier version."""
+    place = earlier.get("place", 0) if isinstance(earlier, dict) else 0
+    if not _is_place(place, runs):
+        raise FormatError(f"{where}: found {place!r:.80} as the place of an earlier run; see run.schema.json")
+    return int(place)
 
 
 def _given(run: Run) -> str:
@@ -231,8 +239,11 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
+def _is_place(place: object, runs: int) -> bool:
+    return type(place) is int and 0 <= place < runs
+
+
 def _is_span(span: object, runs: int) -> bool:
-    if not isinstance(span, list) or len(span) != 2 or not all(type(number) is int for number in span):
+    if not isinstance(span, list) or len(span) != 2 or type(span[0]) is not int:
         return False
-    count, place = span
-    return bool(0 <= count < 1 << 32 and 0 <= place < runs)
+    return 0 <= span[0] < 1 << 32 and _is_place(span[1], runs)

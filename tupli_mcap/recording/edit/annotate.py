@@ -1,4 +1,4 @@
-"""Annotates episodes of a finished recording, and edits its run. All chunks stay unchanged, byte for byte."""
+"""Annotates episodes of a finished recording, and edits its runs. All chunks stay unchanged, byte for byte."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import operator
 import os
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,13 +20,13 @@ from tupli_mcap.recording.about.annotations import (
     Annotation,
     Annotations,
 )
-from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, Run
 from tupli_mcap.recording.edit.attach import attach, check_attachable, held
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
 
-_MOST_EDITS = 20  # edits that can be undone
+_MOST_EDITS = 20  # of a run, that can be undone
 _Path = TypeVar("_Path", bound=str | os.PathLike[str])
 _Change = TypeVar("_Change")
 
@@ -85,57 +86,74 @@ def undo_annotation(path: str | os.PathLike[str], *, dry_run: bool = False) -> A
     return last
 
 
-def edit_run(
+def edit_runs(
     path: str | os.PathLike[str],
+    runs: Sequence[int] | None = None,
     *,
     name: str | None = None,
     metadata: Mapping[str, Any] | None = None,
     tags: Sequence[str] | None = None,
     split: str | None = None,
     dry_run: bool = False,
-) -> Run:
-    """Changes the given parts of a recording's run, and returns the new run.
+) -> list[Run]:
+    """Changes the given parts of a recording's runs, and returns these as they are now.
 
-    The recording keeps its UUID, and the earlier version of the run for `undo_edit`.
+    The recording keeps its UUID, and the earlier versions of the runs for `undo_edit`.
 
     Args:
         path: the recording.
-        name, tags, split: replace those of the run; None keeps them.
-        metadata: are added to the run's own; a value of None removes a key.
-        dry_run: only check, and return the run.
+        runs: their places in `Recording.runs`; all by default.
+        name, tags, split: replace those of the runs; None keeps them.
+        metadata: are added to the runs' own; a value of None removes a key.
+        dry_run: only check, and return the runs.
 
     Raises:
-        RecordingError: as `annotate_episodes`; or the recording was made of several runs.
+        RecordingError: as `annotate_episodes`; or there are no such runs.
     """
     with _changing(path, dry_run) as (recording, say):
-        said, before = _only_run(path, recording)
-        added = {**said.metadata, **(metadata or {})}
-        run = Run.given(
-            said.name if name is None else name,
-            {key: value for key, value in added.items() if value is not None},
-            said.tags if tags is None else tags,
-            said.split if split is None else split,
-        )
-        was = Run(name=said.name, metadata=said.metadata, tags=said.tags, split=said.split)
-        run = replace(said, name=run.name, metadata=run.metadata, tags=run.tags, split=run.split)
-        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run], before=[*before, was][-_MOST_EDITS:]).to_json())
-    return run
+        said = recording.recorded_runs
+        new, before = list(said.runs), list(said.before)
+        places = _places(path, recording, runs)
+        for place in places:
+            run = new[place]
+            added = {**run.metadata, **(metadata or {})}
+            given = Run.given(
+                run.name if name is None else name,
+                {key: value for key, value in added.items() if value is not None},
+                run.tags if tags is None else tags,
+                run.split if split is None else split,
+            )
+            before.append((place, _with_given(Run(), run)))
+            new[place] = _with_given(run, given)
+        say(RUN_NAME, RUN_MEDIA_TYPE, said._replace(runs=new, before=_latest(before)).to_json())
+    return [new[place] for place in places]
 
 
-def undo_edit(path: str | os.PathLike[str], *, dry_run: bool = False) -> Run:
-    """Undoes the last `edit_run`, and returns the earlier run; `dry_run` only returns it.
+def undo_edit(
+    path: str | os.PathLike[str], runs: Sequence[int] | None = None, *, dry_run: bool = False
+) -> list[Run]:
+    """Undoes the last edit of each run that was edited, and returns these as they were before.
+
+    Args:
+        path: the recording.
+        runs: the places in `Recording.runs` of those that may be changed; all by default.
+        dry_run: only check, and return the runs.
 
     Raises:
-        RecordingError: as `edit_run`; or nothing was edited.
+        RecordingError: as `edit_runs`; or none of the runs was edited.
     """
     with _changing(path, dry_run) as (recording, say):
-        said, before = _only_run(path, recording)
-        if not before:
+        said = recording.recorded_runs
+        new, before = list(said.runs), list(said.before)
+        edited = {place: i for i, (place, _) in enumerate(before)}  # where its latest version is
+        last = {place: edited[place] for place in _places(path, recording, runs) if place in edited}
+        if not last:
             raise RecordingError(f"{path}: there is no edit to undo")
-        was = before[-1]
-        run = replace(said, name=was.name, metadata=was.metadata, tags=was.tags, split=was.split)
-        say(RUN_NAME, RUN_MEDIA_TYPE, RecordedRuns([run], before=before[:-1]).to_json())
-    return run
+        for place, i in last.items():
+            new[place] = _with_given(new[place], before[i][1])
+        kept = [each for i, each in enumerate(before) if i not in last.values()]
+        say(RUN_NAME, RUN_MEDIA_TYPE, said._replace(runs=new, before=kept).to_json())
+    return [new[place] for place in last]
 
 
 def change_all(
@@ -167,15 +185,34 @@ def change_all(
     return found if dry_run else [change(path, False) for path in paths]
 
 
-def _only_run(path: str | os.PathLike[str], recording: Recording) -> tuple[Run, Sequence[Run]]:
-    """The run of a recording, and its versions before edits."""
-    if len(recording.runs) > 1:
-        raise RecordingError(
-            f"{path} has {len(recording.runs)} runs, and only a recording of one run can be edited; write the run to a "
-            f"file of its own (tupli-mcap filter {path} 'run.name = \"{recording.run.name}\"' -o run.mcap), and edit it"
-        )
-    (said,) = recording.recorded_runs.runs
-    return said, recording.recorded_runs.before
+def _places(path: str | os.PathLike[str], recording: Recording, runs: Sequence[int] | None) -> Sequence[int]:
+    """The places of some of a recording's runs, in their order."""
+    known = range(len(recording.runs))
+    try:
+        places = known if runs is None else sorted({operator.index(place) for place in runs})
+    except TypeError as err:
+        raise RecordingError(f"expected places in Recording.runs, found {runs!r:.80}") from err
+    missing = [place for place in places if place not in known]
+    if missing or not places:
+        found = missing[0] if missing else "none"
+        raise RecordingError(f"{path}: expected places of its {len(known)} runs, from 0, found {found}")
+    return places
+
+
+def _with_given(run: Run, given: Run) -> Run:
+    """A run with what a user has given of another."""
+    return replace(run, name=given.name, metadata=given.metadata, tags=given.tags, split=given.split)
+
+
+def _latest(before: Sequence[tuple[int, Run]]) -> list[tuple[int, Run]]:
+    """The latest of the earlier versions of each run."""
+    later = Counter[int]()
+    kept = []
+    for place, run in reversed(before):
+        if later[place] < _MOST_EDITS:
+            kept.append((place, run))
+        later[place] += 1
+    return kept[::-1]
 
 
 @contextmanager

@@ -205,7 +205,8 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
     found = {}
     if runs and runs != [Run()]:
         first = parts[0][0].recorded_runs
-        edits = first.before if not several and runs == first.runs else ()
+        there = {place: runs.index(run) for place, run in enumerate(first.runs) if run in runs}
+        edits = [(there[place], was) for place, was in first.before if not several and place in there]
         carried = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
         found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
     if annotations:
