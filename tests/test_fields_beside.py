@@ -14,7 +14,16 @@ import pytest
 from environments import Scripted
 
 import tupli_mcap
-from tupli_mcap import F, FilterError, RecordEpisodes, Recording, RecordingError, SpaceError, TupliDataset
+from tupli_mcap import (
+    F,
+    FilterError,
+    RecordEpisodes,
+    Recording,
+    RecordingError,
+    SpaceError,
+    TupliDataset,
+    TupliError,
+)
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.dataset.items import SamplingError
 
@@ -55,6 +64,49 @@ def test_of_transitions(dataset: tupli_mcap.Dataset) -> None:
     items = dataset.sort("seed", descending=True).head(2).transitions(2, fields=["rewards", "info.step"])
     assert items[:].infos["step"].tolist() == [1, 2, 3, 4, 5] * 2
     assert items[3].infos["step"] == 4
+
+
+def test_have_statistics(dataset: tupli_mcap.Dataset) -> None:
+    infos = dataset.read(["infos"]).infos
+    found = dataset.stats(["states", "info.force", "infos.rare"])
+    assert set(found) == {"state", "info.force", "info.rare"}
+    force = np.array([info["force"] for info in infos], np.float64)
+    assert np.array_equal(found["info.force"].mean, force.mean(axis=0))
+    assert found["info.force"].quantiles[0.5].shape == (2,)
+    rare = [info["rare"] for info in infos if "rare" in info]
+    assert (found["info.rare"].count, found["info.rare"].max) == (len(rare), max(rare))
+    assert set(dataset.stats("infos")) == {"info.step", "info.force", "info.rare"}
+    with pytest.raises(TupliError, match=r"expected a number as info.name .*, found others; see them with"):
+        dataset.stats(["info.name"])
+    with pytest.raises(SamplingError, match=r"has the key 'forec' \(did you mean 'info.force'\?\)"):
+        dataset.stats(["info.forec"])
+
+
+def test_a_part_of_states_has_statistics_and_is_read_whole(tmp_path: Path) -> None:
+    arm = gym.spaces.Dict({"q": gym.spaces.Box(-9, 9, (2,)), "v": gym.spaces.Box(-9, 9, (2,))})
+    space = gym.spaces.Dict({"arm": arm, "t": gym.spaces.Box(-9, 9, ())})
+    with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        writer.step(space.sample(), 1, 1.0, True)
+    dataset = tupli_mcap.open(tmp_path)
+    assert set(dataset.stats(["state.arm", "rewards"])) == {"state.arm.q", "state.arm.v", "reward"}
+    assert set(dataset.stats(["observations.arm.q"])) == {"state.arm.q"}
+    with pytest.raises(TupliError, match=r"expected a part of states .*, found 'state.arm.w' \(did you mean"):
+        dataset.stats(["state.arm.w"])
+    taken = r"found 'state.arm.q'; read 'states', and take \['arm'\]\['q'\] of it"
+    for read in (
+        dataset.read,
+        lambda fields: dataset.windows(1, fields=fields)[0],
+        lambda fields: dataset.transitions(fields=fields)[:],
+        dataset[0].recording.read,
+    ):
+        assert np.array_equal(read(["state"])["states"]["t"], dataset[0].states["t"])
+        with pytest.raises(TupliError, match=taken):
+            read(["state.arm.q"])
+    with pytest.raises(TupliError, match="read 'states', and take that part of it"):
+        dataset.transitions(fields=["states.arm.q[0]"])
+    with pytest.raises(TupliError, match="read 'infos', which has a dict for each step"):
+        Recording(tmp_path / "r.mcap").read(["info.x"])
 
 
 def test_a_budget_is_that_of_the_recorded_steps(dataset: tupli_mcap.Dataset) -> None:
@@ -240,7 +292,7 @@ def test_frames_that_are_not_there(pictures: tupli_mcap.Dataset, tmp_path: Path)
     with pytest.raises(RecordingError, match="it has none: record with frames=True"):
         tupli_mcap.open(tmp_path / "d.mcap").read("frames")
     with pytest.raises(SamplingError, match=r"did you mean 'frames'"):
-        pictures.windows(2, fields=["frame"])
+        pictures.windows(2, fields=["fames"])
     pictures_of_a_storage = TupliDataset(tmp_path)
     with pytest.raises(SamplingError, match=r"tupli_mcap\.open"):
         pictures_of_a_storage.windows(2, fields=["frames"])[0]

@@ -790,7 +790,7 @@ def test_statistics_of_what_follows_have_a_name_of_their_own(dataset: Dataset) -
     np.testing.assert_allclose(
         found["next_states"].mean, next_states.mean(axis=0, dtype=np.float64), rtol=1e-6
     )
-    for field in ("terminals", "times", "infos"):
+    for field in ("terminals", "times"):
         with pytest.raises(TupliError, match="expected fields from states, actions, rewards, next_states"):
             dataset.stats([field])
 

@@ -347,7 +347,7 @@ BAD: list[tuple[Callable[[TupliDataset], Any], str]] = [
     (lambda d: d.windows(2, True), f"expected a stride {COUNT} 1, found True"),
     (lambda d: d.windows(2, pad="x"), "expected pad to be one of 'none', 'repeat', 'zero', found 'x'"),
     (lambda d: d.windows(2, history=-1), f"expected a number of earlier steps {COUNT} 0, found -1"),
-    (lambda d: d.windows(2, fields=["state"]), f"{FIELD} 'state'"),
+    (lambda d: d.windows(2, fields=["velocity"]), f"{FIELD} 'velocity'"),
     (lambda d: d.windows(2)[[0.5]], rf"{NUMBERS} \[0.5\]"),
     (lambda d: d.windows(2)[[[1]]], rf"{NUMBERS} \[\[1\]\]"),
     (lambda d: d.windows(2)["a"], f"{NUMBERS} 'a'"),

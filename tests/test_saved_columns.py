@@ -267,8 +267,8 @@ def test_columns_are_mapped_and_items_are_ones_own(cart: Files, tmp_path: Path) 
         for field in ("states", "next_states"):
             with pytest.raises(IndexError, match="700"):
                 columns.steps.read([field], beyond)
-    with pytest.raises(SamplingError, match="expected fields from states, .* found 'state'"):
-        columns.steps.read(["state"], beyond)
+    with pytest.raises(SamplingError, match="expected fields from states, .* found 'velocity'"):
+        columns.steps.read(["velocity"], beyond)
 
 
 # --- in other processes ---

@@ -23,7 +23,13 @@ from tupli_mcap.dataset.columns.load import (
     read_in_order,
     steps_within,
 )
-from tupli_mcap.dataset.columns.statistics import STATISTICAL, FieldStatistics, statistics_of
+from tupli_mcap.dataset.columns.statistics import (
+    STATISTICAL,
+    FieldStatistics,
+    part_of,
+    statistics_of,
+    statistics_of_infos,
+)
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.beside import INFOS, FrameValues, info_columns, info_keys
 from tupli_mcap.dataset.items.index import positions_of
@@ -40,7 +46,14 @@ from tupli_mcap.dataset.sources import (
 )
 from tupli_mcap.errors import warn
 from tupli_mcap.recording import Columns, Episode, Recording
-from tupli_mcap.recording.columns.fields import FIELDS, FIVE, ColumnDict, field_names
+from tupli_mcap.recording.columns.fields import (
+    FIELD_OF,
+    FIELDS,
+    FIVE,
+    ColumnDict,
+    field_names,
+    split_name,
+)
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
@@ -353,9 +366,10 @@ class Dataset(RandomAccess):
         """Columns of all steps, episode after episode; `episode_lengths` has the length of each.
 
         Args:
-            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames; Gymnasium's
-                names (observations, terminations, truncations) mean the same. "infos" is a dict for each step;
-                "info.<key>" makes `infos` a dict of columns, as in `windows`. "info.contact.left" is a value in a dict.
+            fields: of states, actions, rewards, terminals, timeouts, next_states, times, infos, frames. The names of
+                their values in a step (state), and Gymnasium's (observations, terminations, truncations), mean the
+                same. "infos" is a dict for each step; "info.<key>" makes `infos` a dict of columns, as in `windows`.
+                "info.contact.left" is a value in a dict.
 
         Raises:
             DatasetError: a field is unknown.
@@ -474,14 +488,28 @@ class Dataset(RandomAccess):
         The names of columns (`states.arm`) and Gymnasium's find them, too. Steps are read once, one block after the
         other, and the result is kept. Images, and leaves of variable size (texts, graphs), have no statistics.
 
+        Args:
+            fields: of states, actions, rewards, next_states, infos; also a part of one, such as "state.arm" or
+                "info.contact.left". Infos are all read into memory; steps without an info do not count.
+
         Raises:
             DatasetError: a field has no numbers, or there is no step.
+            SamplingError: no step has such an info.
             SpaceError: one array cannot hold a field of two of the recordings.
         """
-        names = field_names(fields, STATISTICAL, DatasetError)
+        keys, given = info_keys(fields)
+        parts = [split_name(name) if isinstance(name, str) else (name, "") for name in given]
+        names = field_names([word for word, _ in parts], (*STATISTICAL, INFOS), DatasetError)
         if missing := [name for name in names if name not in self._stats]:
             self._stats |= statistics_of(self.steps, missing)
-        return ColumnDict({leaf: found for name in names for leaf, found in self._stats[name].items()})
+        if missing := [key for key in keys if f"info.{key}" not in self._stats]:
+            self._stats |= statistics_of_infos(self.steps, self._infos(), missing)
+        found: dict[str, Any] = {}
+        for word, part in parts:
+            found |= part_of(FIELD_OF[word], part, self._stats[FIELD_OF[word]])
+        for key in keys:
+            found |= self._stats[f"info.{key}"]
+        return ColumnDict(found)
 
     # ---- out
 

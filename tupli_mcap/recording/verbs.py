@@ -76,7 +76,7 @@ class DatasetVerbs(SaysWhatIsMeant):
     def stats(
         self, fields: Sequence[str] = ("states", "actions", "rewards")
     ) -> Mapping[str, FieldStatistics]:
-        """Count, mean, std, min, max and quantiles of each leaf."""
+        """Count, mean, std, min, max and quantiles of each leaf, or info: `stats(["states", "info.force"])`."""
         return self.dataset.stats(fields)
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:

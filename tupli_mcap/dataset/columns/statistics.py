@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, DType
 from tupli_mcap.dataset.items import Steps
+from tupli_mcap.dataset.items.beside import INFOS, InfoValues, StepsWith, info_columns
 from tupli_mcap.dataset.sources import DatasetError
+from tupli_mcap.errors import did_you_mean
 from tupli_mcap.messages.shared_dtypes import field_leaves
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import step_name
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
@@ -53,33 +58,99 @@ def _brief(values: Array) -> str:
 
 def statistics_of(steps: Steps, fields: Sequence[str]) -> dict[str, dict[str, FieldStatistics]]:
     """The statistics of each leaf, by field. See `Dataset.stats`."""
-    if steps.layout is None or not len(steps):
-        raise DatasetError("expected steps to take statistics of, found none")
+    layout = _layout_of(steps)
     steps.read(
         fields, np.empty(0, np.int64)
     )  # SpaceError, also where the first recording's leaves have no statistics
-    layout, total = steps.layout, len(steps)
-    leaves = [(field, leaf) for field in fields for leaf in field_leaves(field, layout) or ()]
-    leaves = [(field, leaf) for field, leaf in leaves if leaf.kind != "variable" and not leaf.apart]
-    names = [name_within(step_name(field), *leaf.keys) for field, leaf in leaves]
-    known = {
-        name: ElementStatistics(leaf, layout.dtypes[leaf.name])
-        for name, (_, leaf) in zip(names, leaves, strict=True)
+    leaves = [
+        _Named(name_within(step_name(field), *leaf.keys), field, leaf, layout.dtypes[leaf.name])
+        for field in fields
+        for leaf in field_leaves(field, layout) or ()
+        if leaf.kind != "variable" and not leaf.apart
+    ]
+    found = _statistics(steps, leaves)
+    return {field: {one.name: found[one.name] for one in leaves if one.field == field} for field in fields}
+
+
+def statistics_of_infos(
+    steps: Steps, infos: Sequence[Mapping[str, Any]], keys: Sequence[str]
+) -> dict[str, dict[str, FieldStatistics]]:
+    """The statistics of entries of infos, by `info.<key>`; the empty key stands for all entries that are numbers. See
+    `Dataset.stats`."""
+    _layout_of(steps)
+    found = {}
+    for key in keys:
+        columns = info_columns(infos, [key] if key else None)
+        numbers = {entry: column for entry, column in columns.items() if isinstance(column, np.ndarray)}
+        if key and not numbers:
+            raise DatasetError(
+                f"expected a number as info.{key:.80} of each step that has it, or arrays of one shape, found others; "
+                "see them with read(['infos'])"
+            )
+        leaves = [
+            _Named(
+                f"info.{key}" if key else name_within("info", entry),
+                INFOS,
+                _info_leaf(entry, column),
+                column.dtype,
+            )
+            for entry, column in numbers.items()
+        ]
+        found[f"info.{key}"] = _statistics(StepsWith(steps, INFOS, InfoValues(numbers, len(steps))), leaves)
+    return found
+
+
+def _info_leaf(key: str, column: Array) -> Leaf:
+    """A leaf that finds a column among those of infos; it allows all numbers."""
+    shape = column.shape[1:]
+    return Leaf((key,), "info", "", spaces.Box(-np.inf, np.inf, shape), "array", column.dtype, shape)
+
+
+def part_of(field: str, part: str, leaves: Mapping[str, FieldStatistics]) -> dict[str, FieldStatistics]:
+    """Those of a field's leaves that are in a part of it (`.arm`); all if the part is empty. DatasetError if there is
+    none."""
+    own = f"{step_name(field)}{part}"
+    found = {
+        name: leaf for name, leaf in leaves.items() if name == own or name.startswith((f"{own}.", f"{own}["))
     }
+    if part and not found:
+        raise DatasetError(
+            f"expected a part of {field} that has numbers, such as {', '.join(leaves) or 'none'}, found {own!r:.80}"
+            f"{did_you_mean(own, leaves)}"
+        )
+    return found
+
+
+def _layout_of(steps: Steps) -> StepLayout:
+    if steps.layout is None or not len(steps):
+        raise DatasetError("expected steps to take statistics of, found none")
+    return steps.layout
+
+
+class _Named(NamedTuple):
+    """A leaf with its name, its field, and the dtype of its values."""
+
+    name: str
+    field: str
+    leaf: Leaf
+    dtype: DType
+
+
+def _statistics(steps: Steps, leaves: Sequence[_Named]) -> dict[str, FieldStatistics]:
+    """The statistics of leaves, by their names."""
+    total, fields = len(steps), list(dict.fromkeys(one.field for one in leaves))
+    known = {one.name: ElementStatistics(one.leaf, one.dtype) for one in leaves}
     sampled = np.unique(np.linspace(0, total - 1, min(total, _SAMPLED)).round().astype(np.int64))
     samples: dict[str, list[Array]] = {path: [] for path in known}
     for first in range(0, total, _BLOCK):
         rows = np.arange(first, min(first + _BLOCK, total))
-        columns = steps.read(list(dict.fromkeys(field for field, _ in leaves)), rows)
+        columns = steps.read(fields, rows)
         here = sampled[(sampled >= rows[0]) & (sampled <= rows[-1])] - first
-        for name, (field, leaf) in zip(names, leaves, strict=True):
+        for name, field, leaf, _ in leaves:
             values = leaf.get(columns[field]).reshape(len(rows), leaf.size)
             known[name].add(np.ascontiguousarray(values.T))
             samples[name].append(values[here])
-    found: dict[str, dict[str, FieldStatistics]] = {field: {} for field in fields}
-    for name, (field, leaf) in zip(names, leaves, strict=True):
-        found[field][name] = _of(leaf, known[name], np.concatenate(samples[name]))
-    return found
+    return {name: _of(leaf, known[name], np.concatenate(samples[name])) for name, _, leaf, _ in leaves}
 
 
 def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:

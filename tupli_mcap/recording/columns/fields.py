@@ -49,21 +49,36 @@ FIELD_OF = MappingProxyType(
 """Every name of a column, or of its value in one step -> column."""
 
 
+def split_name(name: str) -> tuple[str, str]:
+    """The field of a name, and the part of it that the name goes on with: `state.arm[0]` as `state` and `.arm[0]`."""
+    word, *part = re.split(r"(?=[.\[])", name, maxsplit=1)
+    return word, "".join(part)
+
+
 def field_names(
     fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
 ) -> list[str]:
-    """The fields under this package's names, each once; Gymnasium's names are understood. Raises `error` for an unknown
-    name."""
+    """The columns of fields, each once; a field may have any name in `FIELD_OF`. Raises `error` for an unknown name; of
+    a part of a field (`state.arm`), the message says how to get it."""
     try:
         given = [fields] if isinstance(fields, str) else list(fields)
-        names = [OTHER_NAMES.get(name, name) for name in given]
+        names = [FIELD_OF.get(name, name) for name in given]
     except TypeError as err:
         raise error(f"expected fields from {', '.join(known)}, found {fields!r:.80}") from err
     for written, name in zip(given, names, strict=True):
         if name not in known:
-            hint = did_you_mean(re.split(r"[.\[]", str(name))[0], known)
+            word, part = split_name(str(name))
+            whole = FIELD_OF.get(word)
+            hint = _how_to_get(part, whole) if part and whole in known else did_you_mean(word, known)
             raise error(f"expected fields from {', '.join(known)}, found {written!r:.80}{hint}")
     return list(dict.fromkeys(names))
+
+
+def _how_to_get(part: str, field: str | None) -> str:
+    if field == "infos":
+        return "; read 'infos', which has a dict for each step"
+    keys = "" if {"[", '"'} & set(part) else "".join(f"[{key!r}]" for key in part[1:].split("."))
+    return f"; read {field!r}, and take {keys or 'that part'} of it"
 
 
 def described(column: Any) -> str:
@@ -107,9 +122,9 @@ class ColumnDict(dict[str, Any]):
         """The key that a name means; the name itself if there is none."""
         if dict.__contains__(self, name) or not isinstance(name, str):
             return name
-        word, *leaf = re.split(r"(?=[.\[])", name, maxsplit=1)
+        word, part = split_name(name)
         field = FIELD_OF.get(word, word)
-        meant = ("".join([own, *leaf]) for own in (field, step_name(field)))
+        meant = (own + part for own in (field, step_name(field)))
         return next((key for key in meant if dict.__contains__(self, key)), name)
 
 
