@@ -142,7 +142,7 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     ]
     assert told("info", "--episodes", "0,3-4")["episodes"] == 3
     assert told("info", "--filter", "seed = 1")["episodes"] == 1
-    assert told("filter", "seed > 2", "-o", made)["episodes"] == 2
+    assert told("filter", "--filter", "seed > 2", "-o", made)["episodes"] == 2
     assert told("trim", "--steps", "1:", "--episodes", "best", "-o", made, "--force")["left_out"] == 1
     assert told("doctor")["episodes"] == 5
     (listed,) = told("ls", "--filter", "seed > 1")
@@ -157,7 +157,9 @@ def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path)
     assert told("render", "--episodes", "0", "-o", str(tmp_path / "film.gif"))["ok"]
     for words in (["merge"], ["split", "--episodes", "1"]):
         done = CliRunner().invoke(app, [words[0], url, *words[1:], "-o", made])
-        assert f"tupli-mcap filter {url} FILTER -o FILE" in " ".join(done.output.split()), done.output
+        assert f"tupli-mcap filter {url} --filter FILTER -o FILE" in " ".join(done.output.split()), (
+            done.output
+        )
     done = CliRunner().invoke(app, ["verify", url])
     assert "is a server, not a recording → fetch its recordings with tupli-mcap pull" in " ".join(
         done.output.split()

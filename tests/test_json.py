@@ -124,7 +124,7 @@ trust FILE: trust wind.mcap
 trust --list: trust --list
 untrust: untrust wind.mcap
 untrust: untrust --key key.pub
-filter: filter runs/a.mcap steps>15 -o some.mcap
+filter: filter runs/a.mcap --filter steps>15 -o some.mcap
 trim: trim runs/a.mcap --steps :5 -o trimmed.mcap
 delete: delete runs/a.mcap --episodes 0-1
 restore: restore runs --dry-run --episodes 1

@@ -617,11 +617,15 @@ def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "part_0001.mcap" in run("split", "all.mcap", "-o", "part.mcap", "--episodes", "30")
     assert [Path(part["path"]).exists() for part in dry["recordings"]] == [True] * len(dry["recordings"])
     assert "either --episodes or --max-bytes" in run("split", "all.mcap", "-o", "x.mcap", code=2)
-    kept = json.loads(run("filter", "all.mcap", "n_tuples > 3", "-o", "some.mcap", "--json"))["result"]
+    kept = json.loads(run("filter", "all.mcap", "--filter", "n_tuples > 3", "-o", "some.mcap", "--json"))[
+        "result"
+    ]
     assert (kept["path"], kept["episodes"]) == ("some.mcap", len(Recording("some.mcap")))
-    assert "would write" in run("filter", "all.mcap", "n_tuples > 3", "-o", "none.mcap", "--dry-run")
+    assert "would write" in run(
+        "filter", "all.mcap", "--filter", "n_tuples > 3", "-o", "none.mcap", "--dry-run"
+    )
     assert not Path("none.mcap").exists()
-    run("filter", "all.mcap", "colour = 1", "-o", "none.mcap", code=2)
+    run("filter", "all.mcap", "--filter", "colour = 1", "-o", "none.mcap", code=2)
 
 
 def test_vectorised_copies_of_an_environment_are_no_other_one(

@@ -849,7 +849,7 @@ class TestCommands:
         for i in range(2):
             record(tmp_path / "runs" / f"{i}.mcap", episodes=i + 2, name=f"run-{i}")
         target = str(tmp_path / "o.mcap")
-        words = "filter", str(tmp_path / "runs"), "run.name in ['run-0', 'run-1']", "-o", target
+        words = "filter", str(tmp_path / "runs"), "--filter", "run.name in ['run-0', 'run-1']", "-o", target
         assert command(*words, "--dry-run").startswith(f"would write {target}: 5 episodes")
         assert not Path(target).exists()
         command(*words)

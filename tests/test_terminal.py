@@ -158,7 +158,7 @@ def look_at(path: object, out: Path) -> None:
         ("recover", path, "--dry-run"),
         ("merge", path, "-o", out / "m.mcap", "--dry-run"),
         ("split", path, "-o", out / "s.mcap", "--episodes", 1, "--dry-run"),
-        ("filter", path, "env = 0", "-o", out / "f.mcap", "--dry-run"),
+        ("filter", path, "--filter", "env = 0", "-o", out / "f.mcap", "--dry-run"),
         ("trust", path, "--show"),
         ("bundle", path, "-o", out / "b.mcap"),
         ("import", path, "--storage", out / "lab", "--dry-run"),

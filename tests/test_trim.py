@@ -199,7 +199,7 @@ def test_commands_of_files_directories_and_urls(tmp_path: Path) -> None:
             assert said == Recording(target).made_of
             assert [one["name"] for one in said["sources"]] == ["a.mcap", "b.mcap"]
             assert list(said["steps"].values()) == [[2, len(episode)] for episode in tupli_mcap.open(first)]
-            words = ["filter", *map(str, sources), "seed == 1", "-o", str(target), "--force"]
+            words = ["filter", *map(str, sources), "--filter", "seed == 1", "-o", str(target), "--force"]
             assert CliRunner().invoke(app, words).exit_code == 0
             assert [episode.seed for episode in Recording(target)] == [1, 1]
 

@@ -344,7 +344,9 @@ def filter_(
     sources: Sources,
     filter_text: Annotated[
         str,
-        typer.Argument(metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."),
+        typer.Option(
+            "--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."
+        ),
     ],
     output: Output,
     force: Force = False,

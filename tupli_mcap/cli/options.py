@@ -126,7 +126,7 @@ def recordings_of(sources: Sequence[str]) -> list[str]:
     for source in filter(is_server, sources):
         raise typer.BadParameter(
             f"expected recordings, found the server {shown(source)}; fetch them with tupli-mcap pull, or write its "
-            f"episodes into one file: tupli-mcap filter {shown(source)} FILTER -o FILE"
+            f"episodes into one file: tupli-mcap filter {shown(source)} --filter FILTER -o FILE"
         )
     return [file for source in sources for file in recordings_at(source)]
 
