@@ -637,6 +637,17 @@ def test_a_damaged_file_with_deleted_episodes_does_not_keep_others_from_being_fe
     assert run("pull", uri, "--storage", mine) == f"fetched 12 episodes of 1 benchmark into {mine}\n"
 
 
+def test_pull_says_why_it_fetched_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri, mine = pushed(admin, tmp_path / "lab"), tmp_path / "mine"
+    none = f"fetched 0 episodes into {mine}; no episode matches\n"
+    assert run("pull", "--filter", "steps > 100000", "--storage", mine) == none
+    assert run("pull", uri, "--storage", mine) == f"fetched 12 episodes of 1 benchmark into {mine}\n"
+    again = run("pull", uri, "--filter", "episode < 3", "--storage", mine)
+    assert again == f"fetched 0 episodes of 1 benchmark into {mine}; none of the 3 that match is new\n"
+    said = run("push", tmp_path / "lab", "--filter", "episode < 0", "--benchmark", uri)
+    assert said == f"sent 0 episodes of 1 benchmark to {admin.url}; no episode matches\n"
+
+
 def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "lab" / "run.mcap"
     path.parent.mkdir()
@@ -648,7 +659,7 @@ def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path:
     run("delete", admin.url, "--filter", "episode = 1")
     told = "not copied: 1 episode that had been deleted there\n"
     for source, line in (
-        (path.parent, f"sent 0 episodes to {admin.url}\n"),
+        (path.parent, f"sent 0 episodes to {admin.url}; none of the 3 that match is new\n"),
         (path, f"already there: 2 episodes of {path} at {admin.url}\n"),
     ):
         result = CliRunner().invoke(app, ["push", str(source)])

@@ -125,16 +125,19 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
 def _push_storage(
     client: TupliAPIClient, source: str, benchmark: str | None, chosen: BaseFilter | None, *, dry_run: bool
 ) -> _Pushed:
+    from tupli_mcap.schema import FilterEQ
     from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes
 
     with FileStorage(source) as storage:
         uri = None if benchmark is None else full_id(storage, benchmark)
         brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run)
-    ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
+        ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
+        among = None if uri is None else FilterEQ(key="benchmark_id", value=uri)
+        why = _why_none(episodes, storage, _both(among, chosen))
     what = _counts(episodes, ids)
     publish = ids[0][:8] if len(brought) == len(ids) == 1 else ""
-    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", ids, [], episodes, publish)
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}{why}", ids, [], episodes, publish)
 
 
 def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
@@ -233,17 +236,31 @@ def pull(
             among = FilterEQ(key="benchmark_id", value=uri)
         if wanted is not None:
             _check_keys([client], wanted, among)
-        chosen = wanted if among is None else among if wanted is None else among & wanted
+        chosen = _both(among, wanted)
         copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run)
-    ids = list(filter(None, copied))
-    artifacts, episodes = (sum(counts) for counts in zip(*copied.values(), strict=True)) if copied else (0, 0)
+        ids = list(filter(None, copied))
+        artifacts = sum(each.artifacts for each in copied.values())
+        episodes = sum(each.episodes for each in copied.values())
+        why = _why_none(episodes, client, chosen)
     told = {"dry_run": dry_run, "benchmarks": ids, "storage": str(storage_path)}
     verb = "would fetch" if dry_run else "fetched"
     print_result(
         {**told, "artifacts": artifacts, "episodes": episodes},
-        f"{verb} {_counts(episodes, ids)} into {storage_path}",
+        f"{verb} {_counts(episodes, ids)} into {storage_path}{why}",
         as_json=as_json,
     )
+
+
+def _why_none(copied: int, source: TupliStorage, chosen: BaseFilter | None) -> str:
+    """Why no episode was copied; empty if one was."""
+    if copied:
+        return ""
+    there = source.count_episodes(chosen)
+    return f"; none of the {there:,} that match is new" if there else "; no episode matches"
+
+
+def _both(one: BaseFilter | None, other: BaseFilter | None) -> BaseFilter | None:
+    return other if one is None else one if other is None else one & other
 
 
 def _counts(episodes: int, benchmarks: Sequence[str]) -> str:
