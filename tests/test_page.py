@@ -79,6 +79,18 @@ def addresses(client: httpx.Client) -> list[str]:
     ]
 
 
+def damage(path: Path, topic: str) -> None:
+    """Changes a byte of the only chunk with messages of a topic."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    (channel,) = (one.id for one in summary.channels.values() if one.topic == topic)
+    (chunk,) = (one for one in summary.chunk_indexes if channel in one.message_index_offsets)
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 255
+    path.write_bytes(data)
+
+
 class TestDatasets:
     def test_they_are_put_together_by_environment(self, web: httpx.Client, lab: Path) -> None:
         found = {dataset["name"]: dataset for dataset in told(web, "/")["datasets"]}
@@ -517,14 +529,7 @@ class TestOneFile:
         with tupli_mcap.RecordEpisodes(env, path, step_callback=lambda step: {"speed": 3.0}) as recorder:
             recorder.reset(seed=5, options={"low": -0.01})
             recorder.step(0)
-        with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
-        assert summary is not None
-        (channel,) = (one.id for one in summary.channels.values() if one.topic == topic)
-        (chunk,) = (one for one in summary.chunk_indexes if channel in one.message_index_offsets)
-        data = bytearray(path.read_bytes())
-        data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 255
-        path.write_bytes(data)
+        damage(path, topic)
         with browsing(path) as address, httpx.Client(base_url=address) as client:
             (uri,) = (one["id"] for one in told(client, "/episodes")["episodes"])
             text, facts = client.get(f"/episode/{uri}").text, told(client, f"/episode/{uri}")
@@ -539,6 +544,25 @@ class TestOneFile:
             assert facts["reset"]["options"] == (None if topic == "/episode_start" else {"low": -0.01})
             key = told(client, "/")["datasets"][0]["key"]
             assert ("Its steps cannot be read" in client.get(f"/dataset/{key}").text) == (topic == "/step")
+
+
+    def test_a_damaged_episode_among_others(self, tmp_path: Path) -> None:
+        for steps, name in enumerate(("a", "b"), start=1):
+            with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap") as recorder:
+                recorder.reset(seed=5)
+                for _ in range(steps):
+                    recorder.step(0)
+        damage(tmp_path / "b.mcap", "/step")
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            a, b = (one["id"] for one in told(client, "/episodes", sort="steps")["episodes"])
+            text = client.get("/compare", params={"episode": [a, b]}).text
+            assert text.count("Its steps cannot be read: the recording is damaged") == 1
+            assert "Pole Angle" in text and "return so far" in text
+            key = told(client, "/")["datasets"][0]["key"]
+            assert "<path" in client.get(f"/cover/{key}").text  # of the episode that can be read
+            refused = client.get("/download", params={"episode": [b]})
+            assert refused.status_code == 500 and "b.mcap" in refused.text
+            assert client.get("/download", params={"episode": [a]}).status_code == 200
 
 
 class TestNothingActs:

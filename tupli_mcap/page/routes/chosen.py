@@ -55,25 +55,31 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
     steps = max(len(one.episode) for one in seen)
     groups = [(title, _compared(seen, field, steps)) for field, title in FIELDS.items()]
     keys = list(dict.fromkeys(itertools.chain.from_iterable(header.metadata for header in headers)))
+    notes: dict[str, list[int]] = {}  # with the places of their episodes
+    for place, one in enumerate(seen):
+        for note in one.curves.notes:
+            notes.setdefault(note, []).append(place)
     facts = {"episodes": [dict(header) for header in headers]}
     return page(
         request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
-        groups=[(title, tracks) for title, tracks in groups if tracks],
+        groups=[(title, tracks) for title, tracks in groups if tracks], notes=notes,
     )  # fmt: skip
 
 
 def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
-    """Overlays the tracks that all episodes have."""
+    """Overlays the tracks of a field that all episodes have, but those that have none, which may be damaged."""
     each = [{track.name: track for track in one.curves.of(field)} for one in seen]
-    names = [name for name in each[0] if all(name in tracks for tracks in each)]
-    return [_overlaid(name, [tracks[name] for tracks in each], steps) for name in names]
+    some = [tracks for tracks in each if tracks]
+    names = [name for name in some[0] if all(name in tracks for tracks in some)] if some else []
+    return [_overlaid(name, [tracks.get(name) for tracks in each], steps) for name in names]
 
 
-def _overlaid(name: str, tracks: Sequence[Track], steps: int) -> Compared:
-    ends = np.array([track.ends for track in tracks])
+def _overlaid(name: str, tracks: Sequence[Track | None], steps: int) -> Compared:
+    ends = np.array([track.ends for track in tracks if track is not None])
     known = ends[np.isfinite(ends).all(axis=1)]
     both = (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
-    lines = [(track.at, track.values) for track in tracks]
+    nothing = np.empty(0), np.empty(0)
+    lines = [nothing if track is None else (track.at, track.values) for track in tracks]
     return Compared(name, charts.lines(lines, steps, both), both)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from fastapi import APIRouter, Response
@@ -11,11 +12,11 @@ from sqlalchemy import Connection
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown
-from tupli_mcap.page.curves import curves_of
+from tupli_mcap.page.curves import curves_of, readable
 from tupli_mcap.page.datasets import find_dataset
 from tupli_mcap.page.pictures import cameras_of, picture_at
 from tupli_mcap.page.routes.dataset import shown_first
-from tupli_mcap.page.shelf import find_episode, opened
+from tupli_mcap.page.shelf import Shelf, find_episode, opened
 from tupli_mcap.recording import Episode
 from tupli_mcap.schema import EpisodeHeader
 
@@ -38,20 +39,35 @@ def static(name: str) -> FileResponse:
 
 @router.get("/cover/{key:path}")
 def cover(shelf: Shown, key: str) -> Response:
-    """The picture of a dataset in lists: one of its newest episode, or else curves of it."""
+    """The picture of a dataset in lists: one of its newest episode, or else curves of it; if nothing of that can be
+    read, of its best or worst episode."""
 
-    def ask(connection: Connection) -> EpisodeHeader | None:
-        return shown_first(shelf, connection, find_dataset(shelf, connection, key), "newest")
+    def ask(show: str, connection: Connection) -> EpisodeHeader | None:
+        return shown_first(shelf, connection, find_dataset(shelf, connection, key), show)
 
-    header = shelf.ask(ask)
+    for show in ("newest", "best", "worst"):
+        header = shelf.ask(partial(ask, show))
+        answer = None if header is None else readable("picture", partial(_cover, shelf, header), [])
+        if answer is not None:
+            return answer
     if header is None:
         raise NotFoundError("this benchmark has no episodes yet")
+    return _drawing([])
+
+
+def _cover(shelf: Shelf, header: EpisodeHeader) -> Response | None:
+    """A picture or curves of an episode; None if there are none, FormatError if what they show is damaged."""
     episode = opened(shelf, header)
     cameras = cameras_of(episode)
     if cameras:
         data, media = picture_at(episode, cameras, 0, len(cameras[0].steps) // 2)
         return Response(data, media_type=media, headers=_KEPT)
-    return Response(charts.cover(_curves(episode)), media_type="image/svg+xml", headers=_KEPT | _DRAWING)
+    lines = _curves(episode)
+    return _drawing(lines) if lines else None
+
+
+def _drawing(lines: list[charts.Line]) -> Response:
+    return Response(charts.cover(lines), media_type="image/svg+xml", headers=_KEPT | _DRAWING)
 
 
 def _curves(episode: Episode) -> list[charts.Line]:
