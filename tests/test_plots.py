@@ -554,6 +554,13 @@ def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     assert dict(seedless.facts)["seeds"] == "none known"
 
 
+def test_a_wrong_option_is_that_of_what_was_called(tiny: Path) -> None:
+    with Recording(tiny) as recording, pytest.raises(TypeError, match=r"^Recording.plot\(\) got .* 'path'"):
+        recording.plot(path="report.png")  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match=r"^Dataset.plot\(\) got .* 'path'"):
+        tupli_mcap.open(tiny).plot(path="report.png")  # type: ignore[call-arg]
+
+
 def test_a_recording_that_is_open(tiny: Path) -> None:
     with Recording(tiny) as recording:
         made = recording.plot(episode=3, episode_filter=F("n_tuples") > 9)

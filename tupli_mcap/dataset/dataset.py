@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
 
 import numpy as np
 
@@ -638,10 +638,16 @@ class Dataset(RandomAccess):
 
     # ---- showing
 
-    def plot(self, **options: Any) -> Any:
+    def plot(
+        self,
+        *,
+        episode: str | int = "best",
+        episode_filter: BaseFilter | None = None,
+        x: Literal["steps", "episodes", "time"] | None = None,
+    ) -> Any:
         """A `tupli_mcap.plots.Report` of these episodes: returns, lengths, success, states, actions and one episode.
 
-        A notebook shows it; `.plot().save("report.png")` writes it. `options` are those of `tupli_mcap.plots.report`:
+        A notebook shows it; `.plot().save("report.png")` writes it. Arguments are those of `tupli_mcap.plots.report`:
         `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
 
         Raises:
@@ -649,7 +655,7 @@ class Dataset(RandomAccess):
         """
         from tupli_mcap import plots
 
-        return plots.report(self, **options)
+        return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
 
     def __repr__(self) -> str:
         return display.text("Dataset", self._facts())

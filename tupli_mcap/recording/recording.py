@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from tupli_mcap.recording.verbs import DatasetVerbs
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.schema import BaseFilter
 
 _THREADS = min(4, os.cpu_count() or 1)
 
@@ -398,10 +399,16 @@ class Recording(DescribedRecording, DatasetVerbs):
             return viewer.display(self, episodes, **options)
         return viewer.show(self, episodes, **options)
 
-    def plot(self, **options: Any) -> Any:
+    def plot(
+        self,
+        *,
+        episode: str | int = "best",
+        episode_filter: BaseFilter | None = None,
+        x: Literal["steps", "episodes", "time"] | None = None,
+    ) -> Any:
         """A `tupli_mcap.plots.Report`: returns, lengths, success, states, actions and one episode.
 
-        A notebook shows it; `.plot().save("report.png")` writes it. `options` are those of `tupli_mcap.plots.report`:
+        A notebook shows it; `.plot().save("report.png")` writes it. Arguments are those of `tupli_mcap.plots.report`:
         `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
 
         Raises:
@@ -409,7 +416,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         """
         from tupli_mcap import plots
 
-        return plots.report(self, **options)
+        return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
 
     def __reduce__(self) -> tuple[Callable[..., Recording], tuple[str, str, int]]:
         """Pickles the path: a copy in another process opens the file itself."""
