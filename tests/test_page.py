@@ -547,7 +547,7 @@ class TestOneFile:
 
 
     def test_a_damaged_episode_among_others(self, tmp_path: Path) -> None:
-        for steps, name in enumerate(("a", "b"), start=1):
+        for steps, name in enumerate(("a", "b"), start=2):
             with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap") as recorder:
                 recorder.reset(seed=5)
                 for _ in range(steps):

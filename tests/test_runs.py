@@ -468,6 +468,25 @@ class TestAnnotations:
         assert Recording(path).episodes[1].metadata["note"] == "gripper slipped"
         assert verify_recording(path).ok
 
+    def test_are_taken_back_in_python(self, tmp_path: Path) -> None:
+        for name in ("a", "b", "c"):
+            record(tmp_path / f"{name}.mcap")
+        dataset = tupli_mcap.open([tmp_path / "a.mcap", tmp_path / "b.mcap"])
+        dataset.annotate(good=True)
+        episode = dataset[0]
+        episode.annotate(note="gripper slipped")
+        assert episode.metadata == dataset.headers[0].metadata == {"good": True, "note": "gripper slipped"}
+        assert episode.undo_annotation().values == {"note": "gripper slipped"}
+        assert episode.metadata == dataset.headers[0].metadata == {"good": True}
+        assert [last.values for last in tupli_mcap.open(tmp_path).undo_annotation()] == [{"good": True}] * 2
+        assert {len(episode.metadata) for episode in tupli_mcap.open(tmp_path)} == {0}
+        with pytest.raises(RecordingError, match="expected an annotation to take back, found none"):
+            tupli_mcap.open(tmp_path).undo_annotation()
+        annotate_episodes(tmp_path / "a.mcap", {"good": False})
+        with Recording(tmp_path / "a.mcap") as recording:
+            assert recording.undo_annotation(dry_run=True) == recording.undo_annotation()
+            assert [one.metadata for one in recording.episodes] == [{}] * len(recording)
+
     def test_are_seen_by_a_storage(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")
         env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)

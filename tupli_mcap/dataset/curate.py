@@ -42,6 +42,7 @@ from tupli_mcap.storage.listing import recordings_at
 from tupli_mcap.storage.sidecar import Notes, Sidecar, storage_of
 
 if TYPE_CHECKING:
+    from tupli_mcap.recording.about.annotations import Annotation
     from tupli_mcap.storage import FileStorage, TupliStorage
 
 
@@ -287,18 +288,40 @@ def relabel(
 
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     """See `Dataset.annotate`."""
-    numbers = numbers_by_recording(dataset.headers)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # to list the episodes gave the same ones
-        recordings = dict(dataset.opened())
+    numbers, recordings = numbers_by_recording(dataset.headers), _recordings_of(dataset)
 
     def change(name: str, dry: bool) -> None:
         recordings[name].annotate(numbers[name], values, dry_run=dry)
 
     change_all(recordings, change, dry_run=False)
-    for header in dataset.headers:
-        noted = recordings[header.recording].annotations
-        header.metadata = noted.applied(header.episode, header.metadata)
+    _read_metadata_again(dataset, recordings)
+
+
+def undo_annotation(dataset: Episodes) -> list[Annotation]:
+    """See `Dataset.undo_annotation`."""
+    noted = {name: one for name, one in _recordings_of(dataset).items() if one.annotations.said}
+    if not noted:
+        raise RecordingError(
+            "expected an annotation to take back, found none in the recordings of the dataset"
+        )
+    found = change_all(noted, lambda name, dry: noted[name].undo_annotation(dry_run=dry), dry_run=False)
+    _read_metadata_again(dataset, noted)
+    return found
+
+
+def _recordings_of(dataset: Episodes) -> dict[str, Recording]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # to list the episodes gave the same ones
+        return dict(dataset.opened())
+
+
+def _read_metadata_again(dataset: Episodes, recordings: Mapping[str, Recording]) -> None:
+    """Gives the dataset's episodes of these recordings the metadata that they have now."""
+    listed = by_recording(dataset.headers)
+    for name, recording in recordings.items():
+        positions = positions_of(recording, ListedEpisodes.of(name, listed[name]))
+        for header, position in zip(listed[name], positions.tolist(), strict=True):
+            header.metadata = recording.episode_metadata(position)
 
 
 def delete(

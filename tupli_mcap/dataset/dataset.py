@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from tupli_mcap.dataset.columns.tables import Level
+    from tupli_mcap.recording.about.annotations import Annotation
 
 Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
 
@@ -603,8 +604,8 @@ class Dataset(RandomAccess):
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episodes, in their files: `ds.filter("return > 100").annotate(success=True)`.
 
-        Values take precedence over the metadata that were recorded; None removes a key. `tupli-mcap tag PATH --undo`
-        takes them back. If one recording cannot be changed, none is. The episodes of this dataset have the values; one
+        Values take precedence over the metadata that were recorded; None removes a key. `undo_annotation` takes them
+        back. If one recording cannot be changed, none is. The episodes of this dataset have the values; one
         that was listed apart from it has to be opened again.
 
         Raises:
@@ -613,6 +614,17 @@ class Dataset(RandomAccess):
             FormatError: a recording is damaged.
         """
         curate.annotate(self._whole(), values)
+
+    def undo_annotation(self) -> list[Annotation]:
+        """Takes the last annotation of each of its recordings back, from all its episodes, and returns them.
+
+        Recordings without an annotation stay as they are. If one recording cannot be changed, none is.
+
+        Raises:
+            RecordingError: no recording has an annotation, or as `annotate`.
+            FormatError: a recording is damaged.
+        """
+        return curate.undo_annotation(self._whole())
 
     def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
         """Deletes the episodes where they are stored: `ds.filter("return < 0").delete()`; returns their number.

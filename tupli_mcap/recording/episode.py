@@ -19,6 +19,7 @@ from tupli_mcap.schema import F, RLTuple
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.recording.about.annotations import Annotation
     from tupli_mcap.recording.about.run import Run
     from tupli_mcap.recording.columns.read import Columns
     from tupli_mcap.recording.frames import Frames
@@ -184,10 +185,23 @@ class Episode(GymnasiumNames):
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episode, in its file: `annotate(success=True, note="gripper slipped")`.
 
-        Values take precedence over the metadata that were recorded; None removes a key. `Dataset.annotate` does this
-        for many episodes at once.
+        Values take precedence over the metadata that were recorded; None removes a key. `undo_annotation` takes them
+        back. `Dataset.annotate` does this for many episodes at once.
         """
         self._recording.annotate([self.number], values)
+        self._read_metadata_again()
+
+    def undo_annotation(self) -> Annotation:
+        """Takes the last annotation of its recording back, from all its episodes, and returns it.
+
+        Raises:
+            RecordingError: the recording has no annotation, or cannot be changed.
+        """
+        last = self._recording.undo_annotation()
+        self._read_metadata_again()
+        return last
+
+    def _read_metadata_again(self) -> None:
         self.__dict__.pop("metadata", None)
         if self.listed is not None:
             self.listed.metadata = self.metadata

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 
@@ -24,9 +24,13 @@ from tupli_mcap.recording.index import LARGE_SEED
 from tupli_mcap.recording.verbs import DatasetVerbs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tupli_mcap.dataset import Dataset
+    from tupli_mcap.recording.about.annotations import Annotation
     from tupli_mcap.schema import BaseFilter
 
+T = TypeVar("T")
 _THREADS = min(4, os.cpu_count() or 1)
 
 
@@ -92,6 +96,20 @@ class Recording(DescribedRecording, DatasetVerbs):
         """
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
+        self._annotated(lambda path: annotate_episodes(path, values, episodes, dry_run=dry_run), episodes)
+
+    def undo_annotation(self, *, dry_run: bool = False) -> Annotation:
+        """Takes the last annotation back from all its episodes, and returns it; `dry_run` only returns it.
+
+        Raises:
+            RecordingError: there is none, or as `annotate`.
+        """
+        from tupli_mcap.recording.edit.annotate import undo_annotation
+
+        return self._annotated(lambda path: undo_annotation(path, dry_run=dry_run))
+
+    def _annotated(self, change: Callable[[Path], T], episodes: Sequence[int] | None = None) -> T:
+        """Changes the annotations in the file, of these episodes; returns what the change returned."""
         if self.path is None:
             # a user knows an episode of a server by its id, not by the path of its recording there
             what = f"episode {self.uuid}-{episodes[0]}" if episodes else self.name
@@ -101,9 +119,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         with Recording(self.path) as there:
             if there.uuid != self.uuid:
                 raise RecordingError(f"{self.path} is another recording now; open it again")
-        annotate_episodes(self.path, values, episodes, dry_run=dry_run)
+        found = change(self.path)
         with Recording(self.path) as changed:
             self.annotations = changed.annotations
+        return found
 
     # ---- episodes
 
