@@ -1654,6 +1654,20 @@ class TestProgram:
         for line, seed in zip(lines, (1, 2), strict=True):
             assert f"  ppo-seed{seed}  " in line and not line.endswith("…")
 
+    @pytest.mark.parametrize("width", [100, 110, 130])
+    def test_episodes_show_the_whole_names_of_their_runs(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch, width: int
+    ) -> None:
+        for seed in (1, 2):
+            path = f"runs/ppo-without-normalisation-{seed}.mcap"
+            ok("record", "CartPole-v1", "-o", path, "--seed", str(seed))
+            ok("tag", path, "--episodes", "all", "success=true", "note=gripper slipped, and was caught again")
+        monkeypatch.setenv("COLUMNS", str(width))
+        title, *lines = ok("episodes", "runs").splitlines()
+        assert ("ENDED" in title) == (width == 130)
+        for line in lines:
+            assert re.search("  ppo-without-normalisation-[12]  .* success=true", line)
+
     @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
     def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:
         pid, fd = pty.fork()

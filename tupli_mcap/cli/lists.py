@@ -115,6 +115,7 @@ _MEANT = {
 }
 """Other names for columns, for a hint."""
 _SETTING = "run.metadata."
+_WHOLE_NAME: Final = 32  # characters of a run's name that are not cut where there is room
 
 
 def ls(
@@ -422,13 +423,16 @@ def print_episodes(
         return
     names = {(header.recording, header.run.get("name", "")) for header in among}
     by_run = len({name for _, name in names}) == len(names) > 0
-    source = Column("RUN", shrink="end") if by_run else Column("RECORDING", shrink="start")
+    roomy = is_roomy()
+    least = _WHOLE_NAME if roomy else 8
+    title, end = ("RUN", "end") if by_run else ("RECORDING", "start")
+    source = Column(title, shrink=end, least=least)
 
     def source_of(header: EpisodeHeader) -> str:
         return str(header.run.get("name", "")) if by_run else short_path(header.recording)
 
-    roomy = is_roomy()
     several_envs = any(header.env for header in headers)
+    with_times = is_wide() or (roomy and not any(header.metadata for header in headers))
     returns = numbers([header.episode_return for header in headers])
     columns = (
         Column("ID") if several else Column("EPISODE", "right"),
@@ -450,7 +454,7 @@ def print_episodes(
             total,
             h.end,
             "" if h.seed is None else str(h.seed),
-            when(h.created_at) if roomy else "",
+            when(h.created_at) if with_times else "",
             pairs_of(h.metadata),
         )
         for h, total in zip(headers, returns, strict=True)

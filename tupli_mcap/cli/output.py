@@ -25,11 +25,13 @@ _STORED = re.compile(r"\brecordings/[0-9a-f]{64}/")
 
 
 class Column(NamedTuple):
-    """A column of a table; `shrink` says which end of its values is cut if the terminal is too narrow."""
+    """A column of a table; `shrink` says which end of its values is cut if the terminal is too narrow, down to `least`
+    characters."""
 
     title: str
     align: Literal["left", "right"] = "left"
     shrink: Literal["start", "end"] | None = None
+    least: int = 8
 
 
 def print_table(
@@ -274,7 +276,7 @@ def _fit(columns: Sequence[Column], widths: list[int]) -> None:
     excess = sum(widths) + len(_GAP) * (len(widths) - 1) - limit
     while excess > 0 and shrinkable:
         widest = max(shrinkable, key=lambda i: widths[i])
-        least = max(len(columns[widest].title), 8)
+        least = max(len(columns[widest].title), columns[widest].least)
         if widths[widest] <= least:
             shrinkable.remove(widest)
             continue
