@@ -278,6 +278,17 @@ class TestEpisodes:
         assert [track.name for track in tracks] == names
         assert [told[name] for name in names] == ["123456789", "1.5", "-2"] and told["info.note"] == "[1, 2]"
 
+    def test_a_depth_is_a_picture_without_curves(self, tmp_path: Path) -> None:
+        space = gym.spaces.Dict({"depth": gym.spaces.Box(0, 9, (16, 16)), "q": gym.spaces.Box(-1, 1, (2,))})
+        with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
+            writer.begin()
+            writer.step(space.sample(), 1, 1.0, True)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            (uri,) = (one["id"] for one in told(client, "/episodes")["episodes"])
+            text = client.get(f"/episode/{uri}").text
+            assert "state.depth is a picture (16 x 16) and has no curves." in text
+            assert "state.q[1]" in text and "state.depth[" not in text
+
     def test_pictures(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
         picture = web.get(f"/episode/{uri}/picture/0/3")
@@ -544,7 +555,6 @@ class TestOneFile:
             assert facts["reset"]["options"] == (None if topic == "/episode_start" else {"low": -0.01})
             key = told(client, "/")["datasets"][0]["key"]
             assert ("Its steps cannot be read" in client.get(f"/dataset/{key}").text) == (topic == "/step")
-
 
     def test_a_damaged_episode_among_others(self, tmp_path: Path) -> None:
         for steps, name in enumerate(("a", "b"), start=2):

@@ -334,6 +334,22 @@ def test_pictures_of_an_episode(tmp_path: Path) -> None:
     assert {picture.shape for _, picture in pictures} == {(4, 5, 3)}
 
 
+@pytest.mark.parametrize("shape", [(16, 20), (16, 20, 1), (3, 16, 20)])
+def test_depths_are_pictures(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    def depth(n: int) -> Any:
+        return np.full(shape, np.nan if n == 3 else n / 2, np.float32)
+
+    path = scripted(tmp_path / "r.mcap", depth, spaces.Box(0, np.inf, shape), 10, length=10)
+    made = report(path)
+    ((_, trace),) = made.traces
+    assert not trace.values.keys() & {"state"}
+    (pictures,) = trace.pictures.values()
+    assert {picture.shape[:2] for _, picture in pictures} == {(16, 20)}
+    shades = [int(picture.flat[0]) for _, picture in pictures]
+    assert shades[:3] == [0, 28, 0] and shades[5] == 255  # of 0, 0.5, NaN, ..., 4.5
+    made.png()
+
+
 def test_recorded_frames_are_shown_beside_images_of_states(tmp_path: Path) -> None:
     class Filmed(Scripted):
         metadata = {"render_modes": ["rgb_array"]}
@@ -395,6 +411,7 @@ KINDS: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
     "wide": (spaces.Box(-1, 1, (400,)), spaces.Box(-1, 1, (20,))),
     "pixels": (spaces.Box(0, 255, (48, 64, 3), np.uint8), spaces.Box(0, 1, (2, 2), np.bool_)),
     "grey": (spaces.Box(0, 255, (30, 20), np.uint8), spaces.Box(-5, 5, (), np.int32)),
+    "depth": (spaces.Box(0, 5, (16, 16)), spaces.Box(0, 1, (20, 20), np.bool_)),
     "nothing": (spaces.Dict({}), spaces.Box(0, 1, (0,))),
     "text": (spaces.Text(6), spaces.Graph(spaces.Discrete(3), None)),
 }

@@ -425,8 +425,11 @@ def print_episodes(
     by_run = len({name for _, name in names}) == len(names) > 0
     roomy = is_roomy()
     least = _WHOLE_NAME if roomy else 8
-    title, end = ("RUN", "end") if by_run else ("RECORDING", "start")
-    source = Column(title, shrink=end, least=least)
+    source = (
+        Column("RUN", shrink="end", least=least)
+        if by_run
+        else Column("RECORDING", shrink="start", least=least)
+    )
 
     def source_of(header: EpisodeHeader) -> str:
         return str(header.run.get("name", "")) if by_run else short_path(header.recording)

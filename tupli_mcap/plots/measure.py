@@ -320,7 +320,7 @@ def _frames(recording: Recording, position: int) -> list[tuple[str, Array]]:
 
 
 def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> list[tuple[str, Array]]:
-    """Images in states of an episode at even distances, and the mean of more of them."""
+    """The pictures of a leaf in an episode at even distances, and the mean of more of them."""
     shown, averaged = (
         np.unique(np.linspace(0, length - 1, count).astype(np.int64)).tolist()
         for count in (_FRAMES, _AVERAGED)
@@ -328,12 +328,27 @@ def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> l
     pictures = []
     total: Array = np.zeros(())
     for step in sorted({*shown, *averaged}):
-        value = leaf.get(recording.read_steps(position, step, step + 1, ("states",)).states)[0]
+        field = f"{leaf.root}s"
+        value = leaf.get(recording.read_steps(position, step, step + 1, (field,))[field])[0]
         if leaf.kind == "stack":
             value = value[..., -1] if leaf.frames_last else value[-1]
         frame = value if value.ndim == 2 or value.shape[2] in (1, 3, 4) else value[-1]
+        frame = frame if leaf.dtype == np.uint8 else drawable_numbers(frame)
         if step in shown:
             pictures.append((f"step {step}", frame))
         if step in averaged:
             total = total + frame
-    return [*pictures, (f"mean of {len(averaged)}", (total / len(averaged)).astype(np.uint8))]
+    pictures.append((f"mean of {len(averaged)}", total / len(averaged)))
+    titles, frames = zip(*pictures, strict=True)
+    return list(zip(titles, _shades(np.stack(frames), leaf), strict=True))
+
+
+def _shades(values: Array, leaf: Leaf) -> Array:
+    """Values of pictures as uint8; those that are no bytes, such as depths, from the smallest to the largest of
+    them."""
+    if leaf.dtype == np.uint8:
+        return values.astype(np.uint8)
+    known = values[np.isfinite(values)]
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 0.0)
+    scaled = (np.where(np.isfinite(values), values, low) - low) * (255 / (high - low) if high > low else 0)
+    return scaled.astype(np.uint8)

@@ -116,11 +116,18 @@ class LeafValues:
 def _kind(leaf: Leaf) -> Kind:
     if leaf.kind == "variable":
         return "variable"
-    # Grey pictures, and stacks of them: (height, width) or (n, height, width).
-    grey = leaf.dtype == np.uint8 and isinstance(leaf.space, spaces.Box) and len(leaf.shape) in (2, 3)
-    if leaf.apart or (grey and leaf.size and min(leaf.shape[-2:]) >= _SMALLEST_PICTURE):
+    if leaf.apart or (isinstance(leaf.space, spaces.Box) and leaf.size and _is_picture(leaf.shape)):
         return "picture"
     return "numbers" if leaf.size else "empty"
+
+
+def _is_picture(shape: tuple[int, ...]) -> bool:
+    """Whether it is the shape of a picture, (height, width) or (height, width, 1 | 3 | 4), or of a stack of grey ones:
+    (n, height, width). Depths and heat maps are pictures, too."""
+    if len(shape) not in (2, 3):
+        return False
+    sides = shape[:2] if shape[2:] in ((1,), (3,), (4,)) else shape[-2:]
+    return min(sides) >= _SMALLEST_PICTURE
 
 
 def running_mean(values: Array, window: int) -> Array:
