@@ -451,6 +451,9 @@ class TestAnnotations:
         ds[1].annotate(success=True, note="gripper slipped")
         assert ds[1].metadata == {"score": 1, "success": True, "note": "gripper slipped"}
         assert ds[0].metadata == {"score": 1, "success": False}
+        assert (ds[0].success, ds[1].success) == (False, True)
+        ds[0].annotate(success=None)
+        assert ds[0].success is None and ds[0].undo_annotation().values == {"success": None}
         again = tupli_mcap.open(path)
         assert [episode.number for episode in again.filter("metadata.success")] == [1]
         assert Recording(path).recorded_metadata(1) == {"score": 1, "success": False}

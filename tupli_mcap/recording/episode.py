@@ -14,6 +14,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import short_repr
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
+from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.fields import GymnasiumNames
 from tupli_mcap.schema import F, RLTuple
 
@@ -181,6 +182,12 @@ class Episode(GymnasiumNames):
     def metadata(self) -> dict[str, Any]:
         """The metadata: what the metadata callback last returned, with annotations applied."""
         return self._recording.episode_metadata(self._position)
+
+    @property
+    def success(self) -> bool | None:
+        """Whether it succeeded: `success` or `is_success` of its metadata, if that is true, false, 0 or 1; else
+        None."""
+        return success_of(self.metadata)
 
     def annotate(self, **values: Any) -> None:
         """Adds metadata to the episode, in its file: `annotate(success=True, note="gripper slipped")`.

@@ -18,7 +18,7 @@ from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import RecordingError, asking
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.about.success import KEYS, success_of
+from tupli_mcap.recording.about.success import KEYS
 from tupli_mcap.viewer.about import run_title, send_about
 from tupli_mcap.viewer.blocks import Block, blocks_of, row_counts
 from tupli_mcap.viewer.blueprints import blueprint_of
@@ -237,9 +237,9 @@ def _told_in_turn(parts: Sequence[ShownEpisodes]) -> Iterator[str]:
 
 def _episode_told(recording: Recording, position: int) -> str:
     """An episode's facts and metadata in Markdown."""
-    metadata = recording.episodes[position].metadata
-    said = () if success_of(metadata) is None else KEYS  # in the line before
-    others = [(key, value) for key, value in metadata.items() if key not in said]
+    episode = recording.episodes[position]
+    said = () if episode.success is None else KEYS  # in the line before
+    others = [(key, value) for key, value in episode.metadata.items() if key not in said]
     lines = "".join(f"\n- {plain(key)}: {plain(shown(value))}" for key, value in others[:20])
     return f"{_episode_in_short(recording, position)}\n{lines}"
 
@@ -249,8 +249,7 @@ def _episode_in_short(recording: Recording, position: int, of: str = "") -> str:
     episode = recording.episodes[position]
     facts = ["1 step" if len(episode) == 1 else f"{len(episode):,} steps"]
     facts += [f"return {episode.return_:.6g}", episode.end]
-    succeeded = success_of(episode.metadata)
-    facts += [] if succeeded is None else ["success" if succeeded else "no success"]
+    facts += [] if episode.success is None else ["success" if episode.success else "no success"]
     facts += [] if episode.seed is None else [f"seed {episode.seed}"]
     return f"**Episode {episode.number}**{of}: {', '.join(facts)}"
 
