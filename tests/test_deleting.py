@@ -187,7 +187,13 @@ def test_never_a_whole_recording_by_the_way(runs: Path) -> None:
     assert "which nothing brings back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
     assert seeds(runs) == [0, 1, 2, 3] * 2
     assert "say which" in run("delete", str(runs), code=2)
-    run("delete", str(runs / "a.mcap"), "--episodes", "all", "--force")
+    words = "delete", str(runs / "a.mcap"), "--episodes", "all", "--force"
+    size = bytes_of((runs / "a.mcap").stat().st_size)
+    gone = f"{runs / 'a.mcap'} ({size}), which nothing brings back\n"
+    assert run(*words, "--dry-run") == f"would delete 4 episodes\nwould remove {gone}"
+    some = run("delete", str(runs / "a.mcap"), "--episodes", "0-2", "--force", "--dry-run")
+    assert some == "would delete 3 episodes\n"
+    assert run(*words) == f"deleted 4 episodes\nremoved {gone}"
     assert [path.name for path in runs.rglob("*.mcap")] == ["b.mcap"]
 
 

@@ -141,7 +141,10 @@ def delete(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Remove recordings whose episodes are all deleted.")
+        bool,
+        typer.Option(
+            "--force", help="Remove recordings whose episodes are all deleted, which nothing undoes."
+        ),
     ] = False,
     dry_run: DryRun = False,
     as_json: Json = False,
@@ -150,7 +153,8 @@ def delete(
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json
-    still shows them. Episodes on a server are gone.
+    still shows them. Episodes on a server are gone. So is a recording that loses all of its
+    episodes, which needs --force; --dry-run names it.
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
@@ -164,30 +168,43 @@ def delete(
         ids = [header.id for header in chosen.headers]
         if not ids:
             raise none_in(places, filter_text)
-        count = chosen.delete(force=force, dry_run=dry_run)
+        count, removed = chosen.delete(force=force, dry_run=dry_run), dict[str, int]()
     else:
         paths = list(map(local_path, places))
-        ids, count = _delete_in_files(paths, episodes, filter_text, force, dry_run)
+        ids, count, removed = _delete_in_files(paths, episodes, filter_text, force, dry_run)
+    would = "would " if dry_run else ""
     print_result(
-        {"dry_run": dry_run, "episodes": ids},
-        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
+        {"dry_run": dry_run, "episodes": ids, "removed": list(removed)},
+        f"{would}{'delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
+        *(
+            f"{would}{'remove' if dry_run else 'removed'} {file} ({bytes_of(size)}), which nothing brings back"
+            for file, size in removed.items()
+        ),
         as_json=as_json,
     )
 
 
 def _delete_in_files(
     paths: Sequence[Path], episodes: str | None, filter_text: str | None, force: bool, dry_run: bool
-) -> tuple[list[str], int]:
-    """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
+) -> tuple[list[str], int, dict[str, int]]:
+    """Deletes episodes; returns the ids of those that were chosen, how many were still there, and the sizes of the
+    recordings that had no others, by path."""
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
+    from tupli_mcap.dataset.which import candidates
+    from tupli_mcap.recording import Recording
     from tupli_mcap.storage.base import episode_id
 
     gathered = Gathered()
     doomed = chosen_in(paths, episodes, filter_text, gathered)
     gathered.raise_all()
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
-    return ids, curate.delete(FilesSource(file for file, _ in doomed), doomed, force=force, dry_run=dry_run)
+    source, removed = FilesSource(file for file, _ in doomed), dict[str, int]()
+    for (file, _), numbers in doomed.items() if force else ():
+        with Recording(file) as recording:
+            if len(candidates(recording)) == len(numbers):
+                removed[file] = Path(file).stat().st_size
+    return ids, curate.delete(source, doomed, force=force, dry_run=dry_run), removed
 
 
 def restore(
