@@ -15,7 +15,7 @@ from gymnasium.wrappers import FrameStackObservation, RescaleAction
 from jsonschema import Draft202012Validator
 
 import tupli_mcap
-from tupli_mcap import FormatError, RecordEpisodes, Recording, SpaceError
+from tupli_mcap import F, FilterError, FormatError, RecordEpisodes, Recording, SpaceError
 from tupli_mcap.environment import documented_labels
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -305,3 +305,35 @@ def test_labels_on_which_recordings_differ_are_not_used(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="have different labels of state; indexes"):
         tupli_mcap.merge_recordings(sources, tmp_path / "all.mcap")
     assert Recording(tmp_path / "all.mcap").labels == Labels({"action": ("left", "right")}, {})
+
+
+def test_filters_of_steps_understand_them(tmp_path: Path) -> None:
+    parts = {"joints": spaces.Box(-9, 9, (2,)), "held": spaces.Discrete(3, start=5), "mode": spaces.Text(9)}
+    given = {"joints": ["shoulder", "elbow"], "held": ["a", "b", "c"], "action": ["left", "right"]}
+    with tupli_mcap.EpisodeWriter(
+        tmp_path / "r.mcap", spaces.Dict(parts), spaces.Discrete(2), labels=given
+    ) as writer:
+        writer.begin()
+        for i in range(6):
+            state = {"joints": np.array([i, -i], np.float32), "held": 5 + i % 3, "mode": "ab"[i // 3]}
+            writer.step(state, i % 2, 1.0, i == 5, info={"phase": "grasp" if i < 2 else "lift"})
+    dataset = tupli_mcap.open(tmp_path)
+
+    def steps(test: Any) -> list[int]:
+        return dataset.filter_steps(test).read(["states"]).states["joints"][:, 0].astype(int).tolist()
+
+    assert steps("state.joints.elbow < -3") == steps("observation.joints.shoulder > 3") == [4, 5]
+    assert steps('action = "right"') == [1, 3, 5]
+    assert steps('action != "right" and not state.held = "a"') == [2, 4]
+    assert steps(F("states.held").isin(["a", "c"])) == [0, 2, 3, 5]
+    assert steps("next_state.held = 'a' and state.joints[0] < 3") == [2]
+    assert steps("info.phase == 'grasp'") == [0, 1]
+    assert steps("state.mode = 'b' or info.phase ~ 'gra'") == [0, 1, 3, 4, 5]
+    for wrong, why in (
+        ('action = "rihgt"', r"did you mean 'right'\?"),
+        ('action > "left"', "with =, != or in"),
+    ):
+        with pytest.raises(FilterError, match=f"'action' is one of left, right: .*{why}"):
+            steps(wrong)
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert recording.filter_steps("action = 'left'").n_steps == 3

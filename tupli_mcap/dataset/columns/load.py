@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.columns.labels import StepLabels
 from tupli_mcap.dataset.columns.tuples import Tuples
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
@@ -27,6 +28,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, ev
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
 from tupli_mcap.schema.keys import name_within
+from tupli_mcap.spaces.labels import Labels
 
 _BLOCK_BYTES = 64 << 20
 
@@ -146,19 +148,19 @@ class _Reader:
         for block in whole_episodes(lengths, max(1, most)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed)
             steps = int(lengths[block].sum())
-            keep = self._keep(columns, steps, layout)
+            keep = self._keep(columns, steps, recording)
             for field, builder in self._builders.items():
                 builder.put(columns[field], keep)
             self._done += steps
             bar.advance(steps)
 
-    def _keep(self, columns: dict[str, Any], steps: int, layout: StepLayout) -> Array | None:
+    def _keep(self, columns: dict[str, Any], steps: int, recording: Recording) -> Array | None:
         block = slice(self._done, self._done + steps)
         if self._known is not None:
             return None if self._known.mask is None else self._known.mask[block]
         if self._selector is None or self._mask is None:
             return None
-        self._mask[block] = self._selector.mask(columns, layout)
+        self._mask[block] = self._selector.mask(columns, recording.layout, recording.labels)
         self._info_paths.update(*map(paths_in, columns.get("infos", ())))
         return self._mask[block]
 
@@ -330,14 +332,15 @@ class TupleSelector:
     def __and__(self, other: TupleSelector) -> TupleSelector:
         return TupleSelector(*self.filters, *other.filters)
 
-    def mask(self, columns: Mapping[str, Any], layout: StepLayout) -> Mask:
-        """A mask of the wanted steps of `columns` (by field, at least `self.fields`).
+    def mask(self, columns: Mapping[str, Any], layout: StepLayout, labels: Labels) -> Mask:
+        """A mask of the wanted steps of `columns` of a recording (by field, at least `self.fields`).
         FilterError if an expression does not fit the columns, or a function returned no flag."""
+        names = StepLabels(layout, labels)
         mask = np.ones(len(columns["terminals"]), np.bool_)
         for test in self._tests:
             if isinstance(test, BaseFilter):
                 steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
-                mask &= evaluate_columns(test, steps)
+                mask &= evaluate_columns(names.applied(test), steps)
             else:
                 tuples, rows = Tuples(columns, layout), np.flatnonzero(mask)
                 mask[rows] = [_flag(test(tuples[row])) for row in rows.tolist()]

@@ -1,0 +1,57 @@
+"""Labels in filters of steps: names of elements and of values, as what they stand for in a recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tupli_mcap.errors import FilterError, did_you_mean
+from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.recording.columns.fields import FIELD_OF, step_name
+from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, join_key
+from tupli_mcap.schema.filters import COMBINING, path_of
+from tupli_mcap.spaces.labels import Labels
+
+_EQUAL = (FilterType.EQ, FilterType.NE, FilterType.IN)
+
+
+class StepLabels:
+    """The labels of a recording, by the paths that filters name: `state.Pole Angle` is `state[2]`, and the value "left"
+    of `action` is 0."""
+
+    def __init__(self, layout: StepLayout, labels: Labels) -> None:
+        self._elements: dict[tuple[str, ...], tuple[str, ...]] = {}
+        self._values: dict[tuple[str, ...], dict[str, int]] = {}
+        for leaf in (*layout.state, *layout.action, *layout.reward):
+            path = (leaf.root, *map(str, leaf.keys))
+            for i, name in enumerate(labels.dimensions.get(leaf.path, ())):
+                if not name.isdigit():  # it would be an index
+                    self._elements[*path, name] = tuple(map(str, np.unravel_index(i, leaf.shape)))
+            if names := labels.values.get(leaf.path):
+                space: Any = leaf.space
+                self._values[path] = {name: int(space.start) + i for i, name in enumerate(names)}
+
+    def applied(self, filter: BaseFilter) -> BaseFilter:
+        """The filter without labels. FilterError if it compares a value that has labels with another text."""
+        if filter.type in COMBINING:
+            return filter.model_copy(update={"filters": tuple(map(self.applied, filter.filters))})
+        first, *inside = path_of(filter)
+        path = (step_name(FIELD_OF.get(first, first)).removeprefix("next_"), *inside)
+        if index := self._elements.get(path):
+            return filter.model_copy(update={"key": join_key([first, *inside[:-1], *index])})
+        values = filter.value if filter.type is FilterType.IN else [filter.value]
+        if path not in self._values or not any(isinstance(value, str) for value in values):
+            return filter
+        numbers = [self._number(filter, value, self._values[path]) for value in values]
+        found = FilterIN(key=filter.key, value=numbers)
+        return ~found if filter.type is FilterType.NE else found
+
+    @staticmethod
+    def _number(filter: BaseFilter, value: Any, names: dict[str, int]) -> Any:
+        if filter.type in _EQUAL and (not isinstance(value, str) or value in names):
+            return names.get(value, value)
+        raise FilterError(
+            f"{filter.key!r} is one of {', '.join(names)}: expected a comparison with =, != or in, and one of them, "
+            f"found {filter!s:.80}{did_you_mean(value, names)}"
+        )
