@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import shutil
 import tempfile
-from collections import deque
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -27,7 +26,6 @@ MOST_COMPARED = 8
 MOST_MERGED = 256
 """Most recordings of an answer: all of them are open at the same time."""
 _MEDIA = "application/octet-stream"
-_HELD = 8 << 20  # bytes of an answer that are made before the first is sent
 
 
 def recording_of(shelf: Shelf, numbers_of: Mapping[str, Sequence[int]]) -> StreamingResponse:
@@ -52,7 +50,7 @@ def streamed(
 
 
 def in_pieces(pieces: Generator[bytes], media: str, **headers: str) -> StreamingResponse:
-    """An answer that is made while it is sent. Errors of its first 8 MiB are raised; later ones end the connection."""
+    """An answer that is made while it is sent. Errors of its first piece are raised; later ones end the connection."""
     return _Streamed(pieces, media_type=media, headers=headers)
 
 
@@ -60,12 +58,7 @@ class _Streamed(StreamingResponse):
     """An answer that closes its generator when it ends, also if the client disconnects."""
 
     def __init__(self, pieces: Generator[bytes], **more: Any) -> None:
-        held: deque[bytes] = deque()
-        size = 0
-        while size < _HELD and (piece := next(pieces, b"")):
-            held.append(piece)
-            size += len(piece)
-        super().__init__(_and_then(held, pieces), **more)
+        super().__init__(itertools.chain([next(pieces)], pieces), **more)
         self._pieces = pieces
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -73,12 +66,6 @@ class _Streamed(StreamingResponse):
             await super().__call__(scope, receive, send)
         finally:
             self._pieces.close()
-
-
-def _and_then(held: deque[bytes], rest: Iterator[bytes]) -> Iterator[bytes]:
-    while held:
-        yield held.popleft()
-    yield from rest
 
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
