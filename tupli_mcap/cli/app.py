@@ -316,9 +316,9 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning", "doctor run.mcap --episodes best,worst"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": (
-        "filter run.mcap --filter 'return > 100 and metadata.success' -o good.mcap",
+        "filter a.mcap --filter 'return > 9 and metadata.success' -o b.mcap",
         "filter runs/ --filter 'run.name ~ \"ppo\"' -o ppo.mcap",
-        "filter https://example.org/run.mcap --filter 'return > 100' -o good.mcap",
+        "filter https://example.org/a.mcap --filter 'return > 100' -o b.mcap",
     ),
     "delete": (
         "delete run.mcap --episodes 3,7",
