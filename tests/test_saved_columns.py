@@ -23,6 +23,7 @@ from gymnasium import spaces
 from hypothesis import given, strategies as st
 from test_sampling_properties import FEW, Library, dataset_of, libraries
 
+import tupli_mcap
 from tupli_mcap import F, FileStorage, RecordEpisodes, TupliDataset, files
 from tupli_mcap.dataset import DatasetError, SavedColumns, open_columns
 from tupli_mcap.dataset.access import RandomAccess
@@ -305,6 +306,21 @@ def test_a_copy_maps_the_same_columns_or_none(
     assert len(windows[:].states)  # mapped before
 
 
+def test_columns_of_an_opened_dataset(cart: Files, tmp_path: Path) -> None:
+    """Sorted, filtered, without some steps, and read within another budget."""
+    cart()
+    dataset = tupli_mcap.open(tmp_path).with_cache(1 << 20, threads=1)
+    dataset = dataset.filter("steps > 10").sort("return").filter_steps("action = 1")
+    assert (dataset.steps.cache_bytes, dataset.steps.threads) == (1 << 20, 1)  # type: ignore[attr-defined]
+    dataset.save_columns(tmp_path / "columns")
+    columns = open_columns(tmp_path / "columns")
+    assert columns.preview() == dataset.headers
+    assert same(columns.windows(3, pad="repeat")[:].asdict(), dataset.windows(3, pad="repeat")[:].asdict())
+    assert np.array_equal(columns.steps.episode_lengths, dataset.lengths)
+    with pytest.raises(SamplingError, match="expected a budget in bytes"):
+        dataset.with_cache(-1)
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_torch_loaders_give_the_same_batches(cart: Files, tmp_path: Path, workers: int) -> None:
     torch = pytest.importorskip("torch")
@@ -338,7 +354,7 @@ def test_torch_loaders_give_the_same_batches(cart: Files, tmp_path: Path, worker
 def test_what_cannot_be_saved(cart: Files, tmp_path: Path) -> None:
     goal = tmp_path / "columns"
     for none in (cart().with_episode_filter(F("n_tuples") > 1000), cart().with_tuple_filter(F("reward") > 2)):
-        with pytest.raises(DatasetError, match="expected steps to save, found none; see preview"):
+        with pytest.raises(DatasetError, match="expected steps to save, found none; choose"):
             none.save_columns(goal)
     with pytest.raises(DatasetError, match="expected the path of a directory of columns, found None"):
         cart().save_columns(None)  # type: ignore[arg-type]

@@ -23,6 +23,7 @@ from tupli_mcap.dataset.columns.load import (
     read_in_order,
     steps_within,
 )
+from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.statistics import (
     STATISTICAL,
     FieldStatistics,
@@ -33,6 +34,7 @@ from tupli_mcap.dataset.columns.statistics import (
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
 from tupli_mcap.dataset.items.beside import INFOS, FrameValues, info_columns, info_keys
 from tupli_mcap.dataset.items.index import positions_of
+from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.keys import check_metadata, keys_of, matching, values_at
 from tupli_mcap.dataset.sources import (
     DatasetError,
@@ -87,6 +89,7 @@ class Dataset(RandomAccess):
         self._known: Selected | None = None  # what it has found
         self._recordings = OpenRecordings(source.open)
         self._steps: RecordedSteps | None = None
+        self._cache: dict[str, int] = {}  # arguments of `RecordedSteps`
         self._stats: dict[str, Mapping[str, FieldStatistics]] = {}
 
     # ---- episodes
@@ -202,7 +205,7 @@ class Dataset(RandomAccess):
     def _of(self, headers: Sequence[EpisodeHeader] | None) -> Dataset:
         made = Dataset(self._source, headers)
         made._recordings = self._recordings
-        made._filter, made._selector = self._filter, self._selector
+        made._filter, made._selector, made._cache = self._filter, self._selector, self._cache
         return made
 
     def _whole(self) -> Dataset:
@@ -231,6 +234,7 @@ class Dataset(RandomAccess):
         else:
             joined = JoinedSource([(self._source, self.headers), (other._source, more)])
             made = Dataset(joined, [*self.headers, *more])
+            made._cache = self._cache
         one, two = self._filter, other._filter
         made._filter = None if one is None or two is None else one | two
         return made
@@ -420,8 +424,22 @@ class Dataset(RandomAccess):
                 ListedEpisodes.each(self.headers),
                 lambda name: nullcontext(self._open(name)),
                 self._selected.mask,
+                **self._cache,
             )
         return self._steps
+
+    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Dataset:
+        """The dataset with another budget for what `windows`, `transitions` and `loader` keep decoded (bytes, 512 MiB by
+        default).
+
+        `threads` read chunks; by default as many as there are cores, at most 4.
+
+        Raises:
+            SamplingError: a number is no integer, or too small.
+        """
+        made = self._of(self._listed)
+        made._cache = {**self._cache, **cache_options(cache_bytes, threads)}
+        return made
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         infos: Sequence[Mapping[str, Any]] = self.read(["infos"]).infos
@@ -549,6 +567,21 @@ class Dataset(RandomAccess):
         """
         query = "" if self._filter is None else str(self._filter)
         return curate.save(self._whole(), target, query, overwrite=overwrite)
+
+    def save_columns(self, directory: str | os.PathLike[str]) -> None:
+        """Writes the steps to an unused directory as plain `.npy` files, which `tupli_mcap.dataset.open_columns` reads
+        mapped into memory.
+
+        The directory also holds `manifest.json`; see docs/howto/columns.md. It is written atomically: a killed process
+        leaves none. It holds no infos, and does not depend on the recordings. Steps are read a few at a time, within
+        the budget of `with_cache`.
+
+        Raises:
+            DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
+            SpaceError: one array cannot hold the steps of two recordings; the message names them.
+            StorageError: the path is used, the disk is full, ...
+        """
+        save_columns(directory, self.steps, self.headers, self._step_seconds())
 
     def map(
         self,

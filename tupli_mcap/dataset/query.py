@@ -9,7 +9,6 @@ from typing import Any, Self
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
-from tupli_mcap.dataset.items.recorded import CACHE_BYTES, THREADS
 from tupli_mcap.dataset.items.steps import map_arrays, pick
 from tupli_mcap.dataset.keys import matching
 from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_recording
@@ -44,7 +43,7 @@ class Query:
         self._selected: Selected | None = None
         self._columns: dict[str, Any] = {}
         self._recorded: RecordedSteps | None = None
-        self.cache_bytes, self.threads = CACHE_BYTES, THREADS
+        self.cache: dict[str, int] = {}  # arguments of `RecordedSteps`
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy reads the same episodes itself; a layout cannot be pickled.
@@ -58,7 +57,7 @@ class Query:
             own, new = getattr(self, name), getattr(made, name)
             if own is not None and (new is not None or name not in filters):
                 setattr(made, name, own if new is None else own & new)
-        made.cache_bytes, made.threads = self.cache_bytes, self.threads
+        made.cache = self.cache
         return made
 
     @property
@@ -106,8 +105,7 @@ class Query:
                 ListedEpisodes.each(headers),
                 lambda name: self.source.open(name, chosen[name]),
                 mask,
-                cache_bytes=self.cache_bytes,
-                threads=self.threads,
+                **self.cache,
             )
         loaded = {field: column for field, column in self._columns.items() if field in FIELDS}
         return MemorySteps(loaded, self._recorded) if loaded else self._recorded

@@ -16,7 +16,7 @@ from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.items import Steps
-from tupli_mcap.dataset.items.steps import checked_count
+from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
@@ -132,9 +132,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
             SamplingError: a number is no integer, or too small.
         """
         made = self._with()
-        made._query.cache_bytes = checked_count(cache_bytes, 0, "a budget in bytes")
-        if threads is not None:
-            made._query.threads = checked_count(threads, 1, "a number of threads")
+        made._query.cache = {**made._query.cache, **cache_options(cache_bytes, threads)}
         return made
 
     # --- listing and loading ---
@@ -158,17 +156,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         anew(attempt)  # again if episodes are deleted while they are read: the next listing lacks them
 
     def save_columns(self, directory: str | os.PathLike[str]) -> None:
-        """Write the steps to an unused path as plain `.npy` files, which `open_columns` reads mapped into memory.
-
-        The directory also holds `manifest.json`; see docs/howto/columns.md. It is written atomically: a killed process
-        leaves none. It holds the steps as they are listed now, without infos, and does not depend on the recordings.
-        Steps are read a few at a time, within the budget of `with_cache`.
-
-        Raises:
-            DatasetError: there is no step, values differ in size (texts, graphs), or the directory is no path.
-            SpaceError: one array cannot hold the steps of two recordings; the message names them.
-            StorageError: the path is used, the disk is full, ...
-        """
+        """Writes the steps, as they are listed now, to an unused directory; see `Dataset.save_columns`."""
         save_columns(directory, self.steps, self._headers, self._step_seconds())
 
     # --- contents ---

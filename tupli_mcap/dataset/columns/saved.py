@@ -90,7 +90,7 @@ def save_columns(
     headers: Sequence[EpisodeHeader],
     step_seconds: float | None,
 ) -> None:
-    """Writes the columns of steps; see `TupliDataset.save_columns`."""
+    """Writes the columns of steps; see `Dataset.save_columns`."""
     place = _path_of(directory)
     if os.path.lexists(place):
         raise StorageError(
@@ -122,7 +122,7 @@ def _layout_of(steps: Steps) -> StepLayout:
     DatasetError if there is no step, or values are of variable size."""
     layout = steps.layout
     if layout is None or not len(steps):
-        raise DatasetError("expected steps to save, found none; see preview() for what the filters leave")
+        raise DatasetError("expected steps to save, found none; choose episodes and steps by other filters")
     varying = [f"{leaf.path} of {leaf.space!r:.80}" for leaf in layout.leaves if leaf.kind == "variable"]
     if varying:
         raise DatasetError(
@@ -298,7 +298,7 @@ class SavedSteps:
 
 
 def open_columns(directory: str | os.PathLike[str]) -> SavedColumns:
-    """The columns that `TupliDataset.save_columns` wrote to a directory, mapped into memory and read-only.
+    """The columns that `save_columns` of a dataset wrote to a directory, mapped into memory and read-only.
 
     Nothing in the files is executed, and all sizes are checked.
 

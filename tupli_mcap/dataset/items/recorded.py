@@ -13,7 +13,13 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
-from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, checked_fields, rows_of_runs
+from tupli_mcap.dataset.items.steps import (
+    FIELDS,
+    SamplingError,
+    checked_count,
+    checked_fields,
+    rows_of_runs,
+)
 from tupli_mcap.errors import FormatError, memory_for, plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -23,6 +29,15 @@ from tupli_mcap.recording.columns.gather import EPISODE, Plan, final_rows, image
 CACHE_BYTES = 512 << 20
 THREADS = min(4, os.cpu_count() or 1)
 _STATES = ("states",)
+
+
+def cache_options(cache_bytes: int, threads: int | None) -> dict[str, int]:
+    """The arguments of `RecordedSteps` for a budget (bytes), and a number of threads if there is one.
+    SamplingError if a number is no integer, or too small."""
+    options = {"cache_bytes": checked_count(cache_bytes, 0, "a budget in bytes")}
+    if threads is not None:
+        options["threads"] = checked_count(threads, 1, "a number of threads")
+    return options
 
 
 class RecordedSteps:
