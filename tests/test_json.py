@@ -163,6 +163,7 @@ unpublish: unpublish {pole}
 password: password ann
 ls: ls {url}
 list-users: list-users
+set-quota: set-quota ann 0.5
 create-group: create-group lab --description us
 list-groups: list-groups
 add-members: add-members lab ann

@@ -288,34 +288,33 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
         stored = ann._session.ask("GET", "/v1/me")["used"]
         assert 15_000 < stored < 15_500  # with its header
-        with pytest.raises(StorageError, match=r"ann may store 20000 bytes, and would use 24\d{3} with this"):
+        with pytest.raises(StorageError, match=r"ann may store 20\.0 kB and has stored 15\.\d kB: 9\.\d kB more do not fit"):
             ann.store_artifact(b"y" * 9000, ArtifactMetadata(name="y"))
-        with pytest.raises(StorageError, match="ann may store 20000 bytes"):
+        with pytest.raises(StorageError, match=r"ann may store 20\.0 kB"):
             ann.store_artifact(b"y", ArtifactMetadata(name="y", description="d" * 5000))
         rest = 20_000 - stored
         assert begin(ann, b"z" * rest).status_code == 201
         full = begin(ann, b"z" * (rest + 1))
         assert (full.status_code, full.json()["error"]) == (507, "StorageError")
-        assert f"may store 20000 bytes, and would use {20_001 + rest} with this" in full.json()["detail"]
+        assert "may store 20.0 kB and has stored 20.0 kB: " in full.json()["detail"]
         assert begin(ann, b"z" * rest).status_code == 201  # the same one
-        told = ann._session.ask("GET", "/v1/me")
-        assert (told["used"], told["quota"]) == (20_000, 20_000)
+        assert (ann.whoami().used, ann.whoami().quota) == (20_000, 20_000)
 
         with pytest.raises(StorageError, match="Insufficient permissions"):
-            ann._session.ask("PUT", "/v1/users/ann/quota", {"bytes": 10**9})
-        admin._session.ask("PUT", "/v1/users/ann/quota", {"bytes": 60_000})
+            ann.set_quota("ann", 10**9)
+        admin.set_quota("ann", 60_000)
         benchmark = ann.store_benchmark(query()).id
         ann.record_episodes([episode(benchmark)])
-        assert ann._session.ask("GET", "/v1/me")["used"] > 20_000
-        with pytest.raises(StorageError, match="may store 60000 bytes, and would use"):
+        assert ann.whoami().used > 20_000
+        with pytest.raises(StorageError, match=r"may store 60\.0 kB and has stored"):
             ann.store_artifact(b"y" * 60_000, ArtifactMetadata(name="y"))
         ann.delete_episodes(F("steps") > 0)
         ann.delete_benchmark(benchmark)
-        assert ann._session.ask("GET", "/v1/me")["used"] == 20_000
-        admin._session.ask("PUT", "/v1/users/ann/quota", {"bytes": None})
-        assert ann._session.ask("GET", "/v1/me")["quota"] == 20_000
+        assert ann.whoami().used == 20_000
+        admin.set_quota("ann", None)
+        assert ann.whoami().quota == 20_000
         with pytest.raises(NotFoundError, match="User does not exist"):
-            admin._session.ask("PUT", "/v1/users/nobody/quota", {"bytes": 1})
+            admin.set_quota("nobody", 1)
 
 
 def test_a_user_begins_so_many_uploads(tmp_path: Path, another: Any) -> None:

@@ -122,7 +122,9 @@ class TestSigningIn:
             answer = client.post("/sign-in", data={"username": "ann", "password": "ann's password"})
             cookie = answer.headers["set-cookie"]
             assert "HttpOnly" in cookie and "SameSite=lax" in cookie and "Path=/" in cookie
-            assert client.get("/account").status_code == 200
+            account = client.get("/account")
+            assert account.status_code == 200
+            assert re.search(r"<h2>Stored</h2>\n<p>[\d.]+ [kMG]?B</p>", account.text)
 
     @pytest.mark.parametrize(
         "address",

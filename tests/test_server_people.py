@@ -65,6 +65,20 @@ def test_a_password_must_be_long_enough(url: str, monkeypatch: pytest.MonkeyPatc
     assert run("signup ann") == f"created the user ann at {url}\n"
 
 
+def test_a_quota_of_a_user(url: str) -> None:
+    run("login admin")
+    run("signup ann")
+    assert run("set-quota ann 1.5") == f"ann may store 1.5 GB at {url}\n"
+    assert "User does not exist" in run("set-quota bob 1", code=1)
+    run("login ann")
+    assert re.search(r"^stored +0 B of 1\.5 GB$", run("whoami"), re.MULTILINE)
+    assert "Insufficient permissions" in run("set-quota ann 2", code=1)
+    run("login admin")
+    assert "as much as the server lets everybody" in run("set-quota ann")
+    run("login ann")
+    assert re.search(r"^stored +0 B$", run("whoami"), re.MULTILINE)
+
+
 def test_lists_are_of_the_server_of_the_last_login(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,13 @@ class UserOut(BaseModel):
     memberships: list[Membership] = Field(default_factory=list)
 
 
+class Me(UserOut):
+    """The user who is signed in, with the bytes that they have stored, and may store (None: without a limit)."""
+
+    used: int = 0
+    quota: int | None = None
+
+
 class UserRole(BaseModel):
     """A role and the rights that it gives."""
 

@@ -13,7 +13,7 @@ import typer
 from tupli_mcap.cli.options import Json, Url, server_at
 from tupli_mcap.cli.output import Column, print_facts, print_json, print_result, print_rows, when
 from tupli_mcap.cli.terminal import ask_secret, confirmed
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import StorageError, bytes_of
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import GroupMembershipQuery, GroupWithMembers
@@ -32,6 +32,28 @@ def list_users(url: Url = None, as_json: Json = False) -> None:
     rows = [(u.username, ", ".join(m.group for m in u.memberships if m.group != u.username)) for u in users]
     columns = (Column("USER"), Column("GROUPS", shrink="end"))
     print_rows(told, columns, rows, empty="no users", as_json=as_json)
+
+
+def set_quota(
+    username: Username,
+    gigabytes: Annotated[
+        float | None,
+        typer.Argument(metavar="[GB]", min=0, max=1e9, help="Without it, what --quota of the server says."),
+    ] = None,
+    url: Url = None,
+    as_json: Json = False,
+) -> None:
+    """Set how much a user of a server may store.
+
+    It takes the right user_update, which admins have. `whoami` tells users how much they have
+    stored, and may.
+    """
+    quota = None if gigabytes is None else int(gigabytes * 1e9)
+    with server_at(url) as client:
+        client.set_quota(username, quota)
+        may = "as much as the server lets everybody" if quota is None else bytes_of(quota)
+        told = {"url": client.url, "username": username, "quota": quota}
+        print_result(told, f"{username} may store {may} at {client.url}", as_json=as_json)
 
 
 def delete_user(
@@ -245,17 +267,20 @@ def logout(url: Url = None, as_json: Json = False) -> None:
 
 
 def whoami(url: Url = None, as_json: Json = False) -> None:
-    """Show which user is signed in, and their roles."""
+    """Show who is signed in, their roles, and how much they stored."""
     with server_at(url) as client:
         me = client.whoami()
         memberships = {membership.group: membership.roles for membership in me.memberships}
         name = me.username if client.username else ""  # a guest has a name that nobody has given
         found: dict[str, Any] = {"url": client.url, "username": name, "memberships": memberships}
+        found |= {"used": me.used, "quota": me.quota}
     if as_json:
         print_json(found)
         return
     roles = [(group, ", ".join(held)) for group, held in memberships.items()]
-    print_facts([("server", found["url"]), ("user", name or "nobody is signed in"), *roles])
+    stored = bytes_of(me.used) + ("" if me.quota is None else f" of {bytes_of(me.quota)}")
+    told = [("stored", stored)] if name else []
+    print_facts([("server", found["url"]), ("user", name or "nobody is signed in"), *told, *roles])
 
 
 def signup(username: Username, url: Url = None, as_json: Json = False) -> None:

@@ -13,7 +13,7 @@ from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute, page
 from tupli_mcap.page.routes import lists
 from tupli_mcap.server.pages.session import COOKIE, Code, Member, Visit, Visitor, done, tried
-from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.wire import told
 
@@ -82,7 +82,10 @@ def _page(
     with visit.library.database.reading() as connection:
         tokens = visit.library.tokens.list_api_tokens(connection, visit.caller)
         memberships = accounts.memberships_of(connection, visit.caller.name)
+        used = limits.used_by(connection, visit.caller.name)
+        quota = limits.quota_of(connection, visit.library.settings, visit.caller.name)
     facts = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
+    facts |= {"used": used, "quota": quota}
     return visit.page("account.html", facts, wrong, status, sent=sent, made=made)
 
 

@@ -13,6 +13,7 @@ from tupli_mcap.schema import (
     Group,
     GroupMembershipQuery,
     GroupWithMembers,
+    Me,
     Membership,
     UserOut,
     UserRole,
@@ -39,9 +40,10 @@ class People:
         except TupliError as err:
             raise StorageError(f"Signup failed: {err}") from err
 
-    def whoami(self) -> UserOut:
-        """Who is signed in."""
-        return _user(as_told(_User, self._session.ask("GET", "/v1/me")))
+    def whoami(self) -> Me:
+        """Who is signed in, and how much they have stored."""
+        told = as_told(_Me, self._session.ask("GET", "/v1/me"))
+        return Me(**dict(_user(told)), used=told.used, quota=told.quota)
 
     def list_users(self) -> list[UserOut]:
         """All users."""
@@ -51,6 +53,11 @@ class People:
         """Change a user's password; for your own, `old` is needed. All sign-ins of the user end."""
         wanted = {"password": new_password, "old": old}
         self._session.ask("PUT", f"/v1/users/{_name(username)}/password", wanted)
+
+    def set_quota(self, username: str, quota: int | None) -> None:
+        """Set how many bytes a user may store; None for as many as the server lets everybody. It takes the right
+        `user_update`. NotFoundError if there is no such user."""
+        self._session.ask("PUT", f"/v1/users/{_name(username)}/quota", {"bytes": quota})
 
     def delete_user(self, username: str) -> None:
         """Delete a user, and what only they could see; what they published stays. Nothing happens if there is none."""
@@ -132,6 +139,11 @@ def _name(name: str) -> str:
 class _User(BaseModel):
     username: str
     memberships: dict[str, list[str]]
+
+
+class _Me(_User):
+    used: int
+    quota: int | None
 
 
 class _Member(BaseModel):
