@@ -12,11 +12,13 @@ from pathlib import Path
 
 import httpx
 import pytest
+from postgres import Cluster
 from served import COMMAND, begin, certificate, served, sign_in
 from serving import PASSWORD
 
 from tupli_mcap import Recording
 from tupli_mcap.errors import RecordingError, StorageError
+from tupli_mcap.server.database import Database
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.wrappers.rollout import record_rollouts
 
@@ -26,6 +28,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("run") / "run.mcap"
     record_rollouts("CartPole-v1", path, steps=1000, seed=1)
     return path.read_bytes()
+
+
+def test_a_database_as_psql_names_it(postgres: Cluster) -> None:
+    with postgres.database() as url:
+        Database(url.replace("postgresql+psycopg://", "postgresql://")).close()
+        Database(url.replace("postgresql+psycopg://", "postgres://")).close()
+    with pytest.raises(StorageError, match="cannot be used: .*; give a URL such as postgresql://user@host/name"):
+        Database("no database")
 
 
 def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) -> None:

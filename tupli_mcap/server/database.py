@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
@@ -28,6 +29,7 @@ from tupli_mcap.server import migrations, tables
 from tupli_mcap.storage.catalog.database import BUSY_MS, prepared_sqlite
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
+_POSTGRESQL = re.compile("^postgres(ql)?://")  # as psql has it, without the driver that is installed with us
 _STEPS = 20_000  # instructions of SQLite between two looks at the clock
 _CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
 # A writer on PostgreSQL holds this lock; no time limit is set for its statements.
@@ -146,15 +148,16 @@ def demand_pending(connection: Connection, name: str) -> None:
 
 def _engine(url: str, seconds: float) -> Engine:
     try:
+        url = _POSTGRESQL.sub("postgresql+psycopg://", url)
         engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
     except (SQLAlchemyError, ImportError) as err:
         raise StorageError(
-            f"the database cannot be used: {err}; give a URL such as postgresql+psycopg://…"
+            f"the database cannot be used: {err}; give a URL such as postgresql://user@host/name"
         ) from err
     if engine.dialect.name not in ("sqlite", "postgresql"):
         raise StorageError(
             f"expected a database of SQLite or PostgreSQL, found {engine.dialect.name}; "
-            "give a URL such as postgresql+psycopg://…"
+            "give a URL such as postgresql://user@host/name"
         )
     if engine.dialect.name == "sqlite":
         # acknowledged changes survive a power loss

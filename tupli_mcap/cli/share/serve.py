@@ -47,7 +47,7 @@ _Database = Annotated[
     typer.Option(
         envvar="TUPLI_MCAP_DATABASE",
         metavar="URL",
-        help="The database's URL, such as postgresql+psycopg://…; by default, SQLite in DIR.",
+        help="The database's URL, such as postgresql://user@host/name; by default, SQLite in DIR.",
     ),
 ]
 _Blobs = Annotated[
