@@ -567,6 +567,18 @@ class TestFilter:
         assert all(mine[:-2])
         assert not mine[-1]
 
+    def test_the_first_of_them_in_an_order(self, tmp_path: Path) -> None:
+        paths = [record(tmp_path / f"{name}.mcap", steps=200) for name in "ab"]
+        dataset = open_dataset(paths)
+        best = dataset.filter("n_tuples > 2").sort("metadata.score", descending=True).head(4)
+        report = filter_dataset(
+            dataset, tmp_path / "best.mcap", "n_tuples > 2", sort="-metadata.score", limit=4
+        )
+        kept = open_dataset(report.path)
+        assert (report.episodes, report.left_out) == (4, len(dataset) - 4)
+        assert sorted(kept.returns) == sorted(best.returns)
+        assert [e.end_time for e in kept] == sorted(e.end_time for e in best)
+
     def test_damage_is_not_handed_on(self, tmp_path: Path) -> None:
         path = record(tmp_path / "run.mcap", steps=400)
         data = bytearray(path.read_bytes())

@@ -349,18 +349,25 @@ def filter_(
         ),
     ],
     output: Output,
+    sort: Annotated[
+        str,
+        typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first."),
+    ] = "",
+    limit: Annotated[int | None, typer.Option(min=1, help="Write only the first so many of them.")] = None,
     force: Force = False,
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write the episodes that match a filter into a new file.
 
-    Episodes of one recording keep their ids; those of several get new ones. A signature is
-    dropped.
+    Episodes of one recording keep their ids; those of several get new ones. They lie in the
+    order of their times. A signature is dropped.
     """
     from tupli_mcap.dataset.curate import filter_dataset
 
-    report = filter_dataset(dataset_of(sources), output, filter_text, overwrite=force, dry_run=dry_run)
+    report = filter_dataset(
+        dataset_of(sources), output, filter_text, sort=sort, limit=limit, overwrite=force, dry_run=dry_run
+    )
     _print_made(report, dry_run=dry_run, as_json=as_json)
 
 

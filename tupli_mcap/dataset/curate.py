@@ -145,10 +145,15 @@ def filter_dataset(
     target: str | os.PathLike[str],
     filter: BaseFilter | str,
     *,
+    sort: str = "",
+    limit: int | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> FilterReport:
     """Writes the episodes of a dataset that a filter is true of to `target`, as `Dataset.save` does.
+
+    Args:
+        sort, limit: only the first `limit` of them in the order of a key; of "-return", the highest returns come first.
 
     Raises:
         FilterError: the filter names what episodes do not have.
@@ -160,6 +165,9 @@ def filter_dataset(
     kept = dataset.filter(filter)
     if not len(kept):
         raise RecordingError(f"expected an episode that matches {filter}, found none among {count:,}")
+    if sort:
+        kept = kept.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
+    kept = kept[:limit]
     _check_new(kept, target, overwrite=overwrite)
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
