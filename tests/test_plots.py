@@ -919,6 +919,20 @@ def test_groups_of_the_same_name_are_told_apart(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
+def test_runs_that_alone_have_their_name_are_called_by_it(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        for start in ("x", "y")[:seed]:  # seed 2 was started twice
+            path = tmp_path / start / f"ppo-seed{seed}_2026-11-27.mcap"
+            scored(path, [2, 3], name=f"ppo-seed{seed}", metadata={"lr": 0.1})
+    scored(tmp_path / "ppo-seed3_2026-11-27.mcap", [2, 3, 9], name="ppo-seed3", metadata={"lr": 0.5})
+    made = report(tmp_path)
+    assert {group.name for group in made.groups} == {"ppo", "ppo-seed3"}
+    assert [one.name for one, _ in made.traces] == ["ppo-seed3"]
+    assert {one.name for one in made.measured} == {
+        "ppo-seed1", "x/ppo-seed2_2026-11-27", "y/ppo-seed2_2026-11-27", "ppo-seed3",
+    }  # fmt: skip
+
+
 def test_the_runs_of_a_file_are_plotted_as_those_of_several(tmp_path: Path) -> None:
     both, files = tmp_path / "both.mcap", [tmp_path / f"{seed}.mcap" for seed in range(2)]
     for seed, file in enumerate(files):

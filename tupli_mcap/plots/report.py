@@ -215,15 +215,15 @@ def _saved(figure: Any, format: str) -> bytes:
 
 
 def _shorten_names(measured: Sequence[Measured]) -> None:
-    """The names of the runs if all differ; else file names without directories and extension, or longer parts of the
-    paths if two would be equal."""
-    names = [one.run.name[:_LONGEST_NAME] for one in measured]
-    if len(measured) == 1 or not all(names) or len(set(names)) < len(names):
-        parts = [Path(one.name).with_suffix("").parts for one in measured]
-        for depth in range(1, max(map(len, parts)) + 1):
-            names = ["/".join(part[-depth:]) for part in parts]
-            if len(set(names)) == len(names):
-                break
+    """Of several runs, the name of each that no other one has; else the file's name without directories and extension,
+    or a longer part of its path if two would be equal."""
+    given = [one.run.name[:_LONGEST_NAME] for one in measured]
+    own = [name if len(measured) > 1 and given.count(name) == 1 else "" for name in given]
+    parts = [Path(one.name).with_suffix("").parts for one in measured]
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = [name or "/".join(part[-depth:]) for name, part in zip(own, parts, strict=True)]
+        if len(set(names)) == len(names):
+            break
     for one, name in zip(measured, names, strict=True):
         one.name = name
 

@@ -165,7 +165,7 @@ def add_facts(page: Page, title: str, facts: Sequence[tuple[str, str]], *, sever
                 axes.plot([x + 0.02, x + 0.2], [y, y], color=shades[i], linewidth=2.5)
                 x += 0.28
             axes.text(x, y, cut(label, 34), color=style.INK if several else style.GREY, va="center")
-            axes.text(x + (2.4 if several else 0.85), y, cut(value, 100 if several else _VALUE), va="center")
+            axes.text(x + (2.4 if several else 0.85), y, cut(value, 110 if several else _VALUE), va="center")
 
     page.add([Cell(draw, height, left=0, right=0)], 1, tight=True)
 
