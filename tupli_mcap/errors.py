@@ -145,11 +145,12 @@ class Gathered:
             self._errors.append(err)
 
     def raise_all(self) -> None:
-        """Raises the error if one was kept, and a RecordingError with the messages of all if several were."""
-        if len(self._errors) == 1:
+        """Raises the error that was kept, and a RecordingError with the messages of all if several differ."""
+        messages = dict.fromkeys(map(str, self._errors))
+        if len(messages) == 1:
             raise self._errors[0]
-        if self._errors:
-            raise RecordingError(f"nothing was changed: {'; also, '.join(map(str, self._errors))}")
+        if messages:
+            raise RecordingError(f"nothing was changed: {'; also, '.join(messages)}")
 
 
 _in_command: Final = ContextVar("_in_command", default=False)

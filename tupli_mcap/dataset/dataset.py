@@ -140,8 +140,9 @@ class Dataset(RandomAccess):
             try:
                 return self._episode(headers[chosen])
             except IndexError as err:
-                known = f"an episode from 0 to {len(headers) - 1}" if headers else "no episode: there is none"
-                raise IndexError(f"expected {known}, found {chosen}") from err
+                if not headers:
+                    raise IndexError(f"an empty dataset has no episode {chosen}") from err
+                raise IndexError(f"expected an episode from 0 to {len(headers) - 1}, found {chosen}") from err
         if isinstance(chosen, slice):
             return self._of(headers[chosen])
         return self._of([headers[i] for i in _places(chosen, len(headers))])

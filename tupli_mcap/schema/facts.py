@@ -35,6 +35,8 @@ LISTED_AS: Final[Mapping[str, str]] = {field: key for key, field in _MEANT.items
 _OTHER_NAMES: Final = {**_MEANT, "truncated": "timeout"}
 _LIKE: Final = {
     "length": "steps",
+    "episode_length": "steps",
+    "total_reward": "return",
     "reward": "return",
     "rewards": "return",
     "date": "ended",
@@ -82,16 +84,19 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
         FilterError: there is no such top-level key.
     """
     name, *inside = split_key(key)
-    if isinstance(fields, type) and issubclass(fields, EpisodeHeader):
+    of_episodes = isinstance(fields, type) and issubclass(fields, EpisodeHeader)
+    if of_episodes:
         name = _OTHER_NAMES.get(name, name)
     if name not in (fields.model_fields if isinstance(fields, type) else fields):
         known = filter_keys(fields)
         nested = [there for there in _INSIDE if there.split(".")[0] in known]
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
-        hint = did_you_mean(like, [*known, *_MEANT.values(), *nested])
-        if name in _OF_STEPS and "run" in known:
+        hint = did_you_mean(like, [*known, *(_MEANT.values() if of_episodes else ()), *nested])
+        if name in _OF_STEPS and of_episodes:
             hint += ": it is of steps, which filter_steps(...) of a dataset chooses"
-        elif not hint and "run" in known:
+        elif "step" in known and name in filter_keys(EpisodeHeader):
+            hint += ": it is of episodes, which filter(...) of a dataset chooses"
+        elif not hint and of_episodes:
             hint = f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
         raise FilterError(f"unknown key {key!r}{hint}; the keys are {', '.join(known)}")
     return (name, *inside)

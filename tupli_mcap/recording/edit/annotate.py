@@ -51,6 +51,8 @@ def annotate_episodes(
             finished, or cannot be written.
         FormatError: the recording is damaged.
     """
+    if not values:
+        raise RecordingError("expected values for the episodes, such as success=True, found none")
     with _changing(path, dry_run) as (recording, say):
         known = recording.index["episode"].tolist()
         try:
@@ -62,10 +64,8 @@ def annotate_episodes(
             raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
         if not all(isinstance(key, str) for key in values):
             raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
-        if not chosen or not values:
-            raise RecordingError(
-                f"expected episodes and values to give them, found {chosen!r:.60}, {values!r:.60}"
-            )
+        if not chosen:
+            raise RecordingError("expected episodes to annotate, found none")
         added = Annotation(chosen, dict(values), user_name(), iso_utc(time.time_ns()))
         said = Annotations([*recording.annotations.said, added])
         say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())

@@ -190,7 +190,7 @@ def _checked(made: Any, leaf: Leaf, layout: StepLayout, count: int, where: str) 
     try:
         return exact_array(given, dtype, shape, where)
     except StepError as err:
-        found = f"{type(given).__name__} of {getattr(given, 'dtype', '?')}, {getattr(given, 'shape', '?')}"
+        found = f"{np.asarray(given).dtype} of shape {np.shape(given)}"
         raise RecordingError(
             f"expected {where} of shape {shape} that {dtype} holds exactly, found {found}"
             + ("; cast them" if np.shape(given) == shape else _hint(where))
