@@ -961,8 +961,11 @@ class TestFileStorage(StorageContract):
         with EpisodeWriter(tmp_path / "robot.mcap", spaces.Box(-1, 1, (2,)), spaces.Discrete(2)) as writer:
             writer.begin()
             writer.step(np.zeros(2, np.float32), 0, 0.0)
+        bundle_recording(tmp_path / "robot.mcap", tmp_path / "copy.mcap")
+        with Recording(tmp_path / "copy.mcap") as copy:
+            assert (copy.benchmark_id, len(copy)) == ("", 1)
         with pytest.raises(StorageError, match="carries no environment"):
-            bundle_recording(tmp_path / "robot.mcap", tmp_path / "never.mcap")
+            storage.import_bundle(tmp_path / "copy.mcap")
 
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())

@@ -56,7 +56,7 @@ def bundle(
     The file holds the benchmark, its artifacts and its episodes: nothing else is needed to
     use it. Give a benchmark's id to take its episodes (all, or those of the filter) from the
     storage. Give a FILE to take the episodes of that recording; the storage adds what the
-    file lacks.
+    file lacks. A robot's recording has no benchmark: it is copied, and signed if you want.
 
     `ssh-keygen -t ed25519` makes a key for --sign. Its passphrase is asked for, or taken from
     TUPLI_MCAP_KEY_PASSPHRASE.

@@ -32,7 +32,7 @@ def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
     if DOCUMENT_NAME not in recording.attachments:
         raise StorageError(
             f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so it has no benchmark to import; "
-            "copy it into the storage's directory, where its episodes are found"
+            "copy it into the storage's directory, where its episodes are found (tupli-mcap verify checks it before)"
         )
     return recording.benchmark.record
 

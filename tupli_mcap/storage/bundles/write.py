@@ -93,7 +93,8 @@ def bundle_recording(
 ) -> Path:
     """Write the episodes of one recording into a new file that carries its benchmark and all artifacts.
 
-    A recording that was made outside a storage gets a benchmark: its environment, under the name that it has.
+    A recording that was made outside a storage gets a benchmark: its environment, under the name that it has. One
+    without an environment, such as that of a robot, gets none: its episodes are all that there is.
 
     Args:
         storage: has the parts that the recording lacks; None if it lacks none, like a bundle or a recording of an
@@ -102,8 +103,7 @@ def bundle_recording(
 
     Raises:
         NotFoundError: The storage does not know the recording's benchmark.
-        StorageError: The recording carries no environment; something is missing and no storage given; or the file
-            exists or cannot be written.
+        StorageError: Something is missing and no storage given; or the file exists or cannot be written.
     """
     _refuse_existing(target)
     notes = Notes.read(path)
@@ -121,7 +121,7 @@ def bundle_recording(
                         "name the storage that has them"
                     )
                 attachments = _attachments(storage, recording.benchmark_id)
-        else:
+        elif DOCUMENT_NAME in recording.attachments:
             benchmark_id, attachments = _own_benchmark(recording, path)
         kept = [int(number) for number in recording.index["episode"] if int(number) not in deleted]
         with os_errors("cannot write the bundle", target), fill(target) as temporary:
