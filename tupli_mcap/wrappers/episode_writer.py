@@ -127,6 +127,9 @@ class EpisodeWriter(Recorder):
         """True once the recording is finished."""
         return self._writer.closed
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {str(self.path)!r}{': closed' if self.closed else ''}>"
+
     def begin(
         self,
         *,

@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Items
 from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.errors import plural
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames, Parts
 
 Pad = Literal["none", "repeat", "zero"]
@@ -85,7 +86,7 @@ class Windows(Items[Window]):
         self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
             raise SamplingError(
-                f"expected windows of at most {sizes.max()} steps, which the longest episode has, found {total}; "
+                f"expected windows of at most {plural(int(sizes.max()), "step")}, which the longest episode has, found {total}; "
                 "take shorter ones, or pad='repeat'"
             )
 
