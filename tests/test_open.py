@@ -1166,7 +1166,7 @@ def test_reprs_are_short(tmp_path: Path) -> None:
         for _ in range(2):
             writer.step(image.sample(), SPACE.sample(), 1.0, False, False)
         writer.end(image.sample())
-        assert repr(writer) == f"<EpisodeWriter of {str(tmp_path / 'run.mcap')!r}>"
+        assert repr(writer) == f"<EpisodeWriter of '{tmp_path}/run.mcap'>"
     assert repr(writer).endswith("run.mcap': closed>")
     dataset = tupli_mcap.open(tmp_path / "run.mcap")
     (drawn,) = TupliDataset.from_files(tmp_path / "run.mcap").sample_episodes(1)

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
-from tupli_mcap.errors import NotFoundError, StorageError, TupliError, bytes_of
+from tupli_mcap.errors import NotFoundError, StorageError, TupliError, plural
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, UPLOAD, USER
@@ -132,6 +132,6 @@ def demand_room(connection: Connection, settings: Settings, caller: Caller, size
     used = used_by(connection, caller.name)
     if used + size > allowed:
         raise FullError(
-            f"{caller.name} may store {bytes_of(allowed)} and has stored {bytes_of(used)}: {bytes_of(size)} more do not "
-            f"fit; delete something, or ask the server's admin for a larger quota (tupli-mcap set-quota {caller.name})"
+            f"{caller.name} may store {plural(allowed, 'byte')}, and would use {used + size:,} with this; delete "
+            f"something, or ask the server's admin for a larger quota (tupli-mcap set-quota {caller.name})"
         )
