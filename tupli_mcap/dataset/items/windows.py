@@ -86,7 +86,7 @@ class Windows(Items[Window]):
         self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
             raise SamplingError(
-                f"expected windows of at most {plural(int(sizes.max()), "step")}, which the longest episode has, found {total}; "
+                f"expected windows of at most {plural(int(sizes.max()), 'step')}, which the longest episode has, found {total}; "
                 "take shorter ones, or pad='repeat'"
             )
 
