@@ -149,6 +149,24 @@ def test_episodes_are_as_they_were_told(
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
 
 
+def test_the_environment_has_a_name(tmp_path: Path) -> None:
+    for name in ("arm", "legs"):
+        for _ in range(2):
+            with EpisodeWriter(tmp_path / f"{name}.mcap", BOX, ACTIONS, environment=name, mode="a") as writer:
+                writer.begin()
+                writer.step(BOX.sample(), 1, 0.0)
+    states = np.zeros((3, 3), np.float32)
+    path = tupli_mcap.write_rollout(
+        tmp_path, states, np.ones(3, np.int64), np.zeros(3), action_space=ACTIONS, environment="arm"
+    )
+    assert path.name.startswith("arm_")
+    with Recording(tmp_path / "arm.mcap") as recording:
+        assert [run.environment for run in recording.runs] == ["arm"]
+    assert len(tupli_mcap.open(tmp_path).filter("run.environment = 'arm'")) == 3
+    with pytest.raises(RecordingError, match="environment: expected a name, found None"):
+        EpisodeWriter(tmp_path / "x.mcap", BOX, ACTIONS, environment=None)  # type: ignore[arg-type]
+
+
 @pytest.mark.sampled(4)
 @pytest.mark.parametrize("call", ["step", "begin", "end", "discard", "flush"])
 @pytest.mark.parametrize(

@@ -54,6 +54,8 @@ class EpisodeWriter(Recorder):
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
         num_envs: None for one stream of episodes, or the number of streams in the file, like the sub-environments of a
             vector environment. Each stream runs an episode of its own; `env` in the calls selects the stream.
+        environment: what the episodes are of, such as "ur5-cell-2": `ls` and filters (`run.environment`) name it, and
+            a page puts recordings of one environment together.
         labels: this and all further arguments are those of `tupli_mcap.RecordEpisodes`.
 
     Raises:
@@ -88,10 +90,13 @@ class EpisodeWriter(Recorder):
         metadata: Mapping[str, Any] | None = None,
         tags: Sequence[str] = (),
         split: str = "",
+        environment: str = "",
         capture: Capture = "all",
     ) -> None:
         if num_envs is not None and not (isinstance(num_envs, int | np.integer) and num_envs > 0):
             raise RecordingError(f"num_envs: expected a positive number or None, found {num_envs!r:.80}")
+        if not isinstance(environment, str):
+            raise RecordingError(f"environment: expected a name, found {environment!r:.80}")
         spaces = with_stacks(None, StepLayout(observation_space, action_space, reward_space), stack_size)
         spaces.to_metadata()
         given = with_labels(attachments or {}, spaces, labels, Labels.none())
@@ -101,9 +106,9 @@ class EpisodeWriter(Recorder):
             image_format=image_format, stack_size=stack_size, max_bytes=max_bytes, max_seconds=max_seconds, name=name,
             metadata=metadata, tags=tags, split=split, capture=capture,
         )  # fmt: skip
-        options = replace(options, attachments=with_run(given, options, ""))
+        options = replace(options, attachments=with_run(given, options, environment))
         self._spaces, self._num_envs = spaces, None if num_envs is None else int(num_envs)
-        self.rotation = Rotation(path, options, format_version(spaces, image_format), name or "")
+        self.rotation = Rotation(path, options, format_version(spaces, image_format), name or environment)
         self._work = Work()
         self._check_flag = FlagCheck()
         self._discarded: dict[Path, list[int]] = {}

@@ -74,6 +74,7 @@ def write_rollout(
     metadata: Mapping[str, Any] | None = None,
     tags: Sequence[str] = (),
     split: str = "",
+    environment: str = "",
     capture: Capture = "all",
     observations: Any = None,
     terminations: Any = None,
@@ -115,6 +116,7 @@ def write_rollout(
         labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
         name, metadata, tags, split, capture: of the run, as `tupli_mcap.RecordEpisodes` takes them; what belongs to an
             episode is `episode_metadata`.
+        environment: what the episodes are of, as `tupli_mcap.EpisodeWriter` takes it.
         observations, terminations, truncations, next_observations, final_observations: Gymnasium's names of states,
             terminals, timeouts, next_states, final_states.
 
@@ -138,7 +140,7 @@ def write_rollout(
         path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), name=name, metadata=metadata,
-        tags=tags, split=split, capture=capture,
+        tags=tags, split=split, environment=environment, capture=capture,
     ) as writer:  # fmt: skip
         for part in parts:
             try:
