@@ -379,6 +379,8 @@ class TestPeople:
             assert (wrong.status_code, "needs a value" in wrong.text) == (400, True)
 
     def test_groups(self, server: str) -> None:
+        with browser(server, "ann") as ann:
+            assert "seen by everybody who is signed in" in ann.get("/groups").text
         with browser(server, "ann") as ann, browser(server, "bob") as bob:
             own = code(ann)
             assert ann.post("/groups", data={"code": own, "name": "arms & <legs>"}).status_code == 303
@@ -469,3 +471,6 @@ class TestGuests:
             text = guest.get("/dataset/CartPole-v1").text
             assert "Sign in" in text and "Share" not in text
             assert guest.get("/account").status_code == 303
+            with browser(url, "admin", PASSWORD) as signed_in:
+                for page in ("/groups", "/share?dataset=CartPole-v1"):
+                    assert re.search("everybody, also without a sign-in", signed_in.get(page).text, re.IGNORECASE)

@@ -21,7 +21,7 @@ _GAP = "  "
 _WIDEST = 100  # columns of running text
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
-_STORED = re.compile(r"\brecordings/[0-9a-f]{64}/")
+_STORED = re.compile(r"\brecordings/(?:[0-9a-f]{64}|plain)/")
 
 
 class Column(NamedTuple):

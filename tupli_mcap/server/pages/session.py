@@ -86,9 +86,11 @@ class Visit(NamedTuple):
         **more: Any,
     ) -> Response:
         """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
+        guests = self.library.settings.guests
+        everybody = "everybody, also without a sign-in" if guests else "everybody who is signed in"
         response = page(
             self.request, template, facts, status=status, shelf=self.shelf(), code=self.code, wrong=wrong,
-            sent=defaultdict(str, sent or {}), me=self.caller, **more,
+            sent=defaultdict(str, sent or {}), me=self.caller, everybody=everybody, **more,
         )  # fmt: skip
         response.headers["Cache-Control"] = "no-store"
         return response
