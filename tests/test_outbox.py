@@ -186,6 +186,14 @@ def looks(url: str, *words: str) -> str:
     return done.stderr
 
 
+def test_a_dry_run_sends_nothing_that_was_left(proxy: Between, admin: TupliAPIClient) -> None:
+    kill(records(proxy.url))
+    command = [sys.executable, "-m", "tupli_mcap", "push", "--dry-run", "--url", proxy.url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert done.stdout.startswith("would send 1 recording, ")
+    assert (waiting(admin), admin.count_episodes()) == (1, 0)
+
+
 @pytest.mark.sampled(0, keep=["()"])
 @pytest.mark.parametrize("words", [(), ("flush",)], ids=str)
 def test_a_short_program_that_records_nothing_sends_what_was_left(

@@ -225,11 +225,11 @@ def any_storage(place: str | None) -> AbstractContextManager[TupliStorage]:
     return server_at(place) if is_url(place) else open_storage(path_of(place))
 
 
-def server_at(url: str | None) -> TupliAPIClient:
-    """The storage on a server; see `Url`."""
+def server_at(url: str | None, *, dry_run: bool = False) -> TupliAPIClient:
+    """The storage on a server; see `Url`. A dry run sends nothing that earlier programs could not send, either."""
     from tupli_mcap.storage import TupliAPIClient  # takes long to import
 
-    return TupliAPIClient(url)
+    return TupliAPIClient(url, sends_left=not dry_run)
 
 
 def full_id(storage: TupliStorage, text: str) -> str:

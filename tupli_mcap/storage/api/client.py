@@ -51,19 +51,23 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     recordings, and the ended episodes of growing ones; and what earlier processes left. So it does at exit. The next
     program sends what this one could not. Thread-safe; a copy in another process opens its own connections.
 
+    Args:
+        sends_left: False leaves what earlier processes could not send to the next client.
+
     Raises:
         StorageError: the URL is no web server's; later, the server does not answer, or refuses.
     """
 
-    def __init__(self, url: str | None = None) -> None:
+    def __init__(self, url: str | None = None, *, sends_left: bool = True) -> None:
+        self._sends_left = sends_left
         self._session = Session(url)
         self._benchmarks: dict[str, Benchmark] = {}  # that are there, as far as is known
         if self._session.known_user is not None:
-            outbox_of(self._session)
+            _ = self._outbox
 
     @property
     def _outbox(self) -> Outbox:
-        return outbox_of(self._session)  # of who is signed in now
+        return outbox_of(self._session, sends_left=self._sends_left)  # of who is signed in now
 
     @property
     def url(self) -> str:
@@ -136,7 +140,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     def _note(self, benchmark: Benchmark) -> None:
         """Keeps what recording needs while the server is down: the benchmark, and the user's name."""
         self._benchmarks[benchmark.id] = benchmark
-        outbox_of(self._session)
+        _ = self._outbox
 
     def list_benchmarks(self, filter: BaseFilter | str | None = None) -> list[BenchmarkHeader]:
         return self._listed("/v1/benchmarks/list", BenchmarkHeader, _listing(filter, BenchmarkHeader))
@@ -278,7 +282,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
             self._session.sign_in(username, password)
         except TupliError as err:
             raise type(err)(f"Login failed: {err}") from err
-        outbox_of(self._session)
+        _ = self._outbox
 
     def logout(self) -> None:
         """Send everything that was recorded, then sign out, here and on the server. What cannot be sent now waits for

@@ -64,13 +64,15 @@ def _forget_turn() -> None:
 os.register_at_fork(after_in_child=_forget_turn)
 
 
-def outbox_of(session: Session) -> Outbox:
-    """The outbox of a session's server and user, one per process. Starts to send what earlier processes left in it."""
+def outbox_of(session: Session, *, sends_left: bool = True) -> Outbox:
+    """The outbox of a session's server and user, one per process. When it is made, it starts to send what earlier
+    processes left in it, or leaves it there."""
     with _turn:
         key = (os.getpid(), session.identity)
         if key not in _outboxes:
             _outboxes[key] = Outbox(session.another())
-            _outboxes[key].send_left()
+            if sends_left:
+                _outboxes[key].send_left()
         return _outboxes[key]
 
 
