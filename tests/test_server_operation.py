@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import ssl
 import subprocess
@@ -36,6 +37,14 @@ def test_a_database_as_psql_names_it(postgres: Cluster) -> None:
         Database(url.replace("postgresql+psycopg://", "postgres://")).close()
     with pytest.raises(StorageError, match="cannot be used: .*; give a URL such as postgresql://user@host/name"):
         Database("no database")
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_ctrl_c_is_how_a_server_ends(tmp_path: Path, workers: str) -> None:
+    with served(tmp_path / "served", "--workers", workers) as server:
+        os.kill(server.pid, signal.SIGINT)
+        assert server.wait() == 0
+        assert "interrupted" not in server.log_file.read_text()
 
 
 def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import os
@@ -59,7 +60,8 @@ def run(settings: Settings, listening: Listening, tell: Callable[[str, str | Non
         tell(f"{scheme}://{host}:{bound.getsockname()[1]}", password)
         config = configured(functools.partial(_application, settings), settings, listening)
         if listening.workers == 1:
-            uvicorn.Server(config).run([bound])
+            with contextlib.suppress(KeyboardInterrupt):  # uvicorn raises it again after its shutdown
+                uvicorn.Server(config).run([bound])
             return
         counts = settings.own / "metrics"
         shutil.rmtree(counts, ignore_errors=True)
