@@ -218,8 +218,8 @@ def test_not_finite_in_values_of_variable_size(tmp_path: Path) -> None:
         (spaces.Discrete(5, start=2**62), np.int64(2**62 + 5), np.int64(2**62 + 4), ERROR),
         (spaces.MultiDiscrete([2, 3]), np.array([1, 3]), np.array([1, 2]), ERROR),
         (spaces.MultiBinary(2), np.int8([2, 0]), np.int8([1, 0]), ERROR),
-        (spaces.Text(3, charset="ab"), "abc", "ab", ERROR),
-        (spaces.Text(3, charset="ab"), "aaaa", "aaa", ERROR),
+        (spaces.Text(3, charset="ab"), "abc", "ab", WARNING),
+        (spaces.Text(3, charset="ab"), "aaaa", "aaa", WARNING),
         (spaces.Sequence(spaces.Discrete(2)), (1, 2), (1, 1), ERROR),
         (spaces.OneOf((spaces.Discrete(2), spaces.Discrete(3))), (0, 2), (1, 2), ERROR),
     ],
@@ -239,7 +239,9 @@ def test_outside_of_the_space(
 
 def test_the_letters_of_a_space_are_counted(tmp_path: Path) -> None:
     path = scripted(tmp_path / "bad.mcap", lambda n: "äa", spaces.Text(10, min_length=0))
-    assert "outside of Text(0..10, 62 characters)" in found(examine(path), "outside-space").message
+    finding = found(examine(path), "outside-space")
+    assert "outside of Text(0..10, 62 characters)" in finding.message
+    assert "charset=string.printable" in finding.suggestion
 
 
 def test_choices_beyond_all_integers(tmp_path: Path) -> None:

@@ -185,9 +185,10 @@ def _not_finite(measured: Measurements, check: str, kind: str, word: str, advice
 def outside_space(measured: Measurements) -> Iterator[Finding]:
     """Values outside of their space: bounds of a Box, choices of a Discrete, letters of a Text, ...
 
-    An error for spaces of choices: an index out of range crashes an embedding. A warning for a Box: learners that scale
-    by its bounds get wrong values. Up to 8 units in the last place of the larger bound count as a rounding error.
-    Infinite values and NaN have checks of their own.
+    An error for spaces of choices: an index out of range crashes an embedding. A warning for a Text, in which Gymnasium
+    takes only letters and digits by default, and for a Box: learners that scale by its bounds get wrong values. Up to 8
+    units in the last place of the larger bound count as a rounding error. Infinite values and NaN have checks of their
+    own.
     """
     for values in measured.statistics(LeafValues):
         leaf, mask = values.leaf, values.counts["outside"] > 0
@@ -202,7 +203,9 @@ def outside_space(measured: Measurements) -> Iterator[Finding]:
                 f"the space from {low:g} to {high:g}"
             )
         severity = Severity.WARNING
-        if not isinstance(leaf.space, spaces.Box):
+        if isinstance(leaf.space, spaces.Text):
+            advice = "give the space the length and the characters of the texts: Text(200, charset=string.printable)"
+        elif not isinstance(leaf.space, spaces.Box):
             severity = Severity.ERROR
             advice = "correct the space, or what the environment returns; an index out of range crashes an embedding"
         elif values.role == "action":
