@@ -524,6 +524,7 @@ class TestLook:
             ok("ls", *names[0], "--columns", "success,files,run").split()
         )
         assert "did you mean 'recording'" in fails("ls", "--columns", "file", code=2)
+        assert "(your own: run.metadata.lr)" in fails("ls", "--columns", "run,lr", code=2)
 
     def test_ls_counts_the_chosen_episodes(self, here: Path) -> None:
         for name in ("a", "b"):

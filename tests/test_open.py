@@ -562,7 +562,7 @@ def test_pandas(dataset: Dataset) -> None:
     assert [str(time) for time in episodes["run.started"]] == [
         episode.run.started.replace("T", " ") for episode in found
     ]
-    assert set(episodes["environment"]) == {"CartPole-v1"}
+    assert set(episodes["run.environment"]) == {"CartPole-v1"}
     infos = [info or {} for episode in found for info in episode.infos or []]
     assert steps["info.tag"].tolist() == [info["tag"] for info in infos]
     with pytest.raises(TupliError, match="expected the level"):

@@ -235,6 +235,7 @@ def _column(name: str) -> _Listed:
     key = LISTED_AS.get(name.lower(), name.lower())
     if key not in _COLUMNS:
         similar = did_you_mean(_MEANT.get(name, name), list(_COLUMNS))
+        similar = similar or f" (your own: {_SETTING}{name:.40})"
         raise typer.BadParameter(
             f"there is no column {name!r}{similar}; columns are {', '.join(_COLUMNS)}, {_SETTING}KEY"
         )

@@ -93,8 +93,8 @@ def _episode_columns(dataset: Episodes) -> dict[str, Any]:
         "id": [header.id for header in headers],
         "episode": np.arange(len(headers)),  # as in the table of steps
         "run": [header.run.get("name", "") for header in headers],
-        "split": [header.run.get("split", "") for header in headers],
-        "environment": [header.run.get("environment", "") for header in headers],
+        "run.split": [header.run.get("split", "") for header in headers],
+        "run.environment": [header.run.get("environment", "") for header in headers],
         "recording": [header.recording for header in headers],
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
