@@ -640,7 +640,10 @@ class TestTimes:
                 F("reward") > 1,
                 r"unknown key 'reward' \(did you mean 'return'\?\): it is of steps, which filter_steps",
             ),
-            (F("episode_length") > 3, r"unknown key 'episode_length' \(did you mean 'steps'\?\); the keys are"),
+            (
+                F("episode_length") > 3,
+                r"unknown key 'episode_length' \(did you mean 'steps'\?\); the keys are",
+            ),
             (F("tag") == "ppo", r"unknown key 'tag' \(did you mean 'run.tags'\?\); the keys are"),
         ],
         ids=repr,

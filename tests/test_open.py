@@ -212,11 +212,15 @@ def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> N
     ):  # fmt: skip
         with pytest.raises(AttributeError, match=rf"no attribute '{wrong}' \(did you mean '{meant}'\?\)"):
             getattr(thing, wrong)
-    with pytest.raises(FilterError, match=r"unknown key 'return': it is of episodes, which filter\(\.\.\.\) of a"):
+    with pytest.raises(
+        FilterError, match=r"unknown key 'return': it is of episodes, which filter\(\.\.\.\) of a"
+    ):
         dataset.filter_steps("return > 3").read()
     with pytest.raises(IndexError, match="^an empty dataset has no episode 0$"):
         dataset[:0][0]
-    with pytest.raises(TupliError, match="^expected values for the episodes, such as success=True, found none$"):
+    with pytest.raises(
+        TupliError, match="^expected values for the episodes, such as success=True, found none$"
+    ):
         dataset.annotate()
     with pytest.raises(TupliError, match="^expected episodes to draw, found none"):
         dataset[:0].plot()

@@ -288,7 +288,9 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
         stored = ann._session.ask("GET", "/v1/me")["used"]
         assert 15_000 < stored < 15_500  # with its header
-        with pytest.raises(StorageError, match=r"ann may store 20,000 bytes, and would use 24,\d{3} with this"):
+        with pytest.raises(
+            StorageError, match=r"ann may store 20,000 bytes, and would use 24,\d{3} with this"
+        ):
             ann.store_artifact(b"y" * 9000, ArtifactMetadata(name="y"))
         with pytest.raises(StorageError, match="ann may store 20,000 bytes"):
             ann.store_artifact(b"y", ArtifactMetadata(name="y", description="d" * 5000))

@@ -35,7 +35,9 @@ def test_a_database_as_psql_names_it(postgres: Cluster) -> None:
     with postgres.database() as url:
         Database(url.replace("postgresql+psycopg://", "postgresql://")).close()
         Database(url.replace("postgresql+psycopg://", "postgres://")).close()
-    with pytest.raises(StorageError, match="cannot be used: .*; give a URL such as postgresql://user@host/name"):
+    with pytest.raises(
+        StorageError, match="cannot be used: .*; give a URL such as postgresql://user@host/name"
+    ):
         Database("no database")
 
 

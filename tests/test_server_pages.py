@@ -473,4 +473,6 @@ class TestGuests:
             assert guest.get("/account").status_code == 303
             with browser(url, "admin", PASSWORD) as signed_in:
                 for page in ("/groups", "/share?dataset=CartPole-v1"):
-                    assert re.search("everybody, also without a sign-in", signed_in.get(page).text, re.IGNORECASE)
+                    assert re.search(
+                        "everybody, also without a sign-in", signed_in.get(page).text, re.IGNORECASE
+                    )

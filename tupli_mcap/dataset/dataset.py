@@ -430,10 +430,9 @@ class Dataset(RandomAccess):
         return self._steps
 
     def with_cache(self, cache_bytes: int, threads: int | None = None) -> Dataset:
-        """The dataset with another budget for what `windows`, `transitions` and `loader` keep decoded (bytes, 512 MiB by
-        default).
+        """The dataset with another budget for what `windows`, `transitions` and `loader` keep decoded.
 
-        `threads` read chunks; by default as many as there are cores, at most 4.
+        It is in bytes, 512 MiB by default. `threads` read chunks; by default as many as there are cores, at most 4.
 
         Raises:
             SamplingError: a number is no integer, or too small.

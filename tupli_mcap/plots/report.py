@@ -71,7 +71,9 @@ def report(
     with styled():  # before anything is read: matplotlib may be missing
         subjects = list(subjects_once(source, episode_filter))
         if not subjects and episode_filter is None:
-            raise RecordingError("expected episodes to draw, found none; give a recording (.mcap), or choose others")
+            raise RecordingError(
+                "expected episodes to draw, found none; give a recording (.mcap), or choose others"
+            )
         runs: list[tuple[Subject, Measured]] = []
         for subject in subjects:
             if subject.error is not None:

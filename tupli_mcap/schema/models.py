@@ -185,7 +185,7 @@ class Episode(BaseModel):
 
     benchmark_id: str
     metadata: dict[str, Any]
-    tuples: list[RLTuple] = Field(fail_fast=True, repr=False)  # a defect in each, and all texts, would fill the memory
+    tuples: list[RLTuple] = Field(fail_fast=True, repr=False)  # a defect in each would fill the memory
 
 
 class EpisodeHeader(DBItem):

@@ -85,9 +85,10 @@ class Windows(Items[Window]):
         self._before = self._ends - counts
         self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
+            longest = plural(int(sizes.max()), "step")
             raise SamplingError(
-                f"expected windows of at most {plural(int(sizes.max()), 'step')}, which the longest episode has, found {total}; "
-                "take shorter ones, or pad='repeat'"
+                f"expected windows of at most {longest}, which the longest episode has, found {total}; take shorter "
+                "ones, or pad='repeat'"
             )
 
     def __len__(self) -> int:
