@@ -167,7 +167,8 @@ def filter_dataset(
         raise RecordingError(f"expected an episode that matches {filter}, found none among {count:,}")
     if sort:
         kept = kept.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-    kept = kept[:limit]
+    if limit is not None:
+        kept = kept.head(limit)
     _check_new(kept, target, overwrite=overwrite)
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:

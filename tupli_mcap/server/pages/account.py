@@ -84,7 +84,7 @@ def _page(
         memberships = accounts.memberships_of(connection, visit.caller.name)
         used = limits.used_by(connection, visit.caller.name)
         quota = limits.quota_of(connection, visit.library.settings, visit.caller.name)
-    facts = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
+    facts: dict[str, Any] = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
     facts |= {"used": used, "quota": quota}
     return visit.page("account.html", facts, wrong, status, sent=sent, made=made)
 
