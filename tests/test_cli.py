@@ -545,7 +545,18 @@ class TestLook:
     def test_ls_counts_no_episode_of_a_run_twice(self, here: Path) -> None:
         record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)
         names = sorted(path.name for path in here.glob("*.mcap"))
-        ok("filter", "a.mcap", "--filter", "steps > 20", "-o", "best.mcap", "--sort", "-return", "--limit", 20)
+        ok(
+            "filter",
+            "a.mcap",
+            "--filter",
+            "steps > 20",
+            "-o",
+            "best.mcap",
+            "--sort",
+            "-return",
+            "--limit",
+            20,
+        )
         ok("merge", *names, "-o", "all.mcap")
         ok("split", "a.mcap", "-o", "split.mcap", "--episodes", 100)
         shutil.copytree(".", "copy")
