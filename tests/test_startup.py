@@ -51,6 +51,7 @@ LEFT_OUT = {
         ("from tupli_mcap import Recording", (*EXTRAS, *DATABASE, "tupli_mcap.recording.write.writer")),
         ("from tupli_mcap import Recording, verify_recording", (*EXTRAS, *DATABASE)),
         ("from tupli_mcap import open, merge_recordings", (*EXTRAS, *DATABASE)),
+        ("from tupli_mcap import TupliAPIClient", (*EXTRAS, *DATABASE)),
         ("from tupli_mcap import FileStorage, TupliDataset, TupliEnvWrapper", EXTRAS),
     ],
     "recording": [

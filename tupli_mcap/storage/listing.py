@@ -18,6 +18,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.describe.description import state_of, successes
@@ -190,6 +191,13 @@ def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequen
         (found.st_ino, found.st_ctime_ns, found.st_size) for found in (status, beside) if found is not None
     ]
     return RecordingStamp(status.st_size, status.st_mtime_ns, hash((*facts, *deleting)) & (2**63 - 1))
+
+
+def running(recording: Recording) -> set[int]:
+    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no end."""
+    ends = recording.index["end"].tolist()
+    last = {env: i for i, env in enumerate(recording.index["env"].tolist())}
+    return {i for i in last.values() if ends[i] == INTERRUPTED}
 
 
 def list_recordings(

@@ -15,6 +15,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import glob
+import itertools
 import json
 import os
 import threading
@@ -44,8 +45,7 @@ from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.base import new_name
-from tupli_mcap.storage.catalog.entries import rows_of
-from tupli_mcap.storage.sidecar import Sidecar
+from tupli_mcap.storage.listing import running
 
 _DATA_VARIABLE: Final = "TUPLI_MCAP_DATA_DIR"
 _WHOSE: Final = "whose.json"
@@ -247,13 +247,11 @@ class Outbox:
     def _send_ended(self, path: Path) -> None:
         """Sends the ended episodes that were not sent yet, up to the first running one."""
         with Recording(path) as recording:
-            ended = {row.episode for row in rows_of(recording, Sidecar(), live=True)}
-            new = []
-            for number in _numbers_of(recording, _sent_before(path)):
-                if number not in ended:
-                    break
-                new.append(number)
-            self._send_part(path, recording, new)
+            growing = set(recording.index["episode"][list(running(recording))].tolist())
+            new = itertools.takewhile(
+                lambda number: number not in growing, _numbers_of(recording, _sent_before(path))
+            )
+            self._send_part(path, recording, list(new))
 
     def _send_part(self, path: Path, recording: Recording, numbers: Sequence[int]) -> None:
         if not numbers:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.mcap.lock import is_locked
-from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED
+from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.base import LOCAL_USER
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.rows import EpisodeRow
-from tupli_mcap.storage.listing import LIVE, RecordingStamp, stamp_of
+from tupli_mcap.storage.listing import LIVE, RecordingStamp, running, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
 
 
@@ -74,12 +74,12 @@ def rows_of(
     """The rows of a recording, without deleted episodes and those a live writer is in the middle of."""
     index = recording.index
     columns = [index[name].tolist() for name in ("episode", "env", "length", "end", "return", "end_time")]
-    running = _running(columns[1], columns[3]) if live else set()
+    growing = running(recording) if live else set()
     private = json.dumps([created_by])
     for i, (number, env, length, end, total, created_at, seed, metadata, run) in enumerate(
         zip(*columns, recording.seeds, recording.all_metadata(), _places(recording), strict=True)
     ):
-        if number in sidecar.deleted or i in running:
+        if number in sidecar.deleted or i in growing:
             continue
         groups = sidecar.published_in.get(number)
         yield EpisodeRow(
@@ -101,9 +101,3 @@ def _places(recording: Recording) -> list[int]:
     """The index of each episode's run among the recording's runs."""
     places: dict[int, int] = {}
     return [places.setdefault(id(run), len(places)) for run in recording.listed_runs()]
-
-
-def _running(envs: Sequence[int], ends: Sequence[int]) -> set[int]:
-    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no end."""
-    last = {env: i for i, env in enumerate(envs)}
-    return {i for i in last.values() if ends[i] == INTERRUPTED}
