@@ -5,10 +5,10 @@ from __future__ import annotations
 import gc
 import io
 import itertools
-import json
 import multiprocessing
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import weakref
@@ -514,40 +514,39 @@ def test_state_dicts_of_other_options_are_refused(dataset: TupliDataset, tmp_pat
 
 # ---- ranks
 
-RANK = """
-import json, sys
-import torch
-from torch.utils.data import DataLoader, DistributedSampler
-from tupli_mcap import TupliDataset
-from tupli_mcap.torch import MapDataset, StreamDataset, collate
 
-rank, meeting, files = int(sys.argv[1]), sys.argv[2], sys.argv[3:]
-torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
-items = TupliDataset.from_files(files).transitions(fields=["rewards"])
-mapped, stream = MapDataset(items), StreamDataset(items, 16, seed=0)
-loaders = [
-    DataLoader(mapped, 16, sampler=DistributedSampler(mapped, seed=1), collate_fn=collate),
-    DataLoader(stream, None, num_workers=1, collate_fn=collate),
-]
-total = torch.zeros(())
-for batch in loaders[0]:
-    total += batch["rewards"].sum()
-torch.distributed.all_reduce(total)
-found = [[step for batch in loader for step in batch["steps"].tolist()] for loader in loaders]
-print(json.dumps([total.item(), *found]))
-torch.distributed.destroy_process_group()
-"""
+def shared(rank: int, meeting: Path, files: list[Path], told: Any) -> None:
+    """Sends the sum of the rewards over both ranks, and the steps of a rank in two loaders."""
+    torch.distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
+    items = TupliDataset.from_files(files).transitions(fields=["rewards"])
+    mapped, stream = MapDataset(items), StreamDataset(items, 16, seed=0)
+    loaders = [
+        DataLoader(mapped, 16, sampler=DistributedSampler(mapped, seed=1), collate_fn=collate),
+        DataLoader(stream, None, num_workers=1, collate_fn=collate, multiprocessing_context="fork"),
+    ]
+    total = torch.zeros(())
+    for batch in loaders[0]:
+        total += batch["rewards"].sum()
+    torch.distributed.all_reduce(total)
+    told.send((total.item(), *(all_of(loader) for loader in loaders)))
+    torch.distributed.destroy_process_group()
 
 
 def test_two_ranks_share_an_epoch(tmp_path: Path) -> None:
-    files = [str(record(tmp_path / f"{i}.mcap", SPACES["box"], 80)) for i in range(2)]
+    files = [record(tmp_path / f"{i}.mcap", SPACES["box"], 80) for i in range(2)]
+    context = multiprocessing.get_context("fork")
+    ends = [context.Pipe(duplex=False) for _ in range(2)]
     ranks = [
-        subprocess.Popen(
-            [sys.executable, "-c", RANK, str(rank), str(tmp_path / "meeting"), *files], stdout=subprocess.PIPE
-        )
-        for rank in range(2)
+        context.Process(target=shared, args=(rank, tmp_path / "meeting", files, told))
+        for rank, (_, told) in enumerate(ends)
     ]
-    told = [json.loads(rank.communicate(timeout=200)[0]) for rank in ranks]
+    for rank in ranks:
+        rank.start()
+    assert all(heard.poll(200) for heard, _ in ends)
+    told = [heard.recv() for heard, _ in ends]
+    for rank in ranks:
+        rank.join(200)
+        assert rank.exitcode == 0
     rewards = TupliDataset.from_files(files).rewards
     assert told[0][0] == told[1][0] == pytest.approx(rewards.sum())
     for loader in (1, 2):
@@ -557,35 +556,25 @@ def test_two_ranks_share_an_epoch(tmp_path: Path) -> None:
 # ---- what goes wrong
 
 
-# the worker kills itself where it holds no lock: one that PyTorch's own DataLoader shares with its workers would never
-# be let go of, and the DataLoader would wait for it for ever
-KILLED = """
-import os, signal, sys
-from torch.utils.data import DataLoader
-from tupli_mcap import TupliDataset
-from tupli_mcap.torch import StreamDataset, collate
-
-seen = []
-
-def last(batch):
-    seen.append(batch)
-    if len(seen) == 3:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return collate(batch)
-
-stream = StreamDataset(TupliDataset.from_files(sys.argv[1]).windows(2), 8, seed=0)
-list(DataLoader(stream, None, num_workers=1, collate_fn=last))
-"""
-
-
 def test_a_worker_that_is_killed_is_told(tmp_path: Path) -> None:
+    seen = []
+
+    def last(batch: Any) -> Any:
+        """Kills the worker where it holds no lock: one that PyTorch's own DataLoader shares with its workers would
+        never be let go of, and the DataLoader would wait for it for ever."""
+        seen.append(batch)
+        if len(seen) == 3:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return collate(batch)
+
     path = record(tmp_path / "a.mcap", SPACES["box"], 400)
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, path], capture_output=True, text=True, timeout=200, check=False
-    )
-    assert done.returncode == 1
-    assert "RuntimeError: DataLoader worker (pid" in done.stderr
-    assert ") is killed by signal: Killed." in done.stderr or "exited unexpectedly" in done.stderr
+    stream = StreamDataset(TupliDataset.from_files(path).windows(2), 8, seed=0)
+    loader = DataLoader(stream, None, num_workers=1, collate_fn=last, multiprocessing_context="fork")
+    with pytest.raises(
+        RuntimeError, match=r"DataLoader worker \(pid.*(is killed by signal: Killed\.|exited unexpectedly)"
+    ):
+        list(loader)
+    assert not seen  # here
 
 
 def test_a_worker_that_dies_while_a_batch_is_handed_over() -> None:
