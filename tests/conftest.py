@@ -155,10 +155,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     config.hook.pytest_deselected(items=list(left_out))
 
 
-def pytest_collection_finish() -> None:
+def pytest_collectstart() -> None:
     """What all tests have imported lasts: the garbage collector need not look at it again and again."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000)  # instead of 700: a test leaves little to collect
+    gc.enable()
 
 
 def pytest_configure() -> None:
