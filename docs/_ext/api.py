@@ -157,7 +157,13 @@ def _signature(
     return arguments and arguments.replace("<factory>", "..."), returned
 
 
+def _import_modules(app: Sphinx) -> None:
+    """Imports all modules before the build forks, or each of its processes would import them anew."""
+    _homes()
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("builder-inited", _import_modules)
     app.connect("doctree-read", _name)
     app.connect("missing-reference", _resolve)
     app.connect("autodoc-skip-member", _skip)
