@@ -64,5 +64,9 @@ def show_viewer(
         return Image(data=picture.read_bytes())
 
 
-get_ipython().input_transformers_cleanup.append(_run_shell)  # type: ignore[name-defined]  # noqa: F821
+_page = get_ipython()  # type: ignore[name-defined]  # noqa: F821
+_page.input_transformers_cleanup.append(_run_shell)
+# A page shows a report as HTML, and would draw it as a picture in vain.
+_pictures = _page.display_formatter.formatters["image/png"]
+_pictures.for_type_by_name("tupli_mcap.plots.report", "Report", lambda report: None)
 warnings.filterwarnings("ignore", message=".*IProgress.*")
