@@ -60,8 +60,8 @@ class Session:
         self.tokens = tokens or user_tokens()
         self.url = _checked(url or os.environ.get(_URL_VARIABLE) or self.tokens.last() or DEFAULT_URL)
         self._closed = False
-        self._process = 0  # which has opened the connections
-        self._client: httpx.Client | None = None  # it takes a while to make one: certificates are loaded
+        self._process = os.getpid()
+        self._client = self._connected()
 
     def _connected(self) -> httpx.Client:
         import httpx
@@ -77,7 +77,7 @@ class Session:
         """The connections of this process."""
         if self._closed:
             raise StorageError("the client is closed; open another one")
-        if self._client is None or self._process != os.getpid():  # a forked child must not use its parent's
+        if self._process != os.getpid():  # a forked child must not use its parent's connections
             self._client, self._process = self._connected(), os.getpid()
         return self._client
 
@@ -107,8 +107,7 @@ class Session:
     def close(self) -> None:
         """Close the connections; later requests raise StorageError."""
         self._closed = True
-        if self._client is not None:
-            self._client.close()
+        self._client.close()
 
     # --- signing in ---
 
