@@ -267,7 +267,10 @@ def logout(url: Url = None, as_json: Json = False) -> None:
 
 
 def whoami(url: Url = None, as_json: Json = False) -> None:
-    """Show who is signed in, their roles, and how much they stored."""
+    """Show who is signed in, with their roles.
+
+    Also how much they have stored, and may store.
+    """
     with server_at(url) as client:
         me = client.whoami()
         memberships = {membership.group: membership.roles for membership in me.memberships}
