@@ -156,11 +156,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collectstart() -> None:
-    """What all tests have imported lasts: the garbage collector need not look at it again and again."""
+    """What is imported while tests are collected is no garbage."""
     gc.disable()
 
 
 def pytest_collection_finish() -> None:
+    """What all tests have imported lasts: the garbage collector need not look at it again and again."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000)  # instead of 700: a test leaves little to collect
