@@ -32,8 +32,17 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 _POSTGRESQL = re.compile("^postgres(ql)?://")  # as psql has it, without the driver that is installed with us
 _STEPS = 20_000  # instructions of SQLite between two looks at the clock
 _CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
-# A writer on PostgreSQL holds this lock; no time limit is set for its statements.
-_ALONE = "SELECT set_config('statement_timeout', '0', true), pg_advisory_xact_lock(1953854572)"
+# What is set for each connection to PostgreSQL, as setting it for each transaction takes longer than some queries.
+# Compiling a statement (JIT), or starting processes that share it, takes longer than running it.
+_READS = (
+    r"-c default_transaction_isolation=repeatable\ read -c default_transaction_read_only=on "
+    "-c jit=off -c max_parallel_workers_per_gather=0"
+)
+# A writer sees what others have committed before it got this lock; no time limit is set for its statements.
+_WRITES = (
+    "SET TRANSACTION ISOLATION LEVEL READ COMMITTED, READ WRITE; "
+    "SELECT set_config('statement_timeout', '0', true), pg_advisory_xact_lock(1953854572)"
+)
 _MOST_GROUPS_BYTES = 2000  # PostgreSQL cannot index longer texts
 
 
@@ -68,8 +77,6 @@ class Database:
         with _translated(), self._engine.connect() as connection:
             deadline = time.monotonic() + self._seconds
             connection.execution_options(tupli_deadline=deadline)
-            if connection.dialect.name == "postgresql":
-                connection.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
             with connection.begin(), _interrupted(connection, deadline):
                 yield connection
 
@@ -80,7 +87,7 @@ class Database:
             connection.execution_options(tupli_write=True)
             with connection.begin():
                 if connection.dialect.name == "postgresql":
-                    connection.exec_driver_sql(_ALONE)
+                    connection.exec_driver_sql(_WRITES)
                 connection.execution_options(tupli_deadline=time.monotonic() + self._seconds)
                 yield connection
 
@@ -172,10 +179,7 @@ def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
         limits = f"-c lock_timeout={BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
-        # Compiling a statement (JIT), or starting processes that share it, takes longer than running it.
-        kwargs["options"] = (
-            f"{kwargs.get('options', '')} {limits} -c jit=off -c max_parallel_workers_per_gather=0"
-        )
+        kwargs["options"] = f"{kwargs.get('options', '')} {limits} {_READS}"
 
 
 @contextlib.contextmanager

@@ -228,7 +228,7 @@ def _in_order(found: Iterable[int], group: Sequence[tuple[int, str]], backwards:
 def _streamed(connection: Connection, query: Select[*tuple[Any, ...]]) -> Iterator[Any]:
     """The rows that a query finds, fetched as they are needed: a few first, then more at once."""
     size = _FETCHED_FIRST
-    with contextlib.closing(connection.execute(query, execution_options={"stream_results": True})) as rows:
+    with contextlib.closing(connection.execute(query, execution_options={"yield_per": size})) as rows:
         while some := rows.fetchmany(size):
             yield from some
             size = min(2 * size, _FETCHED)
