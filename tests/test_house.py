@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -47,6 +48,7 @@ def test_a_door_names_every_room_and_module(folder: Path) -> None:
     assert len(names) <= 2 or folder.name == "versions" or not missing
 
 
+@functools.cache
 def imported_names(path: Path) -> list[tuple[str, str]]:
     """(module, name) of what a module imports from the package."""
     nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
