@@ -5,7 +5,7 @@ record         record
 lists, info    ls, episodes; info
 view           view
 render         render, plot
-edit           tag, edit, merge, split, filter, trim, recover
+edit/          tag, edit, merge, split, filter, trim, recover
 doctor         doctor
 verify         verify
 storage        delete, restore, compact, rename, reindex, declare-key, list-benchmarks, list-artifacts, list-episodes

@@ -18,7 +18,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
-from tupli_mcap.cli import doctor, edit, info, lists, record, render, storage, verify, view
+from tupli_mcap.cli import doctor, info, lists, record, render, storage, verify, view
+from tupli_mcap.cli.edit import about, copy, recover
 from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.share import bundle, exchange, people, serve, trust
 from tupli_mcap.cli.terminal import (
@@ -263,8 +264,8 @@ _FUNCTIONS: dict[str, list[Callable[..., None]]] = {
     "Record": [record.record],
     "Look": [lists.ls, info.info, lists.episodes, view.view, serve.browse, render.plot, render.render],
     "Check": [doctor.doctor, verify.verify],
-    "Edit": [edit.tag, edit.edit, edit.filter_, storage.delete, storage.restore, edit.trim, edit.merge,
-        edit.split, edit.recover],
+    "Edit": [about.tag, about.edit, copy.filter_, storage.delete, storage.restore, copy.trim, copy.merge,
+        copy.split, recover.recover],
     "Share": [bundle.bundle, bundle.import_, bundle.export, trust.trust, trust.untrust],
     "Server": [serve.serve, people.login, people.logout, people.whoami, people.signup, people.password,
         exchange.push, exchange.pull, exchange.publish, exchange.unpublish, serve.backup_server,

@@ -1,0 +1,175 @@
+"""Commands that write new recordings out of others: merge, split, filter, trim."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tupli_mcap.cli.options import (
+    DryRun,
+    Episodes,
+    FilterText,
+    Force,
+    Json,
+    Output,
+    Sources,
+    dataset_of,
+    filter_of,
+    none_in,
+    recordings_of,
+)
+from tupli_mcap.cli.output import (
+    Column,
+    counted,
+    number,
+    print_result,
+    print_rows,
+)
+from tupli_mcap.errors import bytes_of
+from tupli_mcap.remote import shown_name
+
+
+def merge(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="PATH|URL", help="Recordings with the same spaces, or directories of them."),
+    ],
+    output: Output,
+    force: Force = False,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write the episodes of several recordings into one.
+
+    Episodes keep their times, and get new numbers and ids. Recordings that were made at the
+    same time, or that have different numbers of sub-environments, become sub-environments of
+    the new one. Each episode keeps its run. The new recording has the environment of the
+    first one, and no signature.
+    """
+    from tupli_mcap.dataset import merge_recordings
+
+    report = merge_recordings(recordings_of(sources), output, overwrite=force, dry_run=dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
+
+
+def split(
+    source: Annotated[str, typer.Argument(metavar="FILE|URL", help="A recording.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The first new recording; others are FILE_0001.mcap, …"
+        ),
+    ],
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes in each file.")] = None,
+    max_bytes: Annotated[int | None, typer.Option(min=1, help="Bytes in each file, roughly.")] = None,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write the episodes of a recording into several.
+
+    Episodes stay whole, and keep their numbers. The new recordings have new ids, and no
+    signature.
+    """
+    if (episodes is None) == (max_bytes is None):
+        raise typer.BadParameter("expected either --episodes or --max-bytes")
+    from tupli_mcap.dataset import split_recording
+
+    found = recordings_of([source])
+    if len(found) != 1:
+        raise typer.BadParameter(
+            f"expected one recording, found {len(found)} at {shown_name(source)}; give one of them"
+        )
+    parts = split_recording(found[0], output, episodes=episodes, max_bytes=max_bytes, dry_run=dry_run)
+    columns = (
+        Column("WOULD WRITE" if dry_run else "RECORDING", shrink="start"),
+        Column("EPISODES", "right"),
+        Column("STEPS", "right"),
+    )
+    rows = [(str(part.path), number(part.episodes), number(part.steps)) for part in parts]
+    told = {"dry_run": dry_run, "recordings": parts}
+    print_rows(told, columns, rows, empty="nothing to split", as_json=as_json)
+
+
+def filter_(
+    sources: Sources,
+    filter_text: Annotated[
+        str,
+        typer.Option(
+            "--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."
+        ),
+    ],
+    output: Output,
+    sort: Annotated[
+        str,
+        typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first."),
+    ] = "",
+    limit: Annotated[int | None, typer.Option(min=1, help="Write only the first so many of them.")] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write the episodes that match a filter into a new file.
+
+    Episodes of one recording keep their ids; those of several get new ones. They lie in the
+    order of their times. A signature is dropped.
+    """
+    from tupli_mcap.dataset.curate import filter_dataset
+
+    report = filter_dataset(
+        dataset_of(sources), output, filter_text, sort=sort, limit=limit, overwrite=force, dry_run=dry_run
+    )
+    _print_made(report, dry_run=dry_run, as_json=as_json)
+
+
+def trim(
+    sources: Sources,
+    steps: Annotated[
+        str, typer.Option("--steps", metavar="10:-5", help="The steps to keep, as a Python slice.")
+    ],
+    output: Output,
+    episodes: Episodes = None,
+    filter_text: FilterText = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Cut steps off the ends of episodes, into a new recording.
+
+    10:-5 leaves out the first ten and the last five steps, :200 all steps from 200 on.
+    Episodes that are not chosen stay whole, also those of other recordings, so all must have
+    the same spaces; to leave episodes out, filter them first. An episode that loses its end
+    is marked as interrupted, the state after its last step becomes its final state, and its
+    recorded success is dropped. An episode that loses its beginning loses its seed. The new
+    recording has a new id, and no signature.
+    """
+    from tupli_mcap.dataset import curate
+    from tupli_mcap.dataset.chosen import chosen_ids
+
+    begin, colon, stop = steps.partition(":")
+    try:
+        kept = slice(int(begin) if begin else None, int(stop) if stop else None)
+    except ValueError:
+        colon = ""
+    if not colon:
+        raise typer.BadParameter(f"--steps: expected a slice such as 10:-5, 10: or :200, found {steps!r:.80}")
+    dataset, wanted = dataset_of(sources), filter_of(filter_text)
+    if episodes is not None:
+        ids = chosen_ids(sources, episodes, wanted)
+    else:
+        ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
+        if not ids:
+            raise none_in(sources, filter_text)
+    report = curate.trim(dataset, kept, output, chosen=ids, overwrite=force, dry_run=dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
+
+
+def _print_made(report: Any, *, dry_run: bool, as_json: bool) -> None:
+    size = "" if dry_run else f", {bytes_of(report.size)}"
+    would = "would write " if dry_run else ""
+    print_result(
+        {"dry_run": dry_run, **report._asdict()},
+        f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}",
+        as_json=as_json,
+    )
