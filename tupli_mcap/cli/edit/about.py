@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -162,22 +163,16 @@ def edit(
     from tupli_mcap.recording import edit_runs, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
 
-    meant = [str(place) for place in places if "=" in str(place) and not place.exists()]
-    if meant:
-        raise typer.BadParameter(
-            f"{meant[0]} is no recording; to change metadata of the run, give --set {meant[0]}"
-        )
+    _demand_no_settings(places)
     if undo == any(given is not None for given in (name, settings, tags, run_split)):
         raise typer.BadParameter(
             "expected a change (--name, --set KEY=VALUE, --tag or --split) or --undo, and not both"
         )
     metadata, gathered = dict(pair_of(text) for text in settings or ()), Gathered()
     chosen = _runs_in(places, filter_text, gathered)
-
-    def edits(file: str, recording: Recording) -> list[int]:
-        """The places of the chosen runs that were edited."""
-        some = chosen[file]
-        return [place for place, _ in recording.recorded_runs.before if some is None or place in some]
+    files = list(chosen)
+    if undo:
+        files = _changed_in(places, files, "edit", partial(_edits_of, chosen), gathered)
 
     def change(file: str, dry: bool) -> list[Run]:
         if undo:
@@ -186,7 +181,6 @@ def edit(
             file, chosen[file], name=name, metadata=metadata, tags=tags, split=run_split, dry_run=dry
         )
 
-    files = _changed_in(places, chosen, "edit", edits, gathered) if undo else list(chosen)
     edited = zip(files, change_all(files, change, dry_run=dry_run, gathered=gathered), strict=True)
     changed = [(file, run) for file, runs in edited for run in runs]
     if as_json:
@@ -194,6 +188,15 @@ def edit(
         return
     for file, run in changed:
         _tell_run(file, run, dry_run=dry_run)
+
+
+def _demand_no_settings(places: Sequence[Path]) -> None:
+    """Says what is meant by KEY=VALUE, which `tag` takes without an option."""
+    for place in places:
+        if "=" in str(place) and not place.exists():
+            raise typer.BadParameter(
+                f"{place} is no recording; to change metadata of the run, give --set {place}"
+            )
 
 
 def _runs_in(
@@ -210,6 +213,12 @@ def _runs_in(
             place_of = dict(zip(recording.index["episode"].tolist(), recording.run_places, strict=True))
             found[file] = sorted({place_of[number] for number in numbers})
     return found
+
+
+def _edits_of(chosen: Mapping[str, list[int] | None], file: str, recording: Recording) -> list[int]:
+    """The places of the chosen runs of a recording that were edited."""
+    some = chosen[file]
+    return [place for place, _ in recording.recorded_runs.before if some is None or place in some]
 
 
 def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
