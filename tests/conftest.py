@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import certifi
+import httpx
 import pytest
 import typer.testing
 from hypothesis import settings
@@ -38,6 +39,14 @@ def _shared_directories(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
         patch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("SSL_CERT_FILE", str(trusted / "authority.pem"))
         patch.setenv("SSL_CERT_DIR", str(tmp_path_factory.mktemp("no more")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _patient_requests() -> Iterator[None]:
+    """An answer may take longer than the five seconds that httpx waits, where the machine is busy."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(httpx._config.DEFAULT_TIMEOUT_CONFIG, "read", 120.0)
         yield
 
 

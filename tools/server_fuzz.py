@@ -224,7 +224,7 @@ class Fuzzer:
     """Sends requests, and counts findings by kind, with the first request that shows each."""
 
     def __init__(self, url: str, folder: Path, seed: int) -> None:
-        self.schema = from_url(f"{url}/openapi.json")
+        self.schema = from_url(f"{url}/openapi.json", timeout=120)
         self._url, self._stock = url, Stock(url, folder)
         self.session, self._seed = requests.Session(), seed
         self.statuses: Counter[str] = Counter()
