@@ -432,7 +432,7 @@ def test_nothing_is_read_before_it_is_needed(
     dataset, _ = cart
     asked: list[tuple[str, ...]] = []
     original = load._read_block
-    monkeypatch.setattr(load, "_read_block", lambda *args: asked.append(tuple(args[-1])) or original(*args))
+    monkeypatch.setattr(load, "_read_block", lambda *args: asked.append(tuple(args[3])) or original(*args))
     good = dataset.with_episode_filter(F("metadata.score") > 20)
     good.preview()
     assert len(good) > 0

@@ -82,7 +82,7 @@ def test_have_statistics(dataset: tupli_mcap.Dataset) -> None:
         dataset.stats(["info.forec"])
 
 
-def test_a_part_of_states_has_statistics_and_is_read_whole(tmp_path: Path) -> None:
+def test_a_part_of_states_has_statistics(tmp_path: Path) -> None:
     arm = gym.spaces.Dict({"q": gym.spaces.Box(-9, 9, (2,)), "v": gym.spaces.Box(-9, 9, (2,))})
     space = gym.spaces.Dict({"arm": arm, "t": gym.spaces.Box(-9, 9, ())})
     with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
@@ -93,18 +93,6 @@ def test_a_part_of_states_has_statistics_and_is_read_whole(tmp_path: Path) -> No
     assert set(dataset.stats(["observations.arm.q"])) == {"state.arm.q"}
     with pytest.raises(TupliError, match=r"expected a part of states .*, found 'state.arm.w' \(did you mean"):
         dataset.stats(["state.arm.w"])
-    taken = r"found 'state.arm.q'; read 'states', and take \['arm'\]\['q'\] of it"
-    for read in (
-        dataset.read,
-        lambda fields: dataset.windows(1, fields=fields)[0],
-        lambda fields: dataset.transitions(fields=fields)[:],
-        dataset[0].recording.read,
-    ):
-        assert np.array_equal(read(["state"])["states"]["t"], dataset[0].states["t"])
-        with pytest.raises(TupliError, match=taken):
-            read(["state.arm.q"])
-    with pytest.raises(TupliError, match="read 'states', and take that part of it"):
-        dataset.transitions(fields=["states.arm.q[0]"])
     with pytest.raises(TupliError, match="read 'infos', which has a dict for each step"):
         Recording(tmp_path / "r.mcap").read(["info.x"])
 

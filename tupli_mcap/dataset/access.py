@@ -20,7 +20,7 @@ from tupli_mcap.dataset.items.beside import (
     info_columns,
     info_keys,
 )
-from tupli_mcap.dataset.items.steps import checked_fields
+from tupli_mcap.dataset.items.steps import steps_and_fields
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import SaysWhatIsMeant
 from tupli_mcap.recording.columns.fields import FIVE
@@ -63,11 +63,12 @@ class RandomAccess(SaysWhatIsMeant):
         columns for all keys of the infos, "info.<key>" for one key, and "info.contact.left" for a value in a dict; they
         are all read into memory. Numbers are arrays, with NaN for steps without such an info; a list if they include
         both integers from 2**53 on and floats or steps without one. The field "frames" gives the recorded pictures of
-        the states.
+        the states. "state.arm" or "action.grip", a part of a Dict, leaves the others out of `states` and `next_states`,
+        or of `actions`; images that are left out are not read.
 
         Raises:
             SamplingError: no episode is long enough, or an argument is invalid.
-            SpaceError: one array cannot hold a field of two of the recordings.
+            SpaceError: one array cannot hold a field of two of the recordings, or one of them has no such part.
         """
         steps, fields = self._with_more(fields)
         return self._checked(Windows(steps, length, stride, pad, history, fields=fields))
@@ -78,11 +79,11 @@ class RandomAccess(SaysWhatIsMeant):
         """The transition (s, a, r, s') that starts at each step, by its number; an array of numbers gives a batch.
 
         See `Transitions` for several steps, and `Transition` for targets of values. Fields are those of
-        `Transition`; "infos", "info.<key>", "times" and "frames" are as for `windows`.
+        `Transition`; "infos", "info.<key>", "times", "frames" and "state.arm" are as for `windows`.
 
         Raises:
             SamplingError: the dataset is empty, or an argument is invalid.
-            SpaceError: one array cannot hold a field of two of the recordings.
+            SpaceError: one array cannot hold a field of two of the recordings, or one of them has no such part.
         """
         steps, fields = self._with_more(fields)
         return self._checked(Transitions(steps, n_step, discount, fields=fields))
@@ -91,7 +92,7 @@ class RandomAccess(SaysWhatIsMeant):
         """The steps, with infos and frames if fields name them, and the names of the fields to read."""
         steps = self.steps
         keys, given = info_keys(fields)
-        rest = checked_fields(given, (*steps.fields, *BESIDE))
+        steps, rest = steps_and_fields(steps, given, (*steps.fields, *BESIDE))
         if FRAMES in rest:
             steps = StepsWith(steps, FRAMES, self._frames())
         if not keys:

@@ -54,6 +54,7 @@ from tupli_mcap.recording.columns.fields import (
     FIVE,
     ColumnDict,
     field_names,
+    fields_and_parts,
     split_name,
 )
 from tupli_mcap.recording.frames import Frames
@@ -377,24 +378,29 @@ class Dataset(RandomAccess):
                 their values in a step (state), and Gymnasium's (observations, terminations, truncations), mean the
                 same. "infos" is a dict for each step; "info.<key>" makes `infos` a dict of columns, as in `windows`.
                 "info.contact.left" is a value in a dict.
+                "state.arm" or "action.grip", a part of a Dict, leaves the others out of `states` and `next_states`, or
+                of `actions`; images that are left out are not read.
 
         Raises:
             DatasetError: a field is unknown.
-            SpaceError: one array cannot hold a field of two of the recordings; the message names them.
+            SpaceError: one array cannot hold a field of two of the recordings; the message names them. Or a recording
+                has no such part of a state or an action.
         """
         keys, others = info_keys(fields)
         if any(keys):
             found = self.read([*others, INFOS])
             found.infos = info_columns(found.infos, keys if all(keys) else None)
             return found
-        wanted = field_names(fields, FIELDS, DatasetError)
+        wanted, parts = fields_and_parts(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
-            return example.read(wanted, episodes=[])
-        columns = self._read(wanted)
+            return example.read(fields, episodes=[])
+        columns = self._read(wanted, parts)
         return Columns(self.lengths, **columns)
 
-    def _read(self, fields: Sequence[str]) -> dict[str, Any]:
-        columns, self._known = read_in_order(self._source, self.headers, fields, self._selector, self._known)
+    def _read(self, fields: Sequence[str], parts: Sequence[str] = ()) -> dict[str, Any]:
+        columns, self._known = read_in_order(
+            self._source, self.headers, fields, self._selector, self._known, parts
+        )
         return columns
 
     @property

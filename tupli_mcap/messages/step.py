@@ -20,7 +20,17 @@ from tupli_mcap.errors import FormatError, SpaceError
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.layout import PREFIX, SEPARATOR, ImageLayout, MessageLayout, image_layout
 from tupli_mcap.messages.variable.codec import VariableField
-from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf, NameRegistry, camel, flatten_space, own_space, structure
+from tupli_mcap.spaces.leaves import (
+    ROS_TYPES,
+    Leaf,
+    NameRegistry,
+    camel,
+    flatten_space,
+    leaves_in,
+    own_space,
+    space_of,
+    structure,
+)
 from tupli_mcap.spaces.space_json import space_from_json, space_to_json
 
 STEP_SCHEMA = "tupli_mcap/msg/Step"
@@ -28,6 +38,11 @@ FINAL_STATE_SCHEMA = "tupli_mcap/msg/FinalState"
 MAX_FRAMES = 256  # of a stack: a row takes at most this many times as many bytes in memory as in the file
 Stack = str | list[str]  # `name`, or `[name, "last"]`
 _RESERVED = ("episode", "step", "terminal", "timeout", "env")
+_GIVEN = (
+    "observation_space", "action_space", "reward_space", "state", "action", "reward",
+    "dtypes", "inner_dtypes", "stacks", "nest_state", "nest_action", "nest_reward",
+)  # fmt: skip
+"""What the constructor of a layout sets; all else follows from it."""
 _U32, _BOOL = np.dtype(np.uint32), np.dtype(np.bool_)
 
 
@@ -90,6 +105,26 @@ class StepLayout:
             {name: found for name, found in self.inner_dtypes.items() if name not in left_out},
             [] if "states" in fields else self.stacks,
         )
+
+    def only(self, parts: Collection[str]) -> StepLayout:
+        """A layout of columns with only some parts of the state, such as "state.arm", or of the action; with all of
+        that of which no part is given. Messages are decoded by the whole layout.
+
+        SpaceError if there is no such part, or if it is in a Tuple or an array.
+        """
+        if not parts:
+            return self
+        made = StepLayout.__new__(StepLayout)
+        vars(made).update({name: value for name, value in vars(self).items() if name in _GIVEN})
+        if some := [part for part in parts if part.startswith("state")]:
+            made.state = leaves_in(some, self.state)
+            made.observation_space = space_of(self.observation_space, made.state)
+            made.nest_state = structure(made.observation_space)
+        if some := [part for part in parts if part.startswith("action")]:
+            made.action = leaves_in(some, self.action)
+            made.action_space = space_of(self.action_space, made.action)
+            made.nest_action = structure(made.action_space)
+        return made
 
     @property
     def leaves(self) -> list[Leaf]:

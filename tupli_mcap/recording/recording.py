@@ -13,9 +13,10 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_START, FINAL_STATE, INFO
 from tupli_mcap.recording.about.described import DescribedRecording
-from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.fields import FIVE, fields_and_parts
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.episode import Episode, Episodes
@@ -190,7 +191,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         rows = self.index[i : i + 1]
         if rows["final_row"][0] < 0:
             return None
-        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows)
+        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows, self.layout.state)
         values = [
             column[0] if isinstance(column, list) or leaf.is_scalar else column[0, ...]
             for leaf, column in zip(self.layout.state, columns, strict=True)
@@ -211,7 +212,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             )
         if not len(rows):
             return self.read(["states"], episodes=[]).states
-        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows)
+        columns = self._reader.final_columns(self._channel(FINAL_STATE), rows, self.layout.state)
         return self.layout.nest_state(columns)
 
     @property
@@ -277,6 +278,8 @@ class Recording(DescribedRecording, DatasetVerbs):
         Args:
             fields: some of "states", "actions", "rewards", "terminals", "timeouts", "next_states", "times", "infos" and
                 "frames"; the first five by default. Gymnasium's names (observations, terminations, …) mean the same.
+                "state.arm" or "action.grip", a part of a Dict, leaves the others out of `states` and `next_states`, or
+                of `actions`; images that are left out are not read.
             episodes: positions in `self.episodes`, or a bool for each of them.
             threads: how many threads decompress; by default as many as there are cores, at most 4.
             images: False leaves the columns of image leaves empty and reads no image; not possible for `next_states`.
@@ -285,9 +288,10 @@ class Recording(DescribedRecording, DatasetVerbs):
 
         Raises:
             RecordingError: an episode or a field does not exist.
+            SpaceError: the state or the action has no such part.
             FormatError: a chunk is damaged.
         """
-        fields = field_names(fields)
+        fields, parts = fields_and_parts(fields)
         if not images and "next_states" in fields:
             raise RecordingError("expected images=True for next_states, found False; read states instead")
         positions = np.arange(len(self.index)) if episodes is None else self._positions(episodes)
@@ -297,14 +301,16 @@ class Recording(DescribedRecording, DatasetVerbs):
         columns = Columns(lengths)
         if self._layout is None:
             return columns
+        layout = self._layout.only(parts)
         needed = [field for field in fields if field not in ("next_states", "infos", "frames")]
         if "next_states" in fields and "states" not in needed:
             needed.append("states")
         with memory_for(lambda: f"{self.name}: reading {', '.join(fields)} of {total} steps"):
             runs = runs_of(rows, self._step_channels)
-            found = self._reader.read(runs, total, needed, threads or _THREADS, episodes is not None, images)
+            keep = episodes is not None
+            found = self._reader.read(runs, total, needed, threads or _THREADS, keep, images, parts)
             if "next_states" in fields:
-                columns.next_states = self._next_states(found["states"], rows, lengths)
+                columns.next_states = self._next_states(found["states"], rows, lengths, layout)
         for field in fields:
             if field in found:
                 setattr(columns, field, found[field])
@@ -312,12 +318,12 @@ class Recording(DescribedRecording, DatasetVerbs):
             columns.infos = [info for i in positions.tolist() for info in self._infos_of(i)]
         if "frames" in fields:
             ends = np.cumsum(lengths)
-            parts = (
+            pictures = (
                 (self.frames(i), np.arange(end - start), np.arange(start, end))
                 for i, start, end in zip(positions.tolist(), ends - lengths, ends, strict=True)
             )
             with memory_for(lambda: f"{self.name}: decoding {total} frames"):
-                columns.frames = gathered(parts, total)
+                columns.frames = gathered(pictures, total)
         return columns
 
     def _infos_of(self, i: int) -> list[dict[str, Any]]:
@@ -365,13 +371,12 @@ class Recording(DescribedRecording, DatasetVerbs):
                 setattr(columns, field, values)
         return columns
 
-    def _next_states(self, states: Any, rows: Any, lengths: Any) -> Any:
-        layout = self.layout
+    def _next_states(self, states: Any, rows: Any, lengths: Any, layout: StepLayout) -> Any:
         known = rows["final_row"] >= 0
         ends = np.cumsum(lengths) - 1
         finals: list[Any] = []
         if known.any():
-            finals = self._reader.final_columns(self._channel(FINAL_STATE), rows[known])
+            finals = self._reader.final_columns(self._channel(FINAL_STATE), rows[known], layout.state)
         columns = []
         for i, leaf in enumerate(layout.state):
             column = leaf.get(states)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import DType
-from tupli_mcap.errors import SpaceError
+from tupli_mcap.errors import SpaceError, did_you_mean
 from tupli_mcap.schema.keys import name_within
 
 # float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
@@ -41,6 +41,7 @@ ROS_TYPES: dict[str, str] = {
 _CONSTANT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _VARIABLE = (spaces.Text, spaces.Sequence, spaces.Graph, spaces.OneOf)
 MAX_DEPTH = 64  # of nested spaces
+_MOST_SHOWN = 12  # parts of a value, in a message
 
 
 @dataclass(frozen=True)
@@ -198,6 +199,51 @@ def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
     if type(space) in _VARIABLE or space.shape is not None or space.dtype is None or space.dtype.kind != "U":
         return space
     return spaces.Text(4096, min_length=0, charset=string.printable)
+
+
+def leaves_in(parts: Collection[str], leaves: Sequence[Leaf]) -> list[Leaf]:
+    """The leaves that lie in parts of a value. SpaceError if a part has none."""
+    found = [leaf for leaf in leaves if any(_lies_in(part, leaf.path) for part in parts)]
+    paths = [leaf.path for leaf in leaves]
+    for part in parts:
+        if not any(_lies_in(part, leaf.path) for leaf in found):
+            whole = next((path for path in paths if _lies_in(path, part)), None)
+            names = [
+                name_within(leaf.root, *leaf.keys[:end])
+                for leaf in leaves
+                for end in range(len(leaf.keys) + 1)
+            ]
+            known = [name for name in dict.fromkeys(names) if name != leaves[0].root] or paths
+            hint = did_you_mean(part, known) if whole is None else f"; read {whole}, and index it"
+            more = "" if len(known) <= _MOST_SHOWN else ", …"
+            raise SpaceError(
+                f"expected a part such as {', '.join(known[:_MOST_SHOWN])}{more}, found {part:.80}{hint}"
+            )
+    return found
+
+
+def _lies_in(part: str, path: str) -> bool:
+    return path == part or path.startswith((f"{part}.", f"{part}["))
+
+
+def space_of(space: gym.Space[Any], leaves: Sequence[Leaf]) -> gym.Space[Any]:
+    """A space without what has none of the leaves."""
+    kept = {leaf.keys[:depth] for leaf in leaves for depth in range(len(leaf.keys) + 1)}
+
+    def cut(space: gym.Space[Any], keys: tuple[Any, ...]) -> gym.Space[Any]:
+        if type(space) is spaces.Dict:
+            return spaces.Dict(
+                [(key, cut(sub, (*keys, key))) for key, sub in subspaces(space) if (*keys, key) in kept]
+            )
+        if type(space) is spaces.Tuple:
+            parts = subspaces(space)
+            if not all((*keys, index) in kept for index, _ in parts):
+                path = name_within(leaves[0].root, *keys)
+                raise SpaceError(f"expected all of {path}, which is a Tuple, found a part of it; read {path}")
+            return spaces.Tuple([cut(sub, (*keys, index)) for index, sub in parts])
+        return space
+
+    return cut(space, ())
 
 
 def structure(space: gym.Space[Any]) -> Callable[[Sequence[Any]], Any]:

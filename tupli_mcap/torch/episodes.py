@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items import Items, Steps, Window
-from tupli_mcap.dataset.items.steps import checked_fields, map_arrays
+from tupli_mcap.dataset.items import FIELDS, Items, Steps, Window
+from tupli_mcap.dataset.items.steps import map_arrays, steps_and_fields
 from tupli_mcap.recording.columns.fields import FIVE
 
 
@@ -22,7 +22,8 @@ class Episodes(Items[Window]):
 
     def __init__(self, steps: Steps, *, fields: Sequence[str] = FIVE) -> None:
         super().__init__(steps, ())
-        self.fields = tuple(checked_fields(fields))
+        self.source, names = steps_and_fields(steps, fields, FIELDS)
+        self.fields = tuple(names)
         self._counts = np.minimum(steps.episode_lengths, 1)
         self._numbers = np.flatnonzero(self._counts)
         self._lengths = steps.episode_lengths[self._numbers]

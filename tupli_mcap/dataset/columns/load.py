@@ -23,7 +23,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
-from tupli_mcap.recording.columns.fields import FIELD_OF, FIVE
+from tupli_mcap.recording.columns.fields import FIELD_OF, FIVE, named_parts
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
@@ -59,6 +59,7 @@ def read_columns(
     fields: Sequence[str],
     selector: TupleSelector | None = None,
     known: Selected | None = None,
+    parts: Sequence[str] = (),
 ) -> tuple[dict[str, Any], Selected, StepLayout | None]:
     """Columns of the wanted steps by field, the selection of these steps, and the layout of the first recording.
 
@@ -66,10 +67,10 @@ def read_columns(
     episode). Memory holds at most the result, one block of episodes (64 MiB, or one episode) and the cache
     of one recording.
 
-    `selector` is the tuple filter, and `known` its result if it was evaluated before.
+    `selector` is the tuple filter, and `known` its result if it was evaluated before. parts: see `StepLayout.only`.
 
     Raises:
-        SpaceError: one array cannot hold a field of two of the recordings.
+        SpaceError: one array cannot hold a field of two of the recordings, or one of them has no such part.
         NotFoundError: an episode is missing in its recording: the file was changed.
     """
     total = sum(header.n_tuples for header in headers)
@@ -77,7 +78,7 @@ def read_columns(
         memory_for(lambda: f"loading {', '.join(fields)} of {total} steps"),
         progress(total, "Loading") as bar,
     ):
-        reader = _Reader(fields, selector, known, total)
+        reader = _Reader(fields, selector, known, total, parts)
         for name, same in itertools.groupby(headers, key=lambda header: header.recording):
             group = list(same)
             with source.open(name, [header.episode for header in group]) as recording:
@@ -91,16 +92,17 @@ def read_in_order(
     fields: Sequence[str],
     selector: TupleSelector | None = None,
     known: Selected | None = None,
+    parts: Sequence[str] = (),
 ) -> tuple[dict[str, Any], Selected]:
     """Columns of the wanted steps of episodes in any order, and the selection of these steps, as `read_columns` reads
     them; opens each recording once."""
     places = {name: i for i, name in enumerate(dict.fromkeys(header.recording for header in headers))}
     order = np.argsort([places[header.recording] for header in headers], kind="stable")
     if (np.diff(order) >= 0).all():
-        return read_columns(source, headers, fields, selector, known)[:2]
+        return read_columns(source, headers, fields, selector, known, parts)[:2]
     listed, back = np.array([header.n_tuples for header in headers], np.int64), np.argsort(order)
     known = None if known is None else known.reordered(listed, order)
-    columns, selected, _ = read_columns(source, [headers[i] for i in order], fields, selector, known)
+    columns, selected, _ = read_columns(source, [headers[i] for i in order], fields, selector, known, parts)
     rows = _rows_of(selected.lengths, back)
     return {field: pick(column, rows) for field, column in columns.items()}, selected.reordered(
         listed[order], back
@@ -119,9 +121,14 @@ class _Reader:
     """Collects the columns, recording by recording."""
 
     def __init__(
-        self, fields: Sequence[str], selector: TupleSelector | None, known: Selected | None, total: int
+        self,
+        fields: Sequence[str],
+        selector: TupleSelector | None,
+        known: Selected | None,
+        total: int,
+        parts: Sequence[str],
     ) -> None:
-        self._fields = list(dict.fromkeys(fields))
+        self._fields, self._parts = list(dict.fromkeys(fields)), parts
         self._known = known
         self._selector = selector if known is None else None
         extra = [] if self._selector is None else list(self._selector.fields)
@@ -136,7 +143,7 @@ class _Reader:
         self._mask = None if self._selector is None else np.empty(total, np.bool_)
 
     def read(self, recording: Recording, headers: Sequence[EpisodeHeader], bar: Progress) -> None:
-        layout = recording.layout
+        layout = recording.layout.only(self._parts)
         if self._layout is None:
             self._layout, self._first_name = layout, recording.name
             self._builders = {field: _FieldBuilder(field, self._capacity, layout) for field in self._fields}
@@ -144,9 +151,17 @@ class _Reader:
             check_layouts(self._layout, self._first_name, layout, recording.name, self._needed)
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
-        most = 1 if "frames" in self._needed else _BLOCK_BYTES // step_bytes(layout)  # frames are large
+        most = (
+            1 if "frames" in self._needed else _BLOCK_BYTES // step_bytes(recording.layout)
+        )  # frames are large
+        # a filter looks at whole values, of which the parts are taken afterwards
+        parts = (
+            ()
+            if self._selector is not None and {*self._selector.fields} & {"states", "actions"}
+            else self._parts
+        )
         for block in whole_episodes(lengths, max(1, most)):
-            columns = _read_block(recording, positions[block], lengths[block], self._needed)
+            columns = _read_block(recording, positions[block], lengths[block], self._needed, parts)
             steps = int(lengths[block].sum())
             keep = self._keep(columns, steps, recording)
             for field, builder in self._builders.items():
@@ -197,13 +212,14 @@ def _empty_column(field: str) -> Any:
 
 
 def _read_block(
-    recording: Recording, positions: Array, lengths: Array, fields: Sequence[str]
+    recording: Recording, positions: Array, lengths: Array, fields: Sequence[str], parts: Sequence[str]
 ) -> dict[str, Any]:
     """The fields of some whole episodes; steps that were recorded after the listing are left out."""
     recorded = [field for field in fields if field != "steps"]
     # None for all episodes is cheaper than a list of them: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
-    found = recording.read(recorded, episodes=None if everything else positions)
+    named = [name for field in recorded for name in named_parts(field, parts)]
+    found = recording.read(named, episodes=None if everything else positions)
     columns = {field: getattr(found, field) for field in recorded}
     now = found.episode_lengths
     if "steps" in fields:

@@ -240,10 +240,16 @@ class SavedSteps:
     fields: tuple[str, ...] = FIELDS
 
     def __init__(
-        self, directory: Path, layout: StepLayout, identity: str, arrays: Mapping[str, Array]
+        self,
+        directory: Path,
+        whole: StepLayout,
+        identity: str,
+        arrays: Mapping[str, Array],
+        parts: Sequence[str] = (),
     ) -> None:
         self._directory = directory.absolute()  # absolute, since copies in other processes open it again
-        self.layout: StepLayout | None = layout
+        self._whole, self._arrays, self._parts = whole, arrays, parts
+        self.layout: StepLayout | None = (layout := whole.only(parts))
         self.identity = identity
         self.episode_lengths, self.breaks = arrays["episode_length"], arrays["break"]
         self.open_ends = self.breaks[~arrays["next_known"]]
@@ -287,14 +293,17 @@ class SavedSteps:
             leaves.append(leaf)
         return self._nest_state(leaves)
 
+    def only(self, parts: Sequence[str]) -> SavedSteps:
+        return SavedSteps(self._directory, self._whole, self.identity, self._arrays, parts)
+
     def blocks(self, rows: Array) -> Array:
         return rows // _BLOCK
 
     def limit(self, cache_bytes: int, threads: int) -> None:
         """Does nothing: the system keeps mapped files as it has room."""
 
-    def __reduce__(self) -> tuple[Callable[..., Steps], tuple[Path, str]]:
-        return _opened_again, (self._directory, self.identity)
+    def __reduce__(self) -> tuple[Callable[..., Steps], tuple[Path, str, Sequence[str]]]:
+        return _opened_again, (self._directory, self.identity, self._parts)
 
 
 def open_columns(directory: str | os.PathLike[str]) -> SavedColumns:
@@ -369,11 +378,11 @@ def _check_episodes(directory: Path, arrays: Mapping[str, Array], steps: int) ->
         raise _defect(directory / "episode_length.npy", "episodes that end at a break", "others")
 
 
-def _opened_again(directory: Path, identity: str) -> Steps:
+def _opened_again(directory: Path, identity: str, parts: Sequence[str]) -> Steps:
     steps = open_columns(directory).steps
     if steps.identity != identity:
         raise StorageError(f"expected the columns that {directory} held before, found others; open them anew")
-    return steps
+    return steps.only(parts)
 
 
 def _defect(path: Path, expected: str, found: str) -> FormatError:

@@ -51,6 +51,9 @@ class StepsWith:
             found[self._field] = self._values(rows)
         return {field: found[field] for field in fields}
 
+    def only(self, parts: Sequence[str]) -> Steps:
+        return StepsWith(self._rest.only(parts), self._field, self._values)
+
     def blocks(self, rows: Array) -> Array:
         return self._rest.blocks(rows)
 

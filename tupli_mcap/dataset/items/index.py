@@ -122,10 +122,11 @@ class StepIndex:
     def files(self) -> Files:
         return Files(self.layouts, self.layout_of, self.stores)
 
-    def check(self, fields: Sequence[str]) -> None:
-        """Raises SpaceError unless one array can hold each of these fields of all recordings."""
-        for layout, name in zip(self.layouts[1:], self.names[1:], strict=True):
-            check_layouts(self.layouts[0], self.names[0], layout, name, fields)
+    def check(self, fields: Sequence[str], parts: Sequence[str]) -> None:
+        """Raises SpaceError unless one array can hold each of these fields of all recordings, or of their parts."""
+        first, *others = (layout.only(parts) for layout in self.layouts)
+        for layout, name in zip(others, self.names[1:], strict=True):
+            check_layouts(first, self.names[0], layout, name, fields)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "layouts": [layout.to_metadata() for layout in self.layouts]}

@@ -13,6 +13,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
+from tupli_mcap.dataset.items.segments import Segments
 from tupli_mcap.dataset.items.steps import (
     FIELDS,
     SamplingError,
@@ -69,6 +70,7 @@ class RecordedSteps:
     ) -> None:
         self.cache_bytes = cache_bytes
         self.threads = threads
+        self._parts: Sequence[str] = ()
         self._cache = ChunkCache(cache_bytes)
         self._index = StepIndex.of(listed, open_recording, OpenFiles(), self._cache)
         self._wanted = None if mask is None else np.flatnonzero(mask)
@@ -95,7 +97,7 @@ class RecordedSteps:
 
     def _prepare(self) -> None:
         index = self._index
-        self.layout: StepLayout | None = index.layouts[0] if index.layouts else None
+        self.layout: StepLayout | None = index.layouts[0].only(self._parts) if index.layouts else None
         self._rows: list[NumberedRows] = []  # steps, images, final states
         if index.layouts:
             files = index.files
@@ -113,6 +115,12 @@ class RecordedSteps:
         self.__dict__.update(state)
         self._prepare()
 
+    def only(self, parts: Sequence[str]) -> RecordedSteps:
+        """As `Steps.only`; of images, those of these parts alone are read."""
+        made = RecordedSteps.__new__(RecordedSteps)
+        made.__setstate__({**self.__getstate__(), "_parts": parts})
+        return made
+
     def __len__(self) -> int:
         return int(self._index.lengths.sum()) if self._wanted is None else len(self._wanted)
 
@@ -122,14 +130,21 @@ class RecordedSteps:
     def blocks(self, rows: Array) -> Array:
         """The chunk of each row: that of the image if states have one."""
         listed = rows if self._wanted is None else self._wanted[rows]
-        where = next(iter(self._index.images.values()), self._index.steps)
+        where = self._largest
         return where.units[where.of(listed)]
+
+    @property
+    def _largest(self) -> Segments:
+        """Where the images of the states are; the steps, if states have none."""
+        names = {leaf.name for leaf in self.layout.state} if self.layout is not None else set()
+        images = (found for name, found in self._index.images.items() if name in names)
+        return next(images, self._index.steps)
 
     @property
     def block_bytes(self) -> int:
         """Average size of a decompressed chunk (bytes); 0 without a chunk."""
         index = self._index
-        units = next(iter(index.images.values()), index.steps)
+        units = self._largest
         sizes = [
             index.stores[file]
             .table["uncompressed"][units.chunk_of[units.file_of == file]]
@@ -190,7 +205,7 @@ class RecordedSteps:
     def _plan(self, layout: StepLayout, fields: Sequence[str]) -> Plan:
         """The plan to read some fields, whose columns then share the budget."""
         names = checked_fields(fields)
-        self._index.check(names)
+        self._index.check(names, self._parts)
         kinds = [rows.columns for rows in self._rows[:-1]]
         plan = Plan.of([field for field in names if field != "next_states"], layout, kinds)
         for i, leaves in plan.sources:

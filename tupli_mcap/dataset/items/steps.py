@@ -9,8 +9,9 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
+from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.columns.fields import FIVE, field_names
+from tupli_mcap.recording.columns.fields import FIVE, field_names, fields_and_parts
 from tupli_mcap.schema import BaseFilter, F
 
 FIELDS = (*FIVE, "next_states", "times")
@@ -61,6 +62,14 @@ class Steps(Protocol):
         """Columns of the steps `start` to `start + length - 1` for each of `starts` (int64), one run after the other.
 
         The same as `read` for all those len(starts) * length rows; `length` is at least 1.
+        """
+        ...
+
+    def only(self, parts: Sequence[str]) -> Steps:
+        """The same steps with only some parts of the state or the action, as `StepLayout.only` has them.
+
+        Raises:
+            SpaceError: there is no such part.
         """
         ...
 
@@ -123,6 +132,14 @@ class MemorySteps:
             for field in fields
         }
 
+    def only(self, parts: Sequence[str]) -> Steps:
+        """As `Steps.only`."""
+        rest = self._rest.only(parts)
+        columns = {
+            field: _part_of_column(field, column, rest.layout) for field, column in self._columns.items()
+        }
+        return MemorySteps(columns, rest)
+
     def blocks(self, rows: Array) -> Array:
         """As `Steps.blocks`; of memory, any rows near each other."""
         return rows // _BLOCK
@@ -135,6 +152,15 @@ class MemorySteps:
         return _same, (self._rest,)
 
 
+def _part_of_column(field: str, column: Any, layout: StepLayout | None) -> Any:
+    """Those leaves of a column that a layout has, which is that of the column or has only parts of it."""
+    leaves = None if layout is None else field_leaves(field, layout)
+    if layout is None or leaves is None or field == "rewards":
+        return column
+    nest = layout.nest_action if field == "actions" else layout.nest_state
+    return nest([leaf.get(column) for leaf in leaves])
+
+
 def _same(steps: Steps) -> Steps:
     return steps
 
@@ -142,6 +168,13 @@ def _same(steps: Steps) -> Steps:
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
     """The fields as a list; one name becomes a list of one. SamplingError if a field is unknown, or is no text."""
     return field_names(fields, known, SamplingError)
+
+
+def steps_and_fields(steps: Steps, fields: Sequence[str], known: Sequence[str]) -> tuple[Steps, list[str]]:
+    """The steps, with only those parts of states and actions that fields name ("state.arm"), and the columns to read.
+    SamplingError if a field is unknown; SpaceError if there is no such part."""
+    names, parts = fields_and_parts(fields, known, SamplingError)
+    return steps.only(parts) if parts else steps, names
 
 
 def pick(column: Any, rows: Array | slice) -> Any:

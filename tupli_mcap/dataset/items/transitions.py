@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.dataset.items.beside import BESIDE
 from tupli_mcap.dataset.items.items import StepItems
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, map_arrays, steps_and_fields
 from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
 TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
@@ -77,7 +77,8 @@ class Transitions(StepItems[Transition]):
             raise SamplingError(f"expected a discount from 0 to 1, found {discount!r:.80}")
         self.discount = float(discount)
         known = [field for field in steps.fields if field in (*TRANSITION_FIELDS, "times", *BESIDE)]
-        self.fields = tuple(checked_fields(fields, known))
+        self.source, names = steps_and_fields(steps, fields, known)
+        self.fields = tuple(names)
         varying = steps.layout is not None and any(leaf.kind == "variable" for leaf in steps.layout.reward)
         if self.n_step > 1 and varying and "rewards" in self.fields:
             raise SamplingError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import Items
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, checked_fields, map_arrays
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, map_arrays, steps_and_fields
 from tupli_mcap.errors import plural
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames, Parts
 
@@ -74,7 +74,8 @@ class Windows(Items[Window]):
         if pad not in PADS:
             raise SamplingError(f"expected pad to be one of {', '.join(map(repr, PADS))}, found {pad!r:.80}")
         self.pad = pad
-        self.fields = tuple(checked_fields(fields, steps.fields))
+        self.source, names = steps_and_fields(steps, fields, steps.fields)
+        self.fields = tuple(names)
         self._lasts = steps.breaks
         self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
         sizes = self._lasts - self._firsts + 1

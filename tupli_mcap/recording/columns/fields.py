@@ -47,6 +47,9 @@ FIELD_OF = MappingProxyType(
     }
 )
 """Every name of a column, or of its value in one step -> column."""
+_VALUE_OF = MappingProxyType({"states": "state", "next_states": "state", "actions": "action"})
+"""Column -> the value, of which a part may be wanted. States and next states are of one space, and have the same parts.
+"""
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -72,6 +75,42 @@ def field_names(
             hint = _how_to_get(part, whole) if part and whole in known else did_you_mean(word, known)
             raise error(f"expected fields from {', '.join(known)}, found {written!r:.80}{hint}")
     return list(dict.fromkeys(names))
+
+
+def fields_and_parts(
+    fields: str | Sequence[str], known: Sequence[str] = FIELDS, error: type[Exception] = RecordingError
+) -> tuple[list[str], list[str]]:
+    """The columns of fields, as `field_names`, and the parts that are wanted of the state and of the action, such as
+    "state.arm" for the field "observations.arm". All is wanted of that of which no part is named. Raises `error` for
+    other parts of the next state than of the state."""
+    given = [fields] if isinstance(fields, str) or not isinstance(fields, Sequence) else list(fields)
+    names: list[Any] = []
+    parts: dict[str, list[str]] = {}  # of each column; none for all of it
+    for name in given:
+        word, part = split_name(name) if isinstance(name, str) else (name, "")
+        field = FIELD_OF.get(word, "") if isinstance(word, str) else ""
+        if field in _VALUE_OF and field in known:
+            own = parts.setdefault(field, [])
+            own.append(f"{_VALUE_OF[field]}{part}")
+            name = field
+        names.append(name)
+    wanted = {
+        field: [] if _VALUE_OF[field] in own else list(dict.fromkeys(own)) for field, own in parts.items()
+    }
+    state, after = wanted.get("states", []), wanted.get("next_states", [])
+    if len({"states", "next_states"} & wanted.keys()) == 2 and sorted(state) != sorted(after):
+        raise error(
+            f"expected the same parts of states and of next_states, found {', '.join(state) or 'all'} "
+            f"and {', '.join(after) or 'all'}; name the same ones"
+        )
+    return field_names(names, known, error), list(dict.fromkeys([*state, *after, *wanted.get("actions", [])]))
+
+
+def named_parts(field: str, parts: Sequence[str]) -> list[str]:
+    """The names of a field that has only some parts, as from `fields_and_parts`: its own, if it has all."""
+    value = _VALUE_OF.get(field, field)
+    own = [part for part in parts if split_name(part)[0] == value]
+    return [f"{step_name(field)}{part.removeprefix(value)}" for part in own] or [field]
 
 
 def _how_to_get(part: str, field: str | None) -> str:

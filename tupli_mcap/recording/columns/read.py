@@ -26,6 +26,7 @@ from tupli_mcap.recording.columns.gather import (
     step_rows,
 )
 from tupli_mcap.recording.columns.runs import Runs, final_runs, parts_of
+from tupli_mcap.spaces.leaves import Leaf
 
 
 @dataclass(repr=False)
@@ -83,15 +84,16 @@ class ColumnReader:
         threads: int,
         keep: bool,
         images: bool = True,
+        parts: Sequence[str] = (),
     ) -> dict[str, Any]:
         """`fields` nested as their spaces are; `keep` puts the chunks read into the cache.
 
-        Without `images`, the columns of image leaves are empty.
+        Without `images`, the columns of image leaves are empty. parts: see `StepLayout.only`.
         """
-        plan = self._plans.get(tuple(fields))
+        plan = self._plans.get((*fields, *parts))
         if plan is None:
             kinds = (rows.columns for rows in self._kinds)
-            plan = self._plans[tuple(fields)] = Plan.of(fields, self._layout, kinds)
+            plan = self._plans[*fields, *parts] = Plan.of(fields, self._layout.only(parts), kinds)
         columns: dict[str, Any] = {}
         tasks, checks, chunks = [], [], []
         for i, names in plan.sources:
@@ -102,11 +104,11 @@ class ColumnReader:
             if leaf is not None:
                 moved = runs._replace(channels=self._image_channels(leaf, runs.channels))
             own = {name: rows.columns[name].empty(total) for name in names}
-            parts = parts_of(moved, self._store)
+            of_chunks = parts_of(moved, self._store)
             columns |= own
-            tasks += rows.tasks(own, parts, keep)
-            chunks += [part.chunk for part in parts]
-            checks.append(partial(rows.check, own, parts, whole=True))
+            tasks += rows.tasks(own, of_chunks, keep)
+            chunks += [part.chunk for part in of_chunks]
+            checks.append(partial(rows.check, own, of_chunks, whole=True))
         self._store.fetch(chunks)
         do_all(tasks, threads)
         for check in checks:
@@ -133,9 +135,9 @@ class ColumnReader:
         images = [self._images[name][channel] for channel in found.tolist()]
         return np.array(images, np.int64)[places]
 
-    def final_columns(self, channel: int, episodes: Array) -> list[Any]:
-        """Final states of episodes (index rows that all have one): a column for each leaf of the state."""
-        names = [leaf.name for leaf in self._layout.state]
+    def final_columns(self, channel: int, episodes: Array, leaves: Sequence[Leaf]) -> list[Any]:
+        """Final states of episodes (index rows that all have one): a column for each of some leaves of the state."""
+        names = [leaf.name for leaf in leaves]
         parts = parts_of(final_runs(episodes, channel), self._store)
         columns = self._finals.read([*names, EPISODE], parts, len(episodes), 1)
         wrong = np.flatnonzero(columns[EPISODE] != episodes["episode"])

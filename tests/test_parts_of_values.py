@@ -1,0 +1,162 @@
+"""Parts of states and actions, such as "state.arm": read alone, they are what the whole has there."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tupli_mcap
+from tupli_mcap import EpisodeWriter, SpaceError, TupliError
+from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.items import RecordedSteps
+
+ARM = gym.spaces.Dict({"q": gym.spaces.Box(-9, 9, (2,)), "v.x": gym.spaces.Box(-9, 9, (3,), np.float32)})
+CAMERA = gym.spaces.Box(0, 255, (8, 6, 3), np.uint8)
+NESTED = {"arm": ARM, "camera": CAMERA, "t": gym.spaces.Tuple([gym.spaces.Discrete(5), CAMERA])}
+ACTION = gym.spaces.Dict({"grip": gym.spaces.Discrete(2), "move": gym.spaces.Box(-1, 1, (2,))})
+STATES = {
+    "of one size": gym.spaces.Dict(NESTED),
+    "with a text": gym.spaces.Dict({**NESTED, "said": gym.spaces.Text(20)}),
+}
+PARTS = (
+    ["state.arm"],
+    ["state.arm.q", "state.camera"],
+    ['observation.arm."v.x"', "states.t"],
+    ["state.camera"],
+)
+Read = Callable[[Sequence[str]], Any]
+
+
+def record(path: Path, space: gym.Space[Any], lengths: Sequence[int], seed: int) -> None:
+    space.seed(seed)
+    ACTION.seed(seed)
+    with EpisodeWriter(path, space, ACTION) as writer:
+        for length in lengths:
+            writer.begin()
+            for step in range(length):
+                writer.step(space.sample(), ACTION.sample(), float(step), step == length - 1)
+            writer.end(space.sample() if length % 2 else None)
+
+
+@pytest.fixture(params=STATES, ids=STATES)
+def runs(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    for seed in range(2):
+        record(tmp_path / f"{seed}.mcap", STATES[request.param], [5, 4, 1], seed)
+    return tmp_path
+
+
+def cut(value: Any, parts: Sequence[Sequence[str]]) -> Any:
+    """A nested value without what lies in none of the parts, by their keys."""
+    if not isinstance(value, dict) or any(len(part) == 0 for part in parts):
+        return value
+    keys = [key for key in value if any(part[0] == key for part in parts)]
+    return {key: cut(value[key], [part[1:] for part in parts if part[0] == key]) for key in keys}
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple | list):
+        return len(one) == len(other) and all(map(same, one, other))
+    return bool(np.array_equal(one, other))
+
+
+KEYS = {
+    "state.arm": ["arm"],
+    "state.arm.q": ["arm", "q"],
+    "state.camera": ["camera"],
+    'observation.arm."v.x"': ["arm", "v.x"],
+    "states.t": ["t"],
+}
+
+
+@pytest.mark.parametrize("parts", PARTS, ids=str)
+def test_parts_are_what_the_whole_has_there(runs: Path, parts: list[str], tmp_path: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    chosen = dataset.filter_steps("step > 0 or state.arm.q[0] > 0")
+    rows = np.array([7, 0, 3, 3])
+    readers: dict[str, Read] = {
+        "recording": lambda fields: dataset[0].recording.read(fields),
+        "dataset": dataset.read,
+        "chosen": chosen.read,
+        "windows": lambda fields: dataset.windows(3, pad="repeat", fields=fields)[rows],
+        "chosen windows": lambda fields: chosen.windows(2, pad="zero", fields=fields)[rows],
+        "transitions": lambda fields: dataset.transitions(fields=[*fields, "rewards"])[rows],
+    }
+    if "said" not in dataset[0].states:
+        dataset.save_columns(tmp_path / "saved")
+        saved = open_columns(tmp_path / "saved")
+        readers["saved"] = lambda fields: saved.windows(3, pad="repeat", fields=fields)[rows]
+    for name, read in readers.items():
+        both = [*parts, *(f"next_state.{part.partition('.')[2]}" for part in parts)]
+        whole, found = read(["states", "actions", "next_states"]), read([*both, "action.move"])
+        keys = [KEYS[part] for part in parts]
+        assert same(found.states, cut(whole.states, keys)), name
+        assert same(found.actions, cut(whole.actions, [["move"]])), name
+        assert same(found.next_states, cut(whole.next_states, keys)), name
+
+
+def test_only_images_that_are_wanted_are_read(runs: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    windows = dataset.windows(2, fields=["state.arm", "actions"])
+    again = pickle.loads(pickle.dumps(windows))
+    assert same(again[:].states, windows[:].states)
+    steps: Any = windows.source
+    assert isinstance(steps, RecordedSteps)
+    used = [bool(names) for names in steps._used]
+    assert used == [True, False, False, False]  # steps, two images, final states
+
+
+def test_what_a_loader_gives(runs: Path) -> None:
+    (batch,) = tupli_mcap.open(runs).loader(length=2, batch_size=100, fields=["state.arm.q", "action.grip"])
+    assert list(batch["states"]) == ["arm"]
+    assert list(batch["states"]["arm"]) == ["q"]
+    assert list(batch["actions"]) == ["grip"]
+
+
+def test_parts_that_cannot_be_read_alone(runs: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    for read in (
+        dataset.read,
+        dataset[0].recording.read,
+        lambda fields: dataset.windows(1, fields=fields)[0],
+    ):
+        with pytest.raises(SpaceError, match=r"found state.amr \(did you mean 'state.arm'"):
+            read(["state.amr"])
+        with pytest.raises(SpaceError, match=r"found state.arm.q\[0\]; read state.arm.q, and index it"):
+            read(["state.arm.q[0]"])
+        with pytest.raises(SpaceError, match=r"expected all of state.t, which is a Tuple"):
+            read(["state.t[0]"])
+        with pytest.raises(
+            TupliError, match=r"the same parts of states and of next_states, found state.arm and all"
+        ):
+            read(["state.arm", "next_states"])
+        assert same(read(["state", "state.arm"]).states, read(["state"]).states)
+
+
+def test_a_part_of_what_has_none(tmp_path: Path) -> None:
+    with EpisodeWriter(tmp_path / "r.mcap", gym.spaces.Box(-1, 1, (3,)), gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        writer.step(np.zeros(3, np.float32), 1, 1.0, True)
+    dataset = tupli_mcap.open(tmp_path)
+    with pytest.raises(SpaceError, match=r"expected a part such as state, found state.arm"):
+        dataset.read(["state.arm"])
+    with pytest.raises(SpaceError, match=r"found state\[0\]; read state, and index it"):
+        dataset.read(["state[0]"])
+
+
+def test_recordings_need_agree_only_on_what_is_read(tmp_path: Path) -> None:
+    for number, size in enumerate((8, 4)):
+        camera = gym.spaces.Box(0, 255, (size, size, 3), np.uint8)
+        record(tmp_path / f"{number}.mcap", gym.spaces.Dict({"arm": ARM, "camera": camera}), [3, 2], number)
+    dataset = tupli_mcap.open(tmp_path)
+    with pytest.raises(SpaceError, match="state.camera"):
+        dataset.read(["states"])
+    assert dataset.read(["state.arm"]).states["arm"]["q"].shape == (10, 2)
+    assert dataset.windows(2, fields=["state.arm"])[:].states["arm"]["q"].shape == (6, 2, 2)
