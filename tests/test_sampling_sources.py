@@ -7,6 +7,8 @@ import multiprocessing
 import os
 import pickle
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -200,6 +202,26 @@ def test_many_files_keep_few_open(tmp_path: Path) -> None:
     assert len(list(Path("/proc/self/fd").iterdir())) <= before + 64 + 4
     (one,) = (Recording(source).read(episodes=[1, 3], fields=["states"]).states,)
     assert np.array_equal(found, np.tile(one, (200, 1))[rows])
+
+
+def test_more_recordings_than_a_process_may_have_open(tmp_path: Path) -> None:
+    """`windows` needs few at once; `save` needs all, and the limit that was set can be raised."""
+    for i in range(100):
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "many" / f"{i}.mcap", capture="none") as env:
+            roll(env, 5)
+    code = (
+        "import resource, sys, tupli_mcap\n"
+        "limit = 80 if sys.argv[1] == 'windows' else resource.getrlimit(resource.RLIMIT_NOFILE)[1]\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (80, limit))\n"
+        "ds = tupli_mcap.open(sys.argv[2])\n"
+        "assert len(ds.windows(1)) == ds.n_steps\n"
+        "if sys.argv[1] == 'save': ds.save(sys.argv[3])\n"
+    )
+    for use in ("windows", "save"):
+        saved = tmp_path / "all.mcap"
+        subprocess.run([sys.executable, "-c", code, use, tmp_path / "many", saved], check=True, timeout=120)
+    with Recording(saved) as recording:
+        assert recording.n_steps == 500
 
 
 def test_one_field_may_be_given_as_a_text(tmp_path: Path) -> None:

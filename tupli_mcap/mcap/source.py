@@ -7,6 +7,7 @@ import errno
 import io
 import mmap
 import os
+import resource
 import stat
 import threading
 import weakref
@@ -20,6 +21,8 @@ from tupli_mcap.errors import FormatError, RecordingError, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
 _LARGEST_LENT = 4 << 20
+_ROOM = 64  # files that a program opens beside recordings
+_MANY_FILES = 10_240  # that every system allows
 _lent = threading.local()
 
 
@@ -57,6 +60,7 @@ def open_regular(path: Path) -> int:
     opened, or is no regular file."""
     waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
     fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
+    _leave_room(fd)
     try:
         mode = os.fstat(fd).st_mode
     except BaseException:
@@ -68,6 +72,16 @@ def open_regular(path: Path) -> int:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     raise OSError(errno.EINVAL, "a device, a pipe or a socket, and no file", str(path))
+
+
+def _leave_room(fd: int) -> None:
+    """Raises the limit of files that this process may have open, where the newest one has nearly reached it: a merge
+    opens all its recordings. The system sets a low limit for programs that wait for files with `select`."""
+    limit, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limit != resource.RLIM_INFINITY and limit - _ROOM <= fd:
+        higher = _MANY_FILES if most == resource.RLIM_INFINITY else most
+        with contextlib.suppress(OSError, ValueError):  # the system may allow fewer
+            resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit, higher), most))
 
 
 def _lent_buffer(length: int) -> memoryview:

@@ -140,7 +140,6 @@ class _FileEpisodes(NamedTuple):
     """The episodes of one file: rows of its index, and how many steps of each are meant."""
 
     stored: StoredSteps
-    store: ChunkStore
     rows: Array
     lengths: Array
 
@@ -174,11 +173,10 @@ class _Builder:
         source = stored.source
         if stored.where is not None and source.path is not None:
             source = FileOfMany(self._files, stored.where, source.path, source)
+        stored = stored._replace(store=stored.store.elsewhere(source, self._cache), source=source)
         rows = recording.index[positions_of(recording, listed)]
         self._layout_of.append(self._layout(recording.name, stored.layout))
-        self._parts.append(
-            _FileEpisodes(stored, stored.store.elsewhere(source, self._cache), rows, listed.lengths)
-        )
+        self._parts.append(_FileEpisodes(stored, rows, listed.lengths))
         self._digest.update(f"{recording.uuid} {len(rows)} ".encode())
         self._digest.update(rows["episode"].tobytes() + listed.lengths.tobytes())
 
@@ -203,7 +201,7 @@ class _Builder:
             self._layouts,
             self._names,
             self._layout_of,
-            [part.store for part in parts],
+            [part.stored.store for part in parts],
             self._steps(None),
             {name: self._steps(path) for name, path in image_names(self._layouts).items()},
             self._finals(),
@@ -219,11 +217,11 @@ class _Builder:
         builder = SegmentsBuilder()
         places = [(*self._places(part, path), part) for part in self._parts]
         for file, (channels, first, part) in enumerate(places):
-            builder.add(file, *part.store.locate(channels, first, part.lengths))
+            builder.add(file, *part.stored.store.locate(channels, first, part.lengths))
         for file, (channels, first, part) in enumerate(places):
             on = part.went_on
             next_rows = first[on] + part.lengths[on]
-            builder.add(file, *part.store.locate(channels[on], next_rows, np.ones_like(next_rows)))
+            builder.add(file, *part.stored.store.locate(channels[on], next_rows, np.ones_like(next_rows)))
         return builder.build()
 
     def _places(self, part: _FileEpisodes, path: str | None) -> tuple[Array, Array]:
@@ -238,7 +236,7 @@ class _Builder:
         for file, part in enumerate(self._parts):
             rows = part.rows["final_row"][part.known].astype(np.int64)
             channels = np.full(len(rows), part.stored.final_channel or 0)
-            builder.add(file, *part.store.locate(channels, rows, np.ones_like(rows)))
+            builder.add(file, *part.stored.store.locate(channels, rows, np.ones_like(rows)))
         return builder.build()
 
 
