@@ -113,6 +113,22 @@ def test_only_images_that_are_wanted_are_read(runs: Path) -> None:
     assert used == [True, False, False, False]  # steps, two images, final states
 
 
+def test_statistics_read_no_image(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    space = gym.spaces.Dict({"arm": ARM, "camera": CAMERA})
+    with EpisodeWriter(path, space, ACTION, compression="none") as writer:
+        writer.begin()
+        for step in range(3):
+            state = {**space.sample(), "camera": np.full(CAMERA.shape, 171, np.uint8)}
+            writer.step(state, ACTION.sample(), 1.0, step == 2)
+    image = bytes([171]) * CAMERA.sample().size
+    path.write_bytes(path.read_bytes().replace(image, b"?" + image[1:], 1))
+    dataset = tupli_mcap.open(path)
+    assert list(dataset.stats(["states"])) == ["state.arm.q", 'state.arm."v.x"']
+    with pytest.raises(TupliError, match="damaged"):
+        dataset.read(["states"])
+
+
 def test_what_a_loader_gives(runs: Path) -> None:
     (batch,) = tupli_mcap.open(runs).loader(length=2, batch_size=100, fields=["state.arm.q", "action.grip"])
     assert list(batch["states"]) == ["arm"]
