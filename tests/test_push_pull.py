@@ -40,6 +40,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, pack
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.exchange import copy_episodes
@@ -561,6 +562,35 @@ def test_nothing_is_hidden_from_a_group_that_sees_nothing(admin: TupliAPIClient,
         assert (refused.exit_code, "there is no group 'robot'" in refused.stderr) == (1, True)
 
 
+def cart_with(artifact: str, storage: TupliStorage) -> str:
+    """The id of a new benchmark that needs an artifact."""
+    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
+    digest = benchmark_hash(BenchmarkContent(record, (artifact,)), metadata)
+    query = BenchmarkQuery(hash=digest, serialized=pack(record, (artifact,)), metadata=metadata)
+    return storage.store_benchmark(query).id
+
+
+def test_a_copy_of_somebody_else_s_benchmark_comes_and_goes_with_its_artifacts(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    artifact = admin.store_artifact(b"wind", ArtifactMetadata(name="wind", description="of 2019")).id
+    uri = cart_with(artifact, admin)
+    run("publish", uri)
+    bob = signed_in(admin, "bob")
+    run("pull", uri, "--storage", tmp_path)
+    with FileStorage(tmp_path) as lab:
+        assert lab.load_artifact(artifact) == b"wind"
+        assert copy_episodes(lab, bob, dry_run=True)[uri].artifacts == 1
+        assert copy_episodes(lab, bob)[uri].artifacts == 1
+        assert copy_episodes(lab, bob)[uri].artifacts == 0
+    bob.login("admin", PASSWORD)
+    bob.unpublish_artifact(artifact, "global")
+    bob.login("bob", "bob's password")
+    (item,) = bob.list_artifacts()
+    assert (item.created_by, item.description) == ("bob", "of 2019")
+    assert bob.load_artifact(artifact) == b"wind"
+
+
 def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClient) -> None:
     artifact = admin.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
     admin.create_group(Group(name="robots"))
@@ -569,10 +599,7 @@ def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClie
     member = GroupMembership(user="bob", roles=["contributor"])
     admin.add_group_members(GroupMembershipQuery(group_name="robots", members=[member]))
     admin.login("bob", "bob's password")
-    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
-    digest = benchmark_hash(BenchmarkContent(record, (artifact,)), metadata)
-    query = BenchmarkQuery(hash=digest, serialized=pack(record, (artifact,)), metadata=metadata)
-    uri = admin.store_benchmark(query).id
+    uri = cart_with(artifact, admin)
     result = CliRunner().invoke(app, ["publish", uri, "--group", "robots"])
     assert (result.exit_code, result.stderr) == (0, "")
     dry = CliRunner().invoke(app, ["publish", uri, "--dry-run"])

@@ -129,10 +129,14 @@ def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, 
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:
-    """Copies a benchmark and the artifacts that it needs; returns how many of these were new."""
+    """Copies a benchmark and the artifacts that it needs; returns how many of these were new. On a server, the caller
+    gets a copy of each: others may hide or delete theirs."""
     benchmark = source.load_benchmark(uri)
     wanted = artifacts_needed(benchmark.serialized)
-    held = {item.id for item in target.list_artifacts(FilterIN(key="id", value=list(wanted)))}
+    among: BaseFilter = FilterIN(key="id", value=list(wanted))
+    if isinstance(target, TupliAPIClient):
+        among = _own(target, among)
+    held = {item.id for item in target.list_artifacts(among)}
     missing = [artifact for artifact in wanted if artifact not in held]
     if dry_run:
         return len(missing)
