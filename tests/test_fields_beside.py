@@ -308,7 +308,13 @@ def test_tables_have_a_column_for_each_number_in_infos(touching: tupli_mcap.Data
         "info.grid[0,1]", 'info."a.b"', "info.texts", "info.ragged", "info.list",
     ]  # fmt: skip
     np.testing.assert_array_equal(table["info.contact.left[0]"], [0, 1, 2, np.nan])
-    assert table["info.contact.right.grip"].tolist() == [False, False, True, None]
+    grips = table["info.contact.right.grip"]
+    assert grips.dtype == "boolean" and grips.to_numpy(object, na_value=None).tolist() == [
+        False,
+        False,
+        True,
+        None,
+    ]
     assert touching.to_arrow()["info.grid[0,1]"].to_pylist() == [0, 1, 2, None]
     assert table["info.texts"][0] == {"x": "y"} and table["info.ragged"][1].shape == (2,)
     assert touching.to_arrow()["info.list"].to_pylist()[1] == [[1], [1, 1]]

@@ -585,6 +585,27 @@ def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:
     assert table["run.metadata.n"].isna().tolist() == [False, True]
 
 
+def test_flags_that_only_some_episodes_have_are_nullable(tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:
+        for success in (True, None, np.False_):
+            writer.begin(metadata={} if success is None else {"success": success, "all": True})
+            for _ in range(2):
+                writer.step([0], [0], 1.0, info={} if success is None else {"touches": success})
+            writer.end([0])
+    dataset = tupli_mcap.open(tmp_path)
+    episodes, steps = dataset.to_pandas("episodes"), dataset.to_pandas()
+    for table, name in ((episodes, "metadata.success"), (steps, "metadata.success"), (steps, "info.touches")):
+        column = table[name]
+        assert column.dtype == "boolean" and column.mean() == 0.5
+        assert column.isna().sum() == len(table) / 3
+        assert column.fillna(False).sum() == len(table[column]) == len(table) / 3
+        assert (~column).sum() == len(table) / 3
+    assert dataset.sort("episode")[[0, 2]].to_pandas("episodes")["metadata.all"].dtype == bool
+    pytest.importorskip("pyarrow")
+    assert dataset.to_arrow("episodes")["metadata.success"].to_pylist() == [True, None, False]
+
+
 @pytest.mark.parametrize("missing", ["pandas", "pyarrow"])
 def test_the_extra_of_arrow_is_named(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
     monkeypatch.setitem(sys.modules, missing, None)

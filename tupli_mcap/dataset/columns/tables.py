@@ -143,6 +143,8 @@ def _column(values: list[Any]) -> Any:
         return _floats(values)
     if numbers and len(given) < len(values):
         return _whole_numbers(values)
+    if len(given) < len(values) and all(isinstance(value, bool | np.bool_) for value in given):
+        return import_pandas().array(values, dtype="boolean")
     # pandas would make a complex number of None
     if len(given) < len(values) and any(isinstance(value, complex | np.complexfloating) for value in given):
         return import_pandas().Series(values, dtype=object)
