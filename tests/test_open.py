@@ -585,6 +585,28 @@ def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:
     assert table["run.metadata.n"].isna().tolist() == [False, True]
 
 
+def test_metadata_in_dicts_are_columns_named_as_in_filters(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    options = {"opt": {"lr": 1e-3, "v1.0": {"betas": [0.9, 0.99]}}, "empty": {}}
+    with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE, metadata=options) as writer:
+        for metadata in ({"goal": {"x": 1, "near": True}}, {"goal": {"x": 2}}, {"goal": "none"}):
+            writer.begin(metadata=metadata)
+            writer.step([0], [0], 1.0, True)
+    dataset = tupli_mcap.open(tmp_path)
+    table = dataset.to_arrow("episodes").to_pydict()
+    wanted = {
+        "run.metadata.opt.lr": [1e-3] * 3,
+        'run.metadata.opt."v1.0".betas': [[0.9, 0.99]] * 3,
+        "metadata.goal.x": [1, 2, None],
+        "metadata.goal.near": [True, None, None],
+        "metadata.goal": [None, None, "none"],
+    }
+    assert {name: column for name, column in table.items() if "metadata" in name} == wanted
+    assert {name for name in dataset.to_pandas() if "metadata" in name} == {*wanted} - {*list(wanted)[:2]}
+    for key, (first, _, last) in wanted.items():
+        assert isinstance(first, list) or len(dataset.filter(F(key) == (first or last))) > 0
+
+
 def test_flags_that_only_some_episodes_have_are_nullable(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:

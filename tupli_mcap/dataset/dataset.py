@@ -542,9 +542,10 @@ class Dataset(RandomAccess):
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
         """One row per step or per episode, one column per dimension, with its label if the recordings agree on one.
 
-        Infos and metadata have a column for each key: `info.x`, `metadata.score`; an info that is an array of numbers
-        of one shape, or a dict of those and of numbers, has one for each number: `info.contact.left[0]`. An image, or
-        an array of more than 500 numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
+        Infos and metadata have a column for each key: `info.x`, `metadata.score`. Metadata in dicts have one for each
+        value: `run.metadata.opt.lr`, as in filters. An info that is an array of numbers of one shape, or a dict of
+        those and of numbers, has one for each number: `info.contact.left[0]`. An image, or an array of more than 500
+        numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
 
         Raises:
             MissingExtraError: pandas is not installed.

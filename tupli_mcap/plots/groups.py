@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -13,6 +13,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording.about.run import name_after
+from tupli_mcap.schema.keys import leaves_of
 
 X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
@@ -126,7 +127,7 @@ def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]
 def _seedless(one: Measured) -> tuple[Any, ...] | None:
     """The key that runs of a group share: the name without the seed (with the directory, if the run is named after its
     file), the environment, the split, and the settings that are no seeds. None if the run names no seed."""
-    told = dict(_settings(one.run.metadata))
+    told = {".".join(keys): value for keys, value in leaves_of(one.run.metadata)}
     settings = frozenset(f"{key}={value}" for key, value in told.items() if not _SEED_KEY.fullmatch(key))
     seed, path, given = one.run.metadata.get("seed"), Path(one.facts.name), one.run.name[:_LONGEST]
     name = _SEED.sub("", given)
@@ -137,15 +138,6 @@ def _seedless(one: Measured) -> tuple[Any, ...] | None:
     own = one.run.name != name_after(one.facts.name)
     folder = "" if own else _SEED.sub("", str(path.parent))
     return folder, name.strip("-_. "), one.run.environment, one.run.split, settings
-
-
-def _settings(metadata: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings by keys such as `optimizer.lr`."""
-    for key, value in metadata.items():
-        if isinstance(value, dict):
-            yield from _settings(value, f"{within}{key}.")
-        else:
-            yield f"{within}{key}", value
 
 
 def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:

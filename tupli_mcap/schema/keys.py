@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -72,6 +72,17 @@ def name_within(name: str, *segments: Any) -> str:
     anything else is an index.
     """
     return name + "".join(map(_segment, segments))
+
+
+def leaves_of(
+    value: Mapping[str, Any], before: tuple[str, ...] = ()
+) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """The values in nested mappings that are no mappings themselves, each with the keys that lead to it."""
+    for key, inside in value.items():
+        if isinstance(inside, Mapping):
+            yield from leaves_of(inside, (*before, key))
+        else:
+            yield (*before, key), inside
 
 
 def join_key(segments: Sequence[Any]) -> str:

@@ -15,7 +15,7 @@ from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.messages.infos import columns_in
 from tupli_mcap.recording.columns.fields import FIVE
-from tupli_mcap.schema.keys import name_within
+from tupli_mcap.schema.keys import leaves_of, name_within
 from tupli_mcap.spaces.labels import common_labels, distinct, element_names
 
 if TYPE_CHECKING:
@@ -130,9 +130,13 @@ def _whole_numbers(values: Sequence[int | None]) -> Any:
 
 
 def _columns_of(root: str, items: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A column for each key of any item, with None for items without the key."""
-    keys = dict.fromkeys(key for item in items for key in item)
-    return {name_within(root, key): _column([item.get(key) for item in items]) for key in keys}
+    """A column for each leaf of any item, named as in filters (`metadata.opt.lr`), with None for items without it."""
+    once = {id(item): item for item in items}  # the episodes of a run share its metadata
+    leaves = {key: dict(leaves_of(item)) for key, item in once.items()}
+    paths = dict.fromkeys(path for own in leaves.values() for path in own)
+    return {
+        name_within(root, *path): _column([leaves[id(item)].get(path) for item in items]) for path in paths
+    }
 
 
 def _column(values: list[Any]) -> Any:
