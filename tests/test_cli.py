@@ -849,6 +849,15 @@ class TestLook:
         assert title.lower().split() == ["seed", "created_by", "run.split"]
         assert "SPLIT" not in ok("ls", cartpole)
 
+    def test_both_lists_take_quoted_parts_of_a_column(self, here: Path) -> None:
+        with RecordEpisodes(Reach(), "a.mcap", metadata={"opt": {"v1.0": 3}}) as env:
+            env.reset(seed=1)
+            env.step(0)
+        key = 'run.metadata.opt."v1.0"'
+        for command in ("ls", "episodes"):
+            assert run(command, "a.mcap", "--columns", key, "--json").json == [{key: 3}]
+        assert "needs a name at character 13" in fails("ls", "a.mcap", "--columns", "run.metadata.", code=2)
+
     def test_ls_takes_the_other_names_of_columns(self, cartpole: Path, here: Path) -> None:
         ok("record", "CartPole-v1", "-o", "short.mcap", "--steps", 5)
         for key, other in (("steps", "n_tuples"), ("return", "episode_return")):

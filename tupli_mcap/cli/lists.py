@@ -227,10 +227,11 @@ def _sorted(
 
 
 def _column(name: str) -> _Listed:
+    from tupli_mcap.schema import split_key
     from tupli_mcap.schema.facts import LISTED_AS
 
     if name.startswith(_SETTING):
-        value = partial(_setting, name.removeprefix(_SETTING).split("."))
+        value = partial(_setting, split_key(name)[2:])
         return _listed_by(value, Column(name.upper()), _text)
     key = LISTED_AS.get(name.lower(), name.lower())
     if key not in _COLUMNS:
