@@ -607,6 +607,21 @@ def test_metadata_in_dicts_are_columns_named_as_in_filters(tmp_path: Path) -> No
         assert isinstance(first, list) or len(dataset.filter(F(key) == (first or last))) > 0
 
 
+def test_tables_have_no_columns_of_what_is_left_out(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:
+        for key, reward in (("a", 1.0), ("b", 2.0)):
+            writer.begin(metadata={key: 1, "both": reward})
+            writer.step([0], [0], reward, True, info={key: 1})
+    dataset = tupli_mcap.open(tmp_path)
+    for found in (dataset.filter("return > 1"), dataset[1:], dataset.filter_steps("reward > 1")):
+        own = {name for name in found.to_pandas() if "metadata" in name or "info" in name}
+        assert own == {"info.b", "metadata.b", "metadata.both"}
+        table = found.to_arrow()
+        assert own <= {*table.column_names} and table["metadata.both"].to_pylist() == [2.0]
+        assert table["episode"].to_pylist() == [len(found) - 1]
+
+
 def test_flags_that_only_some_episodes_have_are_nullable(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", SPACE, SPACE) as writer:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
+    from tupli_mcap.schema import EpisodeHeader
     from tupli_mcap.spaces.labels import Labels
     from tupli_mcap.spaces.leaves import Leaf
 
@@ -39,7 +40,7 @@ def _columns(dataset: Episodes, level: Level) -> dict[str, Any]:
     """Columns that pandas takes; lists and masked arrays say what is missing, where a DataFrame has NaN."""
     pandas = import_pandas()
     if level == "episodes":
-        return _episode_columns(dataset)
+        return _episode_columns(dataset.headers)
     if level != "steps":
         raise DatasetError(f"expected the level 'steps' or 'episodes', found {level!r:.80}")
     return _step_columns(dataset, pandas)
@@ -87,8 +88,7 @@ def _arrow_column(values: Sequence[Any], pyarrow: Any, *, is_pandas: bool) -> An
         return pyarrow.array([None if value is None else jsonvalue.dumps_plain(value) for value in values])
 
 
-def _episode_columns(dataset: Episodes) -> dict[str, Any]:
-    headers = dataset.headers
+def _episode_columns(headers: Sequence[EpisodeHeader]) -> dict[str, Any]:
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
         "episode": np.arange(len(headers)),  # as in the table of steps
@@ -99,7 +99,7 @@ def _episode_columns(dataset: Episodes) -> dict[str, Any]:
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
         "steps": np.array([header.n_tuples for header in headers], np.int64),
-        "return": dataset.returns,
+        "return": np.array([header.episode_return for header in headers], np.float64),  # None becomes NaN
         "end": [header.end for header in headers],
         "seed": _whole_numbers([header.seed for header in headers]),
         "ended": _times([header.created_at for header in headers]),
@@ -183,10 +183,8 @@ def _texts(values: Sequence[Any]) -> Any:
 def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
     found = dataset.read((*FIVE, "times", "infos"))
     lengths = found.episode_lengths
-    of_episode = np.repeat(np.arange(len(lengths)), lengths)
-    episodes = _episode_columns(dataset)
     columns: dict[str, Any] = {
-        "episode": of_episode,
+        "episode": np.repeat(np.arange(len(lengths)), lengths),
         "step": dataset.step_numbers,
         "time": _in_utc(found.times.astype("datetime64[ns]")),
     }
@@ -199,14 +197,17 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.rewards, recording.layout.reward, labels)
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
     columns |= _info_columns(found.infos)
+    there = np.flatnonzero(lengths)  # `filter_steps` may leave none of an episode
+    of_there = np.repeat(np.arange(len(there)), lengths[there])
+    episodes = _episode_columns([dataset.headers[i] for i in there.tolist()])
     repeated = {"id", "run", "env", "seed", *(key for key in episodes if key.startswith("metadata."))}
     for key in episodes:
         if key in repeated:
             values = episodes[key]
             if isinstance(values, np.ndarray):
-                columns[key] = values[of_episode]
+                columns[key] = values[of_there]
             else:
-                columns[key] = pandas.Series(values).iloc[of_episode].reset_index(drop=True)
+                columns[key] = pandas.Series(values).iloc[of_there].reset_index(drop=True)
     return columns
 
 
