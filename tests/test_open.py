@@ -152,9 +152,23 @@ def test_an_index_gives_an_episode_or_a_dataset(dataset: Dataset) -> None:
     for wrong in (36, -37, [36], [-37]):
         with pytest.raises(IndexError, match="expected"):
             dataset[wrong]  # type: ignore[call-overload]
-    for odd in ("first", [True], 1.5, [[1]], None):
+    for odd in ("first", 1.5, [[1]], None, [True, None]):
         with pytest.raises(TupliError, match="expected a number, a slice"):
             dataset[odd]  # type: ignore[call-overload]
+
+
+def test_a_mask_may_be_of_pandas_and_has_a_flag_for_each_episode(dataset: Dataset) -> None:
+    pandas = pytest.importorskip("pandas")
+    table = dataset.to_pandas("episodes")
+    assert ids(dataset[table["steps"] > 20]) == ids(dataset[dataset.lengths > 20])
+    some = pandas.Series([True, pandas.NA, False] * 12, dtype="boolean")
+    for mask in (some, some.array, some.fillna(False)):
+        assert ids(dataset[mask]) == ids(dataset[::3]) == table[mask]["id"].tolist()
+    for wrong in ([True], some[:7], np.ones(37, bool)):
+        with pytest.raises(TupliError, match=f"expected a mask of 36 episodes, found one of {len(wrong)}$"):
+            dataset[wrong]
+    with pytest.raises(TupliError, match="or a mask of 36 episodes"):
+        dataset[some.astype(object)]  # as pandas refuses it
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,8 @@ class Dataset(RandomAccess):
     @overload
     def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
     def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
-        """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets.
+        """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets. What is missing in a mask of
+        pandas counts as False.
 
         Raises:
             IndexError: there is no such episode.
@@ -731,10 +732,13 @@ class Dataset(RandomAccess):
         return display.Facts(repr(self._source), self._listed, steps, filters)
 
 
-def _places(chosen: object, count: int) -> list[int]:
+def _places(chosen: Any, count: int) -> list[int]:
     """The places that a mask or a list of numbers names."""
-    array = np.asarray(chosen)
-    if array.ndim == 1 and array.dtype == np.bool_ and len(array) == count:
+    of_pandas = hasattr(chosen, "fillna") and chosen.ndim == 1 and chosen.dtype.kind == "b"
+    array = np.asarray(chosen.fillna(False), np.bool_) if of_pandas else np.asarray(chosen)
+    if array.ndim == 1 and array.dtype == np.bool_:
+        if len(array) != count:
+            raise DatasetError(f"expected a mask of {count} episodes, found one of {len(array)}")
         return np.flatnonzero(array).tolist()
     if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
         raise DatasetError(
