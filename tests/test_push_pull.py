@@ -22,6 +22,7 @@ from between import Between, Fault
 from malicious import MODULE, _store as store, pickles, specs
 from persons import Person
 from serving import PASSWORD, serving
+from test_benchmark import WindyWrapper, windy
 from typer.testing import CliRunner
 
 import tupli_mcap
@@ -589,6 +590,15 @@ def test_a_copy_of_somebody_else_s_benchmark_comes_and_goes_with_its_artifacts(
     (item,) = bob.list_artifacts()
     assert (item.created_by, item.description) == ("bob", "of 2019")
     assert bob.load_artifact(artifact) == b"wind"
+
+
+def test_who_may_see_a_benchmark_can_load_it(admin: TupliAPIClient) -> None:
+    env = WindyWrapper(windy(), admin)
+    uri = env.store(name="windy")
+    env.publish()
+    bob = signed_in(admin, "bob")
+    loaded = WindyWrapper.load(bob, uri, trust=True)
+    assert np.array_equal(loaded.unwrapped.data, env.unwrapped.data)  # type: ignore[attr-defined]
 
 
 def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClient) -> None:

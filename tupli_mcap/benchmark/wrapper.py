@@ -19,7 +19,7 @@ from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
 from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
-from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, RLTuple
+from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, FilterIN, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
@@ -330,8 +330,17 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         return loaded
 
     def publish(self, publish_in: str = "global") -> None:
-        """Make the benchmark visible to a group."""
-        self.storage.publish_benchmark(self._stored_id(), publish_in)
+        """Make the benchmark visible to a group, and its artifacts, without which nobody can load it.
+
+        Artifacts of others stay as they are: only they can publish them. Its episodes, too, stay as they are.
+        """
+        uri = self._stored_id()
+        self.storage.publish_benchmark(uri, publish_in)
+        benchmark = self.storage.load_benchmark(uri)
+        needed = FilterIN(key="id", value=list(unpack(benchmark.serialized).artifacts))
+        for item in self.storage.list_artifacts(needed):
+            if item.created_by == benchmark.created_by:
+                self.storage.publish_artifact(item.id, publish_in)
 
     def delete(self, delete_artifacts: bool = False, delete_episodes: bool = True) -> DeletedBenchmark:
         """Delete the benchmark from the storage, with its episodes, and with the artifacts that no other benchmark
