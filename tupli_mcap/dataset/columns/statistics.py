@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from tupli_mcap.arrays import Array, DType
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.beside import INFOS, InfoValues, StepsWith, info_columns
 from tupli_mcap.dataset.sources import DatasetError
-from tupli_mcap.errors import did_you_mean
+from tupli_mcap.errors import SpaceError, did_you_mean
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import step_name
@@ -138,7 +139,11 @@ class _Named(NamedTuple):
 
 def _statistics(steps: Steps, leaves: Sequence[_Named]) -> dict[str, FieldStatistics]:
     """The statistics of leaves, by their names."""
-    total, fields = len(steps), list(dict.fromkeys(one.field for one in leaves))
+    steps, total, fields = (
+        _without_images(steps, leaves),
+        len(steps),
+        list(dict.fromkeys(one.field for one in leaves)),
+    )
     known = {one.name: ElementStatistics(one.leaf, one.dtype) for one in leaves}
     sampled = np.unique(np.linspace(0, total - 1, min(total, _SAMPLED)).round().astype(np.int64))
     samples: dict[str, list[Array]] = {path: [] for path in known}
@@ -151,6 +156,16 @@ def _statistics(steps: Steps, leaves: Sequence[_Named]) -> dict[str, FieldStatis
             known[name].add(np.ascontiguousarray(values.T))
             samples[name].append(values[here])
     return {name: _of(leaf, known[name], np.concatenate(samples[name])) for name, _, leaf, _ in leaves}
+
+
+def _without_images(steps: Steps, leaves: Sequence[_Named]) -> Steps:
+    """The steps with only those parts of states and actions that have leaves, so that images beside them are not read;
+    with all, where an image is in a Tuple, of which no part can be read alone."""
+    with contextlib.suppress(SpaceError):
+        return steps.only(
+            [one.leaf.path for one in leaves if one.field in ("states", "next_states", "actions")]
+        )
+    return steps
 
 
 def _of(leaf: Leaf, known: ElementStatistics, sample: Array) -> FieldStatistics:
