@@ -579,6 +579,27 @@ class TestFilter:
         assert sorted(kept.returns) == sorted(best.returns)
         assert [e.end_time for e in kept] == sorted(e.end_time for e in best)
 
+    def test_episodes_that_are_named(self, tmp_path: Path) -> None:
+        path, target = record(tmp_path / "run.mcap", steps=200), tmp_path / "some.mcap"
+        dataset = open_dataset(path)
+        command = ["filter", str(path), "-o", str(target), "--force"]
+        for more, chosen, query in (
+            (["--episodes", "1,3-4"], dataset[[1, 3, 4]], "episodes 1,3-4"),
+            (["-e", "best"], dataset.sort("return", descending=True).head(1), "episodes best"),
+            (
+                ["-e", "2-9", "--filter", "n_tuples > 2"],
+                dataset[2:10].filter("n_tuples > 2"),
+                "n_tuples > 2, e",
+            ),
+        ):
+            result = CliRunner().invoke(app, [*command, *more])
+            assert result.exit_code == 0, result.output
+            with Recording(target) as kept:
+                assert [e.id for e in kept.episodes] == [e.id for e in chosen]
+                assert str(kept.made_of["query"]).startswith(query)
+        refused = CliRunner().invoke(app, command)
+        assert (refused.exit_code, "expected --filter or --episodes" in refused.stderr) == (2, True)
+
     def test_damage_is_not_handed_on(self, tmp_path: Path) -> None:
         path = record(tmp_path / "run.mcap", steps=400)
         data = bytearray(path.read_bytes())

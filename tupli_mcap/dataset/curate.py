@@ -143,8 +143,9 @@ def recover_recording(
 def filter_dataset(
     dataset: Episodes,
     target: str | os.PathLike[str],
-    filter: BaseFilter | str,
+    filter: BaseFilter | str | None,
     *,
+    chosen: tuple[str, Collection[str]] | None = None,
     sort: str = "",
     limit: int | None = None,
     overwrite: bool = False,
@@ -153,6 +154,7 @@ def filter_dataset(
     """Writes the episodes of a dataset that a filter is true of to `target`, as `Dataset.save` does.
 
     Args:
+        chosen: a text such as "3,7-9", and the ids of the episodes that it names; the others are left out.
         sort, limit: only the first `limit` of them in the order of a key; of "-return", the highest returns come first.
 
     Raises:
@@ -162,7 +164,12 @@ def filter_dataset(
     """
     target = file_path(target)
     count = len(dataset)
-    kept = dataset.filter(filter)
+    kept = dataset if filter is None else dataset.filter(filter)
+    query = [] if filter is None else [str(filter)]
+    if chosen is not None:
+        text, ids = chosen
+        kept = kept[[header.id in ids for header in kept.headers]]
+        query.append(f"episodes {text}")
     if not len(kept):
         raise RecordingError(f"expected an episode that matches {filter}, found none among {count:,}")
     if sort:
@@ -173,7 +180,7 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    return report._replace(size=save(kept, target, str(filter), overwrite=overwrite).stat().st_size)
+    return report._replace(size=save(kept, target, ", ".join(query), overwrite=overwrite).stat().st_size)
 
 
 def trim(

@@ -94,13 +94,9 @@ def split(
 
 def filter_(
     sources: Sources,
-    filter_text: Annotated[
-        str,
-        typer.Option(
-            "--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."
-        ),
-    ],
     output: Output,
+    episodes: Episodes = None,
+    filter_text: FilterText = None,
     sort: Annotated[
         str,
         typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first."),
@@ -110,15 +106,29 @@ def filter_(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write the episodes that match a filter into a new file.
+    """Write the episodes that match a filter, or that you name, into a new file.
 
     Episodes of one recording keep their ids; those of several get new ones. They lie in the
     order of their times. A signature is dropped.
     """
+    if episodes is None and filter_text is None:
+        raise typer.BadParameter(
+            "expected --filter or --episodes, found neither; to copy all episodes, merge them"
+        )
+    from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.dataset.curate import filter_dataset
 
+    wanted = filter_of(filter_text)
+    chosen = None if episodes is None else (episodes, chosen_ids(sources, episodes, wanted))
     report = filter_dataset(
-        dataset_of(sources), output, filter_text, sort=sort, limit=limit, overwrite=force, dry_run=dry_run
+        dataset_of(sources),
+        output,
+        filter_text,
+        chosen=chosen,
+        sort=sort,
+        limit=limit,
+        overwrite=force,
+        dry_run=dry_run,
     )
     _print_made(report, dry_run=dry_run, as_json=as_json)
 
