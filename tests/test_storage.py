@@ -40,7 +40,7 @@ from tupli_mcap.errors import (
     TupliError,
     UntrustedError,
 )
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, merge_recordings, verify_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BenchmarkMetadata,
@@ -1008,6 +1008,57 @@ class TestFileStorage(StorageContract):
             storage.export(tmp_path / "f.mcap", F("metadata.score") > 100)
         with pytest.raises(StorageError, match="exists and is not overwritten"):
             storage.export(tmp_path / "e.mcap", of_first)
+
+    def test_several_recordings_in_one_file_keep_their_runs_annotations_and_times(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        benchmark = ""
+        for name in ("first", "second"):
+            about = {"name": name, "metadata": {"lr": len(name)}, "tags": [name]}
+            env = TupliEnvWrapper(
+                gym.make("CartPole-v1"),
+                storage=storage,
+                benchmark_id=benchmark or None,
+                record_info=True,
+                **about,
+            )
+            benchmark = benchmark or env.store(name="pole")
+            with env:
+                env.reset(seed=len(name))
+                for _ in range(3):
+                    env.step(0)
+        stored = storage.list_episodes()
+        tupli_mcap.open(storage.root / stored[1].recording).annotate(good=True)
+        storage.bundle(benchmark, tmp_path / "bundle.mcap")
+        storage.export(tmp_path / "export.mcap")
+        merge_recordings([storage.root / one.recording for one in stored], tmp_path / "merge.mcap")
+        with Recording(tmp_path / "merge.mcap") as merged:
+            for name in ("bundle", "export"):
+                with Recording(tmp_path / f"{name}.mcap") as recording:
+                    assert (recording.runs, recording.run_places) == (merged.runs, merged.run_places)
+                    assert recording.all_metadata() == merged.all_metadata()
+                    for field in ("start_time", "end_time", "seed"):
+                        assert (recording.index[field] == merged.index[field]).all()
+                    assert (recording.read(["times"]).times == merged.read(["times"]).times).all()
+                    assert verify_recording(recording.path).ok
+            assert [(run.name, run.metadata, run.tags) for run in merged.runs] == [
+                ("first", {"lr": 5}, ("first",)), ("second", {"lr": 6}, ("second",)),
+            ]  # fmt: skip
+            assert [one.metadata.get("good") for one in merged.episodes] == [None, True]
+
+    def test_recordings_that_differ_do_not_fit_into_one_file(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        for state in ([0.5, 1.0], [0.5, 1.0, 2.0]):
+            item = RLTuple(state=state, action=0, reward=1.0, terminal=True)
+            storage.record_episode(Episode(benchmark_id=benchmark, metadata={}, tuples=[item]))
+        for write in (storage.export, lambda target: storage.bundle(benchmark, target)):
+            with pytest.raises(
+                StorageError, match="differ, so that one file cannot hold them all .*filter on"
+            ):
+                write(tmp_path / "all.mcap")
+        assert not list(tmp_path.glob("*.mcap*"))
 
     def test_a_recording_from_a_storage_lacks_its_artifacts(
         self, storage: FileStorage, tmp_path: Path

@@ -96,7 +96,8 @@ def export(
     """Write episodes of a storage to one file.
 
     They must be of one benchmark. If the storage has several, choose one with
-    --filter 'benchmark_id = "..."'. Artifacts are left out; use bundle to include them.
+    --filter 'benchmark_id = "..."'. Several recordings are merged, as merge does. Artifacts
+    are left out; use bundle to include them.
     """
     with open_storage(storage_path) as storage:
         storage.export(output, filter_of(filter_text))

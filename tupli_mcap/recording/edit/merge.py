@@ -141,18 +141,20 @@ def merge_excerpts(
     container: Container,
     without: Collection[str] = (),
     made: Mapping[str, Any] = MappingProxyType({"how": "merge"}),
+    attachments: Mapping[str, tuple[str, bytes]] = MappingProxyType({}),
 ) -> Assembler:
     """Writes a recording of at least one excerpt, as `merge_recordings` does.
 
     Args:
         without: fields to leave out: "states", "actions", "infos", "frames".
         made: what `made_of.json` says about how it was made, besides the sources, trims and fields that are left out.
+        attachments: name -> (media type, bytes), added to those of the recordings or replacing them.
 
     Raises:
         SpaceError: they have different spaces or dtypes.
         RecordingError, FormatError: as `merge_recordings`.
     """
-    sources, attachments = check_mergeable(excerpts, without)
+    sources, carried = check_mergeable(excerpts, without)
     now, first = time.time_ns(), sources[0].recording
     turns = _turns(sources)
     lanes = _lanes(sources, turns=len(turns))
@@ -164,7 +166,8 @@ def merge_excerpts(
     trims = _new_trims(sources, turns, numbered)
     facts = {"without": sorted(without)} if without else {"how": "trim", "steps": trims} if trims else {}
     said = say_made_of([source.recording for source in sources], **{**made, **facts})
-    target.begin(new_metadata(first, next_episode), {**attachments, **carry_runs(numbered), **said}, now)
+    carried = {**carried, **carry_runs(numbered), **said, **attachments}
+    target.begin(new_metadata(first, next_episode), carried, now)
     if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
     envs = _num_envs(sources, lanes)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import FormatError, StepError, StorageError
-from tupli_mcap.messages.frames import EncodedFrame
-from tupli_mcap.recording import Episode, EpisodeData, Recording, rewrite_recording, write_recording
+from tupli_mcap.errors import FormatError, NotFoundError, SpaceError, StorageError
+from tupli_mcap.mcap.container import Container
+from tupli_mcap.recording import Recording, rewrite_recording, write_recording
+from tupli_mcap.recording.edit.assemble import replacing
+from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError, merge_excerpts
 from tupli_mcap.recording.sign.sign import sign_recording
-from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.recording.write.options import CAMERA
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, BenchmarkMetadata, EpisodeHeader, FilterEQ, bound
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import LOCAL_USER, TupliStorage, anew, each_opened
+from tupli_mcap.storage.base import LOCAL_USER, TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import (
     ARTIFACT_PREFIX,
     artifacts_of,
@@ -175,77 +178,42 @@ def _write_episodes(
     target: Path,
     attachments: Attachments | None,
 ) -> None:
-    names = sorted({header.recording for header in headers})
-    if len(names) == 1:
-        with storage.open_recording(names[0]) as recording:
-            numbers = [header.episode for header in headers]
-            rewrite_recording(
-                recording, target, episodes=numbers, attachments=attachments, benchmark_id=benchmark_id
-            )
-        return
-    reward_space = None
-    drawn = False
-    for name in names:
-        with storage.open_recording(name) as recording:
-            drawn = drawn or CAMERA in recording.cameras
-    if names:
-        with storage.open_recording(names[0]) as recording:
-            spaces = [recording.observation_space, recording.action_space]
-            reward_space = recording.layout.reward_space
-            attachments = attachments or _carried(recording)
-    else:
+    by_name = by_recording(headers)
+    if not by_name:
         spaces = declared_spaces(storage.load_benchmark(benchmark_id).serialized)
         if not spaces:
             raise StorageError(f"benchmark {benchmark_id} has no episodes, and its spaces are not known")
-    try:
         write_recording(
-            target,
-            _episodes(storage, headers),
-            observation_space=spaces[0],
-            action_space=spaces[1],
-            reward_space=reward_space,
-            benchmark_id=benchmark_id,
+            target, (), observation_space=spaces[0], action_space=spaces[1], benchmark_id=benchmark_id,
             attachments=attachments,
-            frames=drawn,
-        )
-    except StepError as err:
-        raise StorageError(
-            f"the recordings of benchmark {benchmark_id} differ, so that one file cannot hold them all ({err}); "
-            "use a filter on `recording`"
-        ) from err
+        )  # fmt: skip
+        return
+    with ExitStack() as opened:
+        excerpts = [
+            _excerpt(opened.enter_context(storage.open_recording(name)), same)
+            for name, same in by_name.items()
+        ]
+        if len(excerpts) == 1:
+            ((recording, rows, *_),) = excerpts
+            rewrite_recording(
+                recording, target, episodes=rows["episode"].tolist(), attachments=attachments,
+                benchmark_id=benchmark_id,
+            )  # fmt: skip
+            return
+        try:
+            with replacing(target) as (fd, _):
+                merge_excerpts(excerpts, Container(fd, str(target), "zstd"), attachments=attachments or {})
+        except (SpaceError, UnmergeableError) as err:
+            raise StorageError(
+                f"the recordings of benchmark {benchmark_id} differ, so that one file cannot hold them all ({err}); "
+                "use a filter on `recording`"
+            ) from err
 
 
-def _carried(recording: Recording) -> Attachments:
-    """The attachments of a recording without its signature, which covers its own episodes only."""
-    return {
-        name: (info.media_type, recording.read_attachment(name))
-        for name, info in recording.attachments.items()
-        if name != SIGNATURE_NAME
-    }
-
-
-def _episodes(storage: TupliStorage, headers: Sequence[EpisodeHeader]) -> Iterator[EpisodeData]:
-    """The episodes of several recordings as values, one recording open at a time."""
-    for _, episode in each_opened(headers, storage.open_recording):
-        steps = list(episode)
-        yield EpisodeData(
-            states=[step.state for step in steps],
-            actions=[step.action for step in steps],
-            rewards=[step.reward for step in steps],
-            terminals=[step.terminal for step in steps],
-            timeouts=[step.timeout for step in steps],
-            final_state=episode.final_state,
-            seed=episode.seed,
-            options=episode.options,
-            metadata=episode.metadata,
-            infos=None if episode.infos is None else [info or {} for info in episode.infos],
-            end=episode.end,
-            frames=_frames(episode),
-        )
-
-
-def _frames(episode: Episode) -> list[tuple[int, EncodedFrame]]:
-    if CAMERA not in episode.recording.cameras:
-        return []
-    frames = episode.recording.frames(episode.position, CAMERA)
-    return [(step, frames.encoded(i)) for i, step in enumerate(frames.steps.tolist())]
+def _excerpt(recording: Recording, headers: Sequence[EpisodeHeader]) -> Excerpt:
+    """The episodes of these headers. NotFoundError if one was deleted meanwhile."""
+    numbers = [header.episode for header in headers]
+    rows = recording.index[np.isin(recording.index["episode"], numbers)]
+    if len(rows) < len(numbers):
+        raise NotFoundError(f"an episode of {recording.name} was deleted meanwhile")
+    return Excerpt(recording, rows)
