@@ -16,7 +16,9 @@ from jsonschema import Draft202012Validator
 
 import tupli_mcap
 from tupli_mcap import F, FilterError, FormatError, RecordEpisodes, Recording, SpaceError
+from tupli_mcap.dataset.columns.labels import StepLabels
 from tupli_mcap.environment import documented_labels
+from tupli_mcap.schema import evaluate_columns, parse_filter
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -337,3 +339,40 @@ def test_filters_of_steps_understand_them(tmp_path: Path) -> None:
             steps(wrong)
     with Recording(tmp_path / "r.mcap") as recording:
         assert recording.filter_steps("action = 'left'").n_steps == 3
+
+
+def test_filters_of_steps_understand_labels_of_single_numbers_and_repeated_ones(tmp_path: Path) -> None:
+    parts = {
+        "height": spaces.Box(-9, 9, ()),
+        "speed": spaces.Box(-9, 9, (1,)),
+        "q": spaces.Box(-9, 9, (2, 2)),
+    }
+    given = {
+        "height": ["metres"],
+        "speed": ["m/s"],
+        "q": ["x", "y", "x", "z"],
+        "action": ["stay", "go", "stay"],
+    }
+    path = tmp_path / "r.mcap"
+    with tupli_mcap.EpisodeWriter(path, spaces.Dict(parts), spaces.Discrete(3), labels=given) as writer:
+        writer.begin()
+        for i in range(6):
+            state = {name: np.full(space.shape, i, np.float32) for name, space in parts.items()}
+            writer.step(state, i % 3, 1.0, i == 5)
+    both = Labels({"action": ("gear",)}, {"action": ("stay", "go", "stay")})
+    with Recording(path) as recording:
+        layout, columns = recording.layout, recording.read()
+
+        def steps(test: str) -> list[int]:
+            chosen = recording.filter_steps(test).read(["states"]).states["height"]
+            return chosen.astype(int).tolist()
+
+        assert steps("state.height.metres > 3") == steps('state.speed."m/s" > 3') == [4, 5]
+        assert steps('action = "stay"') == [0, 2, 3, 5]
+        assert steps('action != "stay"') == steps('action in ["go"]') == [1, 4]
+        assert steps('state.q.y > 3 and action = "stay"') == [5]
+        several = r"which is that of 2; name one by its index: state\.q\[0,0\], state\.q\[1,0\]"
+        with pytest.raises(FilterError, match=several):
+            steps("state.q.x > 3")
+    named = StepLabels(layout, both).applied(parse_filter('action.gear = "go"'))
+    assert evaluate_columns(named, {"action": columns.actions}).tolist() == [False, True, False] * 2

@@ -18,39 +18,48 @@ _EQUAL = (FilterType.EQ, FilterType.NE, FilterType.IN)
 
 class StepLabels:
     """The labels of a recording, by the paths that filters name: `state.Pole Angle` is `state[2]`, and the value "left"
-    of `action` is 0."""
+    of `action` is 0. A label of several values means any of them; one of several elements means none."""
 
     def __init__(self, layout: StepLayout, labels: Labels) -> None:
-        self._elements: dict[tuple[str, ...], tuple[str, ...]] = {}
-        self._values: dict[tuple[str, ...], dict[str, int]] = {}
+        self._elements: dict[tuple[str, ...], list[tuple[int, ...]]] = {}
+        self._values: dict[tuple[str, ...], dict[str, list[int]]] = {}
         for leaf in (*layout.state, *layout.action, *layout.reward):
             path = (leaf.root, *map(str, leaf.keys))
             for i, name in enumerate(labels.dimensions.get(leaf.path, ())):
                 if not name.isdigit():  # it would be an index
-                    self._elements[*path, name] = tuple(map(str, np.unravel_index(i, leaf.shape)))
-            if names := labels.values.get(leaf.path):
+                    index = tuple(map(int, np.unravel_index(i, leaf.shape)))  # empty for a single number
+                    self._elements.setdefault((*path, name), []).append(index)
+            for i, name in enumerate(labels.values.get(leaf.path, ())):
                 space: Any = leaf.space
-                self._values[path] = {name: int(space.start) + i for i, name in enumerate(names)}
+                self._values.setdefault(path, {}).setdefault(name, []).append(int(space.start) + i)
 
     def applied(self, filter: BaseFilter) -> BaseFilter:
-        """The filter without labels. FilterError if it compares a value that has labels with another text."""
+        """The filter without labels. FilterError if it compares a value that has labels with another text, or several
+        elements have the label that it names."""
         if filter.type in COMBINING:
             return filter.model_copy(update={"filters": tuple(map(self.applied, filter.filters))})
         first, *inside = path_of(filter)
         path = (step_name(FIELD_OF.get(first, first)).removeprefix("next_"), *inside)
-        if index := self._elements.get(path):
-            return filter.model_copy(update={"key": join_key([first, *inside[:-1], *index])})
+        if path in self._elements:
+            outer = (first, *inside[:-1])
+            keys = [join_key((*outer, index) if index else outer) for index in self._elements[path]]
+            if len(keys) > 1:
+                raise FilterError(
+                    f"expected the label of one element, found {filter.key!r}, which is that of {len(keys)}; "
+                    f"name one by its index: {', '.join(keys[:8])}"
+                )
+            return self.applied(filter.model_copy(update={"key": keys[0]}))
         values = filter.value if filter.type is FilterType.IN else [filter.value]
         if path not in self._values or not any(isinstance(value, str) for value in values):
             return filter
-        numbers = [self._number(filter, value, self._values[path]) for value in values]
+        numbers = [one for value in values for one in self._numbers(filter, value, self._values[path])]
         found = FilterIN(key=filter.key, value=numbers)
         return ~found if filter.type is FilterType.NE else found
 
     @staticmethod
-    def _number(filter: BaseFilter, value: Any, names: dict[str, int]) -> Any:
+    def _numbers(filter: BaseFilter, value: Any, names: dict[str, list[int]]) -> list[Any]:
         if filter.type in _EQUAL and (not isinstance(value, str) or value in names):
-            return names.get(value, value)
+            return names[value] if isinstance(value, str) else [value]
         raise FilterError(
             f"{filter.key!r} is one of {', '.join(names)}: expected a comparison with =, != or in, and one of them, "
             f"found {filter!s:.80}{did_you_mean(value, names)}"
