@@ -18,6 +18,8 @@ import gymnasium as gym
 import jsonschema
 import numpy as np
 import pytest
+from counting import calls, grows
+from gymnasium import spaces
 from mcap.reader import make_reader
 from test_verify import unprivileged
 from typer.testing import CliRunner
@@ -49,6 +51,7 @@ from tupli_mcap.recording import (
     verify_recording,
 )
 from tupli_mcap.recording.edit.attach import add_attachments
+from tupli_mcap.recording.edit.rewrite import carry_runs
 from tupli_mcap.schema.times import local_text, time_ns
 from tupli_mcap.storage.listing import listed_of
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
@@ -288,6 +291,15 @@ class TestRun:
         assert [episode.metadata for episode in some.episodes] == [{}, {"success": True}, {}]
         assert len(tupli_mcap.open(tmp_path / "some.mcap").filter("run.name = 'worker-2'")) == 1
         assert verify_recording(tmp_path / "some.mcap").ok
+
+    def test_of_many_runs_are_carried_in_time_that_grows_with_them(self, tmp_path: Path) -> None:
+        recording = of_many_runs(tmp_path / "r.mcap", [{"name": f"run-{i}"} for i in range(200)])
+
+        def carried(runs: int) -> int:
+            return calls(lambda: carry_runs([(recording, recording.index[:runs], 0)]))
+
+        assert len(recording.recorded_runs.runs) == 200
+        assert grows(carried, 50) < 1.3
 
     def test_of_the_episodes_that_ls_chooses(self, tmp_path: Path) -> None:
         paths = [
@@ -1107,6 +1119,17 @@ class TestCommands:
         for wrong, message in (("metadata.none", "no episode has metadata.none"), ("retrun", "'return'")):
             result = CliRunner().invoke(app, ["episodes", str(path), "--columns", wrong])
             assert result.exit_code and message in f"{result.output}{result.exception}"
+
+
+def of_many_runs(path: Path, runs: list[dict[str, Any]]) -> Recording:
+    """A recording with an episode of each run."""
+    with EpisodeWriter(path, spaces.Discrete(2), spaces.Discrete(2)) as writer:
+        for _ in runs:
+            writer.begin()
+            writer.step(0, 0, 1.0, True)
+    document = {"runs": runs, "spans": [[1, place] for place in range(len(runs))]}
+    add_attachments(path, {"run.json": ("application/json", json.dumps(document).encode())})
+    return Recording(path)
 
 
 class TestOfStrangers:

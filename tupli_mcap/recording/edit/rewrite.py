@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, warn
 from tupli_mcap.mcap.container import Container
@@ -182,36 +183,44 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
             recording.
     """
     runs: list[Run] = []
-    known: list[Run] = []  # as the files have them: names and times of files differ within a run
+    known: dict[str, int] = {}  # by what the files say: names and times of files differ within a run
     places: list[int] = []
     annotations = []
     several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
     for recording, rows, shift in parts:
         said_runs = recording.runs if several else recording.recorded_runs.runs
         at = np.searchsorted(recording.index["episode"], rows["episode"]).tolist()
-        for place in (recording.run_places[i] for i in at):
+        of_episodes = [recording.run_places[i] for i in at]
+        carried: dict[int, int] = {}
+        for place in dict.fromkeys(of_episodes):
             recorded = recording.recorded_runs.runs[place]
-            same = recorded if recorded.id else said_runs[place]
-            if same not in known:
-                known.append(same)
+            said = _as_text(recorded if recorded.id else said_runs[place])
+            carried[place] = known.setdefault(said, len(runs))
+            if carried[place] == len(runs):
                 runs.append(said_runs[place])
-            places.append(known.index(same))
+        places += [carried[place] for place in of_episodes]
         kept = set(rows["episode"].tolist())
-        for said in recording.annotations.said:
-            numbers = [number + shift for number in said.episodes if number in kept]
+        for annotation in recording.annotations.said:
+            numbers = [number + shift for number in annotation.episodes if number in kept]
             if numbers:
-                annotations.append(said._replace(episodes=numbers))
+                annotations.append(annotation._replace(episodes=numbers))
     spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
     found = {}
     if runs and runs != [Run()]:
         first = parts[0][0].recorded_runs
-        there = {place: runs.index(run) for place, run in enumerate(first.runs) if run in runs}
-        edits = [(there[place], was) for place, was in first.before if not several and place in there]
-        carried = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
-        found[RUN_NAME] = (RUN_MEDIA_TYPE, carried.to_json())
+        before = () if several else first.before
+        edited = [(known.get(_as_text(first.runs[place])), was) for place, was in before]
+        edits = [(place, was) for place, was in edited if place is not None]
+        written = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
+        found[RUN_NAME] = (RUN_MEDIA_TYPE, written.to_json())
     if annotations:
         found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, Annotations(annotations).to_json())
     return found
+
+
+def _as_text(run: Run) -> str:
+    """What is said of a run as one text, the same whatever the order of its keys."""
+    return json.dumps(json.loads(jsonvalue.dumps_plain(vars(run))), sort_keys=True)
 
 
 def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[str, tuple[str, bytes]]:
