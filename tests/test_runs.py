@@ -42,6 +42,7 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.errors import FilterError, SpaceError
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.recording import (
+    Run,
     annotate_episodes,
     edit_runs,
     merge_recordings,
@@ -50,6 +51,7 @@ from tupli_mcap.recording import (
     undo_edit,
     verify_recording,
 )
+from tupli_mcap.recording.about.run import RecordedRuns
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.rewrite import carry_runs
 from tupli_mcap.schema.times import local_text, time_ns
@@ -300,6 +302,41 @@ class TestRun:
 
         assert len(recording.recorded_runs.runs) == 200
         assert grows(carried, 50) < 1.3
+
+    def test_of_many_runs_are_read_back_and_merged(self, tmp_path: Path) -> None:
+        about = [{"name": f"run-{i}", "metadata": {"notes": f"{i} " * 2000}} for i in range(300)]
+        first = of_many_runs(tmp_path / "a.mcap", about[:200])
+        second = of_many_runs(tmp_path / "b.mcap", about[200:])
+        assert first.attachments["run.json"].size > 1 << 20
+        merge_recordings([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "all.mcap")
+        with Recording(tmp_path / "all.mcap") as merged:
+            assert [(run.name, run.metadata) for run in merged.runs] == [
+                (run["name"], run["metadata"]) for run in about
+            ]
+            assert merged.run_places == list(range(300))
+        assert len(second.runs) == 100
+        assert verify_recording(tmp_path / "all.mcap").ok
+        chosen = tupli_mcap.open(tmp_path / "all.mcap").filter("run.name = 'run-299'")
+        assert [header.episode for header in chosen.headers] == [299]
+
+    def test_of_more_runs_than_a_recording_holds_are_refused(self, tmp_path: Path) -> None:
+        long = Run(metadata={"notes": "n" * (1 << 20)})
+        with pytest.raises(
+            RecordingError, match=r"run\.json of 64 runs: expected at most 67108864 bytes, found"
+        ):
+            RecordedRuns([long] * 64).to_json()
+        with pytest.raises(
+            RecordingError, match="metadata of the run: expected at most 1048576 bytes, found"
+        ):
+            record(tmp_path / "r.mcap", metadata=long.metadata)
+        path = record(tmp_path / "r.mcap")
+        add_attachments(path, {"run.json": ("application/json", b" " * ((64 << 20) + 1))})
+        with Recording(path) as recording:
+            assert len(recording.read().rewards) > 0
+            with pytest.raises(
+                FormatError, match=r"run\.json: expected at most 67108864 bytes, found 67108865"
+            ):
+                _ = recording.runs
 
     def test_of_the_episodes_that_ls_chooses(self, tmp_path: Path) -> None:
         paths = [

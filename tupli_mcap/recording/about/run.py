@@ -19,7 +19,8 @@ from tupli_mcap.schema.times import iso_utc
 
 RUN_NAME: Final = "run.json"
 RUN_MEDIA_TYPE: Final = "application/json"
-MAX_RUN: Final = 1 << 20  # bytes of `run.json`
+MAX_RUN: Final = 1 << 26  # bytes of `run.json`
+_MAX_GIVEN: Final = 1 << 20  # bytes of one run, as a user gives it
 _LISTS: Final = ("tags", "command")
 _TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host")
 OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}")
@@ -84,7 +85,9 @@ class Run(SaysWhatIsMeant):
         except (TypeError, ValueError) as err:
             raise RecordingError(f"metadata of the run: {err}") from err
         run = cls(name=name or "", metadata=plain, tags=tuple(tags), split=split)
-        RecordedRuns([run]).to_json()
+        size = len(RecordedRuns([run]).to_json())
+        if size > _MAX_GIVEN:
+            raise RecordingError(f"metadata of the run: expected at most {_MAX_GIVEN} bytes, found {size}")
         return run
 
     @classmethod
@@ -184,7 +187,10 @@ class RecordedRuns(NamedTuple):
         except (TypeError, ValueError) as err:
             raise RecordingError(f"metadata of the run: {err}") from err
         if len(data) > MAX_RUN:
-            raise RecordingError(f"metadata of the run: expected at most {MAX_RUN} bytes, found {len(data)}")
+            raise RecordingError(
+                f"{RUN_NAME} of {len(self.runs):,} runs: expected at most {MAX_RUN} bytes, found {len(data)}; "
+                "merge fewer recordings, or give runs shorter metadata"
+            )
         return data
 
     @classmethod
