@@ -350,6 +350,24 @@ def test_depths_are_pictures(tmp_path: Path, shape: tuple[int, ...]) -> None:
     made.png()
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_mean_of_depths_leaves_gaps_out(tmp_path: Path) -> None:
+    def depth(n: int) -> Any:
+        values = np.full((16, 20), n, np.float32)
+        values[0] = np.nan  # never known
+        values[1] = n if n < 2 else np.inf
+        values[2] = n if n > 6 else np.nan
+        return values
+
+    path = scripted(tmp_path / "r.mcap", depth, spaces.Box(0, np.inf, (16, 20)), 10, length=10)
+    ((_, trace),) = report(path).traces
+    (pictures,) = trace.pictures.values()
+    title, mean = pictures[-1]
+    assert title == "mean of 10"
+    shade = 255 / 9  # of 0 to 9
+    assert [int(row[0]) for row in mean[:4]] == [0, int(0.5 * shade), int(8 * shade), int(4.5 * shade)]
+
+
 def test_recorded_frames_are_shown_beside_images_of_states(tmp_path: Path) -> None:
     class Filmed(Scripted):
         metadata = {"render_modes": ["rgb_array"]}

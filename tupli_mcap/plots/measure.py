@@ -320,13 +320,13 @@ def _frames(recording: Recording, position: int) -> list[tuple[str, Array]]:
 
 
 def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> list[tuple[str, Array]]:
-    """The pictures of a leaf in an episode at even distances, and the mean of more of them."""
+    """The pictures of a leaf in an episode at even distances, and the mean of more of them, without gaps (NaN, inf)."""
     shown, averaged = (
         np.unique(np.linspace(0, length - 1, count).astype(np.int64)).tolist()
         for count in (_FRAMES, _AVERAGED)
     )
     pictures = []
-    total: Array = np.zeros(())
+    total, counts = np.zeros(()), np.zeros(())  # of each pixel, over the steps where it is a number
     for step in sorted({*shown, *averaged}):
         field = f"{leaf.root}s"
         value = leaf.get(recording.read_steps(position, step, step + 1, (field,))[field])[0]
@@ -337,8 +337,10 @@ def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> l
         if step in shown:
             pictures.append((f"step {step}", frame))
         if step in averaged:
-            total = total + frame
-    pictures.append((f"mean of {len(averaged)}", total / len(averaged)))
+            known = np.isfinite(frame)
+            total, counts = total + np.where(known, frame, 0), counts + known
+    mean = np.divide(total, counts, out=np.full(total.shape, np.nan), where=counts > 0)
+    pictures.append((f"mean of {len(averaged)}", mean))
     titles, frames = zip(*pictures, strict=True)
     return list(zip(titles, _shades(np.stack(frames), leaf), strict=True))
 
