@@ -184,9 +184,13 @@ def _write_episodes(
         if not spaces:
             raise StorageError(f"benchmark {benchmark_id} has no episodes, and its spaces are not known")
         write_recording(
-            target, (), observation_space=spaces[0], action_space=spaces[1], benchmark_id=benchmark_id,
+            target,
+            (),
+            observation_space=spaces[0],
+            action_space=spaces[1],
+            benchmark_id=benchmark_id,
             attachments=attachments,
-        )  # fmt: skip
+        )
         return
     with ExitStack() as opened:
         excerpts = [
@@ -196,9 +200,12 @@ def _write_episodes(
         if len(excerpts) == 1:
             ((recording, rows, *_),) = excerpts
             rewrite_recording(
-                recording, target, episodes=rows["episode"].tolist(), attachments=attachments,
+                recording,
+                target,
+                episodes=rows["episode"].tolist(),
+                attachments=attachments,
                 benchmark_id=benchmark_id,
-            )  # fmt: skip
+            )
             return
         try:
             with replacing(target) as (fd, _):
