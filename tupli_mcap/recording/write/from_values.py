@@ -13,11 +13,9 @@ import gymnasium as gym
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
-from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import ResetFacts
 from tupli_mcap.recording.write.options import Mode, RecordOptions
-from tupli_mcap.recording.write.recorders.frames import put_frame
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import Work
@@ -30,8 +28,7 @@ class EpisodeData:
     """An episode as sequences of one value a step.
 
     `final_state` None: not known, and then the last step has no next state. A flag may be set at the last step only.
-    `end` None: from its flags, "interrupted" if neither is set; another one is refused. `frames` are (step, frame), in
-    order; they get the times of the new recording.
+    `end` None: from its flags, "interrupted" if neither is set; another one is refused.
     """
 
     states: Sequence[Any]
@@ -45,7 +42,6 @@ class EpisodeData:
     metadata: Mapping[str, Any] = field(default_factory=dict)
     infos: Sequence[Mapping[str, Any]] | None = None
     end: str | None = None
-    frames: Sequence[tuple[int, EncodedFrame]] = ()
 
 
 def write_recording(
@@ -59,7 +55,6 @@ def write_recording(
     attachments: Mapping[str, tuple[str, bytes]] | None = None,
     mode: Mode = "x",
     compression: str = "zstd",
-    frames: bool = False,
 ) -> None:
     """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
 
@@ -68,7 +63,6 @@ def write_recording(
         episodes: are written one after the other.
         observation_space, action_space, reward_space: Gymnasium spaces of one step; by default a reward is a number.
         benchmark_id, attachments, mode, compression: as `tupli_mcap.RecordEpisodes` takes them.
-        frames: whether some of them have frames.
 
     Raises:
         StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag
@@ -76,7 +70,7 @@ def write_recording(
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
     options = RecordOptions(
-        compression=compression, mode=mode, benchmark_id=benchmark_id, attachments=attachments, frames=frames
+        compression=compression, mode=mode, benchmark_id=benchmark_id, attachments=attachments
     )
     writer = RecordingWriter(path, options, keep_empty=True)
     recorder = SingleRecorder(writer, spaces, InfoRecorder(True))
@@ -93,7 +87,6 @@ def write_recording(
 
 def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeData) -> None:
     n = len(episode.states)
-    frames = dict(episode.frames)
     columns = (episode.actions, episode.rewards, episode.terminals, episode.timeouts)
     if n == 0 or any(len(column) != n for column in columns):
         found = [n, *(len(column) for column in columns)]
@@ -111,10 +104,6 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
         recorder.put(episode.actions[i], after, episode.rewards[i], episode.terminals[i], episode.timeouts[i])
         if episode.infos is not None and episode.infos[i]:
             recorder.put_info(episode.infos[i])
-        for step in (0, 1) if i == 0 else (i + 1,):
-            if step in frames:
-                frame = frames[step]._replace(time_ns=time.time_ns())
-                put_frame(writer, 0, recorder.running[0], step, frame)
     recorder.metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
     recorder.end(end, has_final_state=episode.final_state is not None)
 

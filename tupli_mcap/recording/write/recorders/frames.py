@@ -55,11 +55,11 @@ class FrameRecorder:
         """
         first, self._first[env] = self._first[env], None
         if first is not None:
-            put_frame(self._writer, env, episode, 0, first)
+            _put_frame(self._writer, env, episode, 0, first)
         if render is None or (not ended and step % self._every):
             return
         frame = self._ask(self._rendered, render)
-        put_frame(self._writer, env, episode, step, frame)
+        _put_frame(self._writer, env, episode, step, frame)
         if ended:  # where no reset follows, the next episode starts here
             self._first[env] = frame
 
@@ -112,7 +112,7 @@ class FrameRecorder:
         return list(found)
 
 
-def put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
+def _put_frame(writer: RecordingWriter, env: int, episode: int, step: int, frame: EncodedFrame) -> None:
     """Records the frame of a step; its time is not before that of the last frame."""
     camera, pairs = writer.channels.cameras[env]
     log = writer.frames[env]
