@@ -26,7 +26,7 @@ from test_benchmark import WindyWrapper, windy
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import FileStorage, RecordEpisodes, TupliEnvWrapper
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord, capture
 from tupli_mcap.errors import FormatError, RecordingError, StorageError, UntrustedError
@@ -212,6 +212,29 @@ def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
         refused = CliRunner().invoke(app, ["push", str(one), str(growing)])
     assert refused.exit_code == 1
     assert f"{growing}: expected a finished recording" in " ".join(refused.stderr.split())
+
+
+def test_a_damaged_copy_does_not_replace_what_is_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record_rollouts("CartPole-v1", path, steps=500, seed=1)
+    good = path.read_bytes()
+    name = admin.push(path)
+    with Recording(path) as recording:
+        chunk, attachment = recording.file.store.table[0], recording.file.contents.attachments
+        places = [int(chunk["offset"] + chunk["length"]) - 9]
+        places += [each.offset + each.length - 9 for each in attachment.values()]
+    for place in places:
+        path.write_bytes(good[:place] + bytes([good[place] ^ 255]) + good[place + 1 :])
+        refused = CliRunner().invoke(app, ["push", str(path)])
+        said = " ".join(refused.stderr.split())
+        assert refused.exit_code == 1, place
+        assert (
+            "expected a good copy of the recording, which is stored here already and stays as it is" in said
+        )
+        assert "; found damage: " in said and "uploads" not in said
+    assert {header.recording for header in admin.list_episodes()} == {name}
+    with admin.open_recording(name) as stored:
+        assert len(stored.read().rewards) == 500
 
 
 def test_a_run_without_a_name_keeps_that_of_its_file(admin: TupliAPIClient, tmp_path: Path) -> None:

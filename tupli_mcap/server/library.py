@@ -211,7 +211,8 @@ class Library:
 
         Raises:
             ChecksumError: its bytes do not have the announced SHA-256.
-            StorageError: it is no recording, or has no episodes.
+            FormatError: it is no finished recording, or it is damaged and would replace what is stored.
+            StorageError: it has no episodes.
         """
         upload = incoming.upload
         try:
@@ -263,6 +264,10 @@ class Library:
             if not recording.complete:
                 raise FormatError("expected a finished recording; close or recover it, then send it again")
             arrivals.demand_short(recording)
+            with self.database.reading() as connection:
+                may_replace = arrivals.has_stored(connection, caller, recording.uuid)
+            if may_replace:
+                arrivals.demand_undamaged(recording)
             with self.database.writing() as connection:
                 if room:
                     limits.demand_room(connection, self.settings, caller, room)

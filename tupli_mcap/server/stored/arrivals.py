@@ -62,6 +62,21 @@ def demand_short(recording: Recording) -> None:
             )
 
 
+def demand_undamaged(recording: Recording) -> None:
+    """Raises FormatError if a chunk or an attachment of a copy is damaged: it must not replace what is stored."""
+    store = recording.file.store
+    try:
+        for chunk in range(len(store.table)):
+            store.load(chunk, keep=False)
+        for name in recording.attachments:
+            recording.read_attachment(name)
+    except FormatError as err:
+        raise FormatError(
+            f"expected a good copy of the recording, which is stored here already and stays as it is; found damage: "
+            f"{str(err).removeprefix(f'{recording.name}: ')}"
+        ) from err
+
+
 def new_place(benchmark_id: str, file: str) -> str:
     """A new place for a recording of a stored benchmark, or of none. What is plain in the name of its file is part of
     it: a run without a name is named after its file."""
@@ -76,6 +91,12 @@ def stored_already(connection: Connection, caller: Caller, digest: str) -> str |
     own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.digest == digest)
     found: str | None = connection.execute(own).scalar()
     return None if found is None else unescape_text(found)
+
+
+def has_stored(connection: Connection, caller: Caller, uuid: str) -> bool:
+    """Whether the caller has stored episodes of a recording."""
+    own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.uuid == uuid)
+    return connection.execute(own).first() is not None
 
 
 def register(
