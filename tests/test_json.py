@@ -156,7 +156,7 @@ login: login admin --url {url}
 whoami: whoami
 signup: signup ann
 push: push lab
-push: push runs/a.mcap
+push: push runs/a.mcap bad.mcap | 1
 pull: pull {pole} --storage pulled
 publish: publish {pole}
 unpublish: unpublish {pole}

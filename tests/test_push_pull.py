@@ -204,14 +204,27 @@ def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
     told = json.loads(run("push", one, two, tmp_path / "lab", "--json"))["result"]
     names = [header.recording for header in admin.list_episodes(F("benchmark_id") == "")]
     assert sorted(told.pop("recordings")) == sorted(names)
-    assert told == {"dry_run": False, "url": admin.url, "benchmarks": [uri], "episodes": 0}
-    growing = tmp_path / "growing.mcap"
-    with RecordEpisodes(gym.make("CartPole-v1"), growing) as env:
-        env.reset(seed=0)
-        env.step(0)
-        refused = CliRunner().invoke(app, ["push", str(one), str(growing)])
+    assert told == {"dry_run": False, "url": admin.url, "benchmarks": [uri], "episodes": 0, "errors": []}
+
+
+def test_of_several_the_others_are_sent(admin: TupliAPIClient, tmp_path: Path) -> None:
+    one, bad, two = paths = [tmp_path / f"{name}.mcap" for name in ("one", "bad", "two")]
+    bad.write_bytes(b"nonsense")
+    for seed in range(2):
+        record_rollouts("CartPole-v1", paths[2 * seed], steps=5, seed=seed)
+    refused = CliRunner().invoke(app, ["push", *map(str, paths)])
     assert refused.exit_code == 1
-    assert f"{growing}: expected a finished recording" in " ".join(refused.stderr.split())
+    assert refused.stdout.startswith(
+        f"sent 1 episode of {one} to {admin.url}\nsent 1 episode of {two} to {admin.url}\nto let others see it: "
+    )
+    why = refused.stderr.removeprefix("error: ").strip()
+    assert why.startswith(f"{bad}: expected an MCAP file")
+    refused = CliRunner().invoke(app, ["push", *map(str, paths), "--json"])
+    told = json.loads(refused.stdout)["result"]
+    assert (refused.exit_code, len(told["recordings"]), told["episodes"]) == (1, 2, 0)
+    assert told["errors"] == [{"path": str(bad), "message": why}]
+    alone = CliRunner().invoke(app, ["push", str(bad), "--json"])
+    assert (alone.exit_code, json.loads(alone.stdout)["error"]["message"]) == (1, why)
 
 
 def test_a_damaged_copy_does_not_replace_what_is_stored(admin: TupliAPIClient, tmp_path: Path) -> None:

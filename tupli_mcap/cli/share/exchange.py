@@ -25,7 +25,7 @@ from tupli_mcap.cli.options import (
     server_at,
 )
 from tupli_mcap.cli.output import counted, print_json, print_result
-from tupli_mcap.cli.terminal import say
+from tupli_mcap.cli.terminal import fail, say
 from tupli_mcap.errors import RecordingError, TupliError, bytes_of
 from tupli_mcap.remote import copied, is_url, path_of, shown
 
@@ -59,8 +59,9 @@ def push(
     """Send storages or recordings to a server.
 
     Sends all benchmarks of a storage, with their artifacts and episodes, except what the
-    server has already. Nobody else sees them until you publish them. Without DIR or FILE, it
-    sends the recordings that could not be sent while they were recorded.
+    server has already. Nobody else sees them until you publish them. If one of several cannot
+    be sent, the others are, and the command exits with 1. Without DIR or FILE, it sends the
+    recordings that could not be sent while they were recorded.
     """
     sources = sources or []
     files = {source for source in sources if is_url(source) or path_of(source).is_file()}
@@ -77,24 +78,25 @@ def push(
         if chosen is not None:
             with ExitStack() as stack:
                 _check_keys([stack.enter_context(open_storage(Path(each))) for each in sources], chosen)
-        done = []
-        for source in sources:
-            with _naming(source if len(sources) > 1 else ""):
-                if source in files:
-                    pushed = _push_file(client, source, dry_run=dry_run)
-                else:
-                    pushed = _push_storage(client, source, benchmark, chosen, dry_run=dry_run)
-            done.append(pushed)
-            if not as_json:
-                say(pushed.line)
-        new = [] if dry_run else [each for each in done if each.episodes]
+        done, failed = list[_Pushed](), list[_Failed]()
+        try:
+            for source in sources:
+                with _naming(source, failed) if len(sources) > 1 else nullcontext():
+                    if source in files:
+                        done.append(_push_file(client, source, dry_run=dry_run))
+                    else:
+                        done.append(_push_storage(client, source, benchmark, chosen, dry_run=dry_run))
+                    if not as_json:
+                        say(done[-1].line)
+        finally:
+            for each in failed:
+                fail(each.message)
         if as_json:
-            benchmarks = list(dict.fromkeys(uri for each in done for uri in each.benchmarks))
-            recordings = [name for each in done for name in each.recordings]
-            episodes = sum(each.episodes for each in done)
-            print_json(_told(client.url, dry_run, benchmarks, recordings, episodes))
-        elif new:
+            print_json(_told(client.url, dry_run, done, failed))
+        elif new := [] if dry_run else [each for each in done if each.episodes]:
             say(_how_to_publish(new, client.url))
+    if failed:
+        raise typer.Exit(1)
 
 
 class _Pushed(NamedTuple):
@@ -105,6 +107,13 @@ class _Pushed(NamedTuple):
     recordings: list[str]
     episodes: int
     publish: str
+
+
+class _Failed(NamedTuple):
+    """A source, as it was given, that was not sent."""
+
+    path: str
+    message: str
 
 
 def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed:
@@ -151,14 +160,18 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
 
 
 @contextmanager
-def _naming(source: str) -> Iterator[None]:
-    """An error in the block names the source, which may be one of many."""
+def _naming(source: str, failed: list[_Failed]) -> Iterator[None]:
+    """Notes an error in the block, which names the source then, so that the others are sent; raises one of the server,
+    with which they would fail too."""
+    from tupli_mcap.storage.api.answers import SignInError, UnreachableError
+
     try:
         yield
     except TupliError as err:
-        if source and shown(source) not in str(err):
-            raise type(err)(f"{shown(source)}: {err}") from err
-        raise
+        message = str(err) if shown(source) in str(err) else f"{shown(source)}: {err}"
+        if isinstance(err, SignInError | UnreachableError):
+            raise type(err)(message) from err
+        failed.append(_Failed(shown(source), message))
 
 
 def _verb(dry_run: bool) -> str:
@@ -172,7 +185,8 @@ def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> No
     size = bytes_of(sum(each.size for each in waiting))
     what = f"{counted(len(waiting), 'recording')}, {size},"
     line = f"{_verb(dry_run)} {what}" if waiting else "nothing waits to be sent"
-    told = _told(client.url, dry_run, [], [str(each.path) for each in waiting], None)
+    told = _told(client.url, dry_run, [])
+    told |= {"recordings": [str(each.path) for each in waiting], "episodes": None}
     others = [
         f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
         for (url, name), n in client.waiting_elsewhere().items()
@@ -193,10 +207,16 @@ def _check_keys(
 
 
 def _told(
-    url: str, dry_run: bool, benchmarks: list[str], recordings: list[str], episodes: int | None
+    url: str, dry_run: bool, done: Sequence[_Pushed], failed: Sequence[_Failed] = ()
 ) -> dict[str, object]:
-    sent = {"benchmarks": benchmarks, "recordings": recordings, "episodes": episodes}
-    return {"dry_run": dry_run, "url": url, **sent}
+    return {
+        "dry_run": dry_run,
+        "url": url,
+        "benchmarks": list(dict.fromkeys(uri for each in done for uri in each.benchmarks)),
+        "recordings": [name for each in done for name in each.recordings],
+        "episodes": sum(each.episodes for each in done),
+        "errors": [each._asdict() for each in failed],
+    }
 
 
 def pull(
