@@ -334,13 +334,16 @@ class TestUpload:
         carts(tmp_path, seeds=1, episodes=2)
         with Recording(tmp_path / "ppo0.mcap") as recording:
             rewrite_recording(recording, tmp_path / "cut.mcap", episodes=[0])
+        (tmp_path / "killed.mcap").write_bytes((tmp_path / "ppo0.mcap").read_bytes()[:-500])
         with opened(chromium, server) as (page, _):
             sign_in(page)
             page.goto("/upload")
             field = page.get_by_label("Drop recordings here", exact=False)
-            field.set_input_files([tmp_path / "ppo0.mcap", tmp_path / "cut.mcap"])
+            field.set_input_files([tmp_path / f"{name}.mcap" for name in ("ppo0", "cut", "killed")])
             refused = page.locator(".uploads .failed")
-            expect(refused).to_contain_text("which this file lacks", timeout=PATIENCE)
+            expect(refused.nth(0)).to_contain_text("which this file lacks", timeout=PATIENCE)
+            expect(refused.nth(1)).to_contain_text("expected a finished recording", timeout=PATIENCE)
+            expect(refused.nth(1)).to_contain_text("tupli-mcap recover FILE")
 
     def test_an_expired_token_is_renewed(self, chromium: Browser, server: str, tmp_path: Path) -> None:
         carts(tmp_path, seeds=1, episodes=1)

@@ -7,6 +7,7 @@ import itertools
 import json
 import os
 import shlex
+import shutil
 import sys
 import threading
 from collections.abc import Iterator
@@ -225,6 +226,38 @@ def test_of_several_the_others_are_sent(admin: TupliAPIClient, tmp_path: Path) -
     assert told["errors"] == [{"path": str(bad), "message": why}]
     alone = CliRunner().invoke(app, ["push", str(bad), "--json"])
     assert (alone.exit_code, json.loads(alone.stdout)["error"]["message"]) == (1, why)
+
+
+def test_what_is_not_finished_is_not_sent(proxy: Between, admin: TupliAPIClient, tmp_path: Path) -> None:
+    (path := tmp_path / "lab" / "my run.mcap").parent.mkdir()
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=0)
+        env.step(0)
+        refused = CliRunner().invoke(app, ["push", str(path)])
+        assert refused.exit_code == 1
+        assert refused.stderr == f"error: {path} is being recorded; send it when its writer has closed it\n"
+        shutil.copytree(path.parent, tmp_path / "killed")
+    killed, cut = tmp_path / "killed" / path.name, tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[:-500])
+    for each in (killed, cut):
+        refused = CliRunner().invoke(app, ["push", str(each)])
+        assert (refused.exit_code, refused.stderr.count("\n")) == (1, 1)
+        assert refused.stderr.startswith(
+            f"error: {each} is not finished: its writer was killed, or its end is"
+        )
+        before = proxy.up
+        with pytest.raises(
+            RecordingError, match=f"tupli-mcap recover {shlex.quote(str(each))}, and send that"
+        ):
+            admin.push(each)
+        assert proxy.up == before
+    with web_server.serving() as web:
+        web.files["/r.mcap"] = cut.read_bytes()
+        refused = CliRunner().invoke(app, ["push", web.url()])
+        assert refused.stderr.startswith(f"error: {web.url()} is not finished: ")
+        assert "; download it, write a finished copy with tupli-mcap recover FILE" in refused.stderr
+    assert run("recover", killed).startswith(f"{killed}: ")
+    assert run("push", f"{killed}".replace(".mcap", ".recovered.mcap")).startswith("sent 1 episode of ")
 
 
 def test_a_damaged_copy_does_not_replace_what_is_stored(admin: TupliAPIClient, tmp_path: Path) -> None:

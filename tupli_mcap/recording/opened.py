@@ -24,7 +24,7 @@ from tupli_mcap.mcap.records import (
     read_metadata,
     read_summary,
 )
-from tupli_mcap.mcap.source import Source, TemporarySource, open_source
+from tupli_mcap.mcap.source import PathSource, Source, TemporarySource, open_source
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
@@ -355,6 +355,18 @@ def _absolute(source: str | os.PathLike[str]) -> str:
 
 
 # ---- the contents: from the summary, or by recovery in memory
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a file ends as a finished recording does. FormatError if it does not begin as an MCAP file does."""
+    source = PathSource(path)
+    try:
+        if has_summary(source):
+            return True
+        check_magic(source)
+        return False
+    finally:
+        source.close()
 
 
 def read_contents(source: Source) -> Contents:

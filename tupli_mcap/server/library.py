@@ -260,9 +260,9 @@ class Library:
 
         room: the bytes for which the caller's quota needs room; that of an upload is counted already.
         """
+        with _unnamed(path):
+            arrivals.demand_finished(path)
         with _unnamed(path), Recording(path) as recording:
-            if not recording.complete:
-                raise FormatError("expected a finished recording; close or recover it, then send it again")
             arrivals.demand_short(recording)
             with self.database.reading() as connection:
                 may_replace = arrivals.has_stored(connection, caller, recording.uuid)

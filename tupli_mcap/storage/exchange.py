@@ -235,17 +235,16 @@ class Pushed(NamedTuple):
     was_there: bool
 
 
-def push_recording(
-    client: TupliAPIClient, path: Path, *, name: str | None = None, dry_run: bool = False
-) -> Pushed:
+def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_run: bool = False) -> Pushed:
     """Sends a recording to a server, without its deleted episodes, after the benchmark and artifacts that it carries.
     `name`: its path or URL, where `path` is a copy.
 
     Raises:
+        RecordingError: the recording is not finished; nothing was sent.
         FormatError: the file is damaged.
         StorageError: the server refuses it: its benchmark is neither stored there nor in the file.
     """
-    with without_deleted(path) as kept, Recording(kept) as recording:
+    with without_deleted(path, name) as kept, Recording(kept) as recording:
         carries = bool(recording.benchmark_id) and DOCUMENT_NAME in recording.attachments
         if carries and not client.list_benchmarks(FilterEQ(key="id", value=recording.benchmark_id)):
             record, _, query = carried_benchmark(recording, path)
@@ -257,7 +256,7 @@ def push_recording(
         if dry_run:
             return Pushed("", recording.benchmark_id, len(recording), False)
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
-            sent = client.send(kept, bar.advance, path.name if name is None else file_name(name))
+            sent = client.send(kept, bar.advance, file_name(name) if name else path.name)
         stored = _stored(client, sent.name)
         say_what_was_deleted(len(recording) - stored, None)
         return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)

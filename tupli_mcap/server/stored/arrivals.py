@@ -9,6 +9,7 @@ import json
 import re
 import secrets
 from collections.abc import Collection, Sequence
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from sqlalchemy import Connection, insert, select
@@ -17,6 +18,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.run import OF_STORAGE
+from tupli_mcap.recording.opened import is_finished
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audience, audit, settle
 from tupli_mcap.server.people.access import Caller, readable
@@ -45,6 +47,16 @@ def demand_benchmark(connection: Connection, caller: Caller, benchmark_id: str) 
     there = select(ITEM.c.number).where(ITEM.c.kind == "benchmark", ITEM.c.id == benchmark_id, seen)
     if not is_hash(benchmark_id) or not connection.execute(there).first():
         raise no_such("benchmark", benchmark_id)
+
+
+def demand_finished(path: Path) -> None:
+    """Raises FormatError for a file without the end of a finished recording."""
+    if not is_finished(path):
+        raise FormatError(
+            "expected a finished recording, found one without its end: it is still being recorded, its program was "
+            "stopped, or a part of the file is missing; write a finished copy with tupli-mcap recover FILE, and send "
+            "that"
+        )
 
 
 def demand_short(recording: Recording) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -11,11 +12,13 @@ from pathlib import Path
 
 from pydantic import BaseModel, Field
 
-from tupli_mcap.errors import NotFoundError
+from tupli_mcap.errors import NotFoundError, RecordingError
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import TemporarySource
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
-from tupli_mcap.remote import is_cut_cheaper
+from tupli_mcap.recording.opened import is_finished
+from tupli_mcap.remote import is_cut_cheaper, is_url, shown
 from tupli_mcap.storage.api.answers import as_told
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Sent, Tell, send_file
@@ -92,7 +95,8 @@ class Recordings:
         Storing it twice changes nothing; a recording that has grown replaces its earlier version.
 
         Raises:
-            StorageError: the server refuses it: it is unfinished or empty, or its benchmark is not stored.
+            RecordingError: it is not finished; nothing was sent.
+            StorageError: the server refuses it: it is empty, or its benchmark is not stored.
         """
         return self.send(path, tell, Path(path).name).name
 
@@ -103,20 +107,34 @@ class Recordings:
 
 
 @contextlib.contextmanager
-def without_deleted(path: Path) -> Iterator[Path]:
-    """A file with the episodes of a recording that were not deleted: its own file, if none was."""
+def without_deleted(path: Path, name: str = "") -> Iterator[Path]:
+    """A file with the episodes of a finished recording that were not deleted: its own file, if none was. `name`: its
+    path or URL, where `path` is a copy. RecordingError if it is not finished."""
+    _demand_finished(path, name or str(path))
     notes = Notes.read(path)
     if notes.deleted:
         with Recording(path) as recording:
             deleted = notes.about(recording.metadata).deleted
             numbers = [number for number in recording.index["episode"].tolist() if number not in deleted]
-            if recording.complete and len(numbers) < len(recording):
+            if len(numbers) < len(recording):
                 with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
                     kept = Path(folder) / path.name
                     rewrite_recording(recording, kept, episodes=numbers)
                     yield kept
                 return
     yield path
+
+
+def _demand_finished(path: Path, name: str) -> None:
+    if is_finished(path):
+        return
+    if is_locked(path):
+        raise RecordingError(f"{shown(name)} is being recorded; send it when its writer has closed it")
+    fetch, file = ("download it, ", "FILE") if is_url(name) else ("", shlex.quote(str(path)))
+    raise RecordingError(
+        f"{shown(name)} is not finished: its writer was killed, or its end is missing; {fetch}write a finished copy "
+        f"with tupli-mcap recover {file}, and send that"
+    )
 
 
 class _Ticket(BaseModel):
