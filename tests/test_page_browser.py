@@ -285,7 +285,7 @@ class TestTable:
         with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1")
             page.get_by_label("Select all episodes of this page").check()
-            expect(page.locator("[data-count]")).to_have_text("12 selected")
+            expect(page.locator("[data-count]")).to_have_text("12 selected; at most 8 can be compared")
             expect(page.get_by_role("button", name="Compare")).to_be_disabled()
             page.get_by_role("button", name="Copy Python", exact=True).click()
             expect(page.get_by_role("button", name="Copied")).to_be_visible()

@@ -8,13 +8,14 @@ export function table(form) {
   const count = form.querySelector("[data-count]");
   const told = count.textContent;
   const python = form.querySelector("[data-python]");
+  const most = Number(form.querySelector("[data-most]").dataset.most);
   const chosen = () => boxes.filter((box) => box.checked).map((box) => box.value);
   const show = () => {
     const number = chosen().length;
     for (const button of form.querySelectorAll("[data-least]")) {
       button.disabled = number < Number(button.dataset.least) || number > Number(button.dataset.most ?? Infinity);
     }
-    count.textContent = number ? `${number} selected` : told;
+    count.textContent = number > most ? `${number} selected; at most ${most} can be compared` : number ? `${number} selected` : told;
     all.checked = number === boxes.length;
     all.indeterminate = number > 0 && number < boxes.length;
     const ids = chosen().map((id) => `"${id}"`);
