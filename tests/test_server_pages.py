@@ -158,8 +158,11 @@ class TestSigningIn:
             told = {"code": code(here), "old": "wrong", "new": "n"}
             assert here.post("/account/password", data=told).status_code == 401
             told["old"], told["new"] = "bob's password", "another password"
-            assert here.post("/account/password", data=told).status_code == 303
-            assert here.get("/account").status_code == 200
+            changed = here.post("/account/password", data=told)
+            assert changed.status_code == 303
+            assert "Your password was changed" in here.get(changed.headers["location"]).text
+            shown = here.get("/account")
+            assert (shown.status_code, "was changed" in shown.text) == (200, False)
             assert there.get("/account").status_code == 303
             told = {"code": code(here), "old": "another password", "new": "bob's password"}
             assert here.post("/account/password", data=told).status_code == 303

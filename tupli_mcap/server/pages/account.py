@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 import tupli_mcap
 from tupli_mcap.errors import TupliError
-from tupli_mcap.page.answers import PageRoute, page
+from tupli_mcap.page.answers import PageRoute, address, page
 from tupli_mcap.page.routes import lists
 from tupli_mcap.server.pages.session import COOKIE, Code, Member, Visit, Visitor, done, tried
 from tupli_mcap.server.people import accounts, limits
@@ -24,9 +24,9 @@ _Flag = Annotated[bool, Form()]
 
 
 @router.get("/account")
-def show(visit: Member) -> Response:
-    """The user's account and tokens, with forms to change them."""
-    return _page(visit)
+def show(visit: Member, changed: bool = False) -> Response:
+    """The user's account and tokens, with forms to change them. changed: the password was changed just now."""
+    return _page(visit, changed=changed)
 
 
 @router.post("/account/password")
@@ -34,7 +34,7 @@ def change_password(visit: Code, old: _Text = "", new: _Text = "") -> Response:
     """Changes the user's password; every other sign-in ends."""
     library, name = visit.library, visit.caller.name
     change = partial(library.change_password, visit.caller, name, new, old=old)
-    response = tried(change, partial(_page, visit), "/account")
+    response = tried(change, partial(_page, visit), address("account", changed="yes"))
     if response.status_code == 303:
         with library.database.writing() as connection:
             pair = library.tokens.pair(connection, name)
@@ -76,6 +76,7 @@ def _page(
     wrong: str = "",
     status: int = 200,
     *,
+    changed: bool = False,
     made: dict[str, Any] | None = None,
     sent: dict[str, str] | None = None,
 ) -> Response:
@@ -86,7 +87,7 @@ def _page(
         quota = limits.quota_of(connection, visit.library.settings, visit.caller.name)
     facts: dict[str, Any] = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
     facts |= {"used": used, "quota": quota}
-    return visit.page("account.html", facts, wrong, status, sent=sent, made=made)
+    return visit.page("account.html", facts, wrong, status, sent=sent, made=made, changed=changed)
 
 
 # --- the first page, signing in and out ---
