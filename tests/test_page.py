@@ -35,6 +35,7 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 ACTING = re.compile("<script>|<img src=x", re.IGNORECASE)
 
@@ -350,6 +351,21 @@ class TestChosen:
         assert web.get("/download", params={"filter": "steps > 100000"}).status_code == 404
         assert web.get("/download", params={"filter": "steps >"}).status_code == 400
 
+    def test_downloads_have_names_that_tell(self, tmp_path: Path) -> None:
+        for seed, name in enumerate(("Grüße", "b")):
+            record_rollouts("CartPole-v1", tmp_path / f"{seed}.mcap", steps=40, seed=seed, name=name)
+        with browsing(tmp_path) as url, httpx.Client(base_url=url, timeout=60) as client:
+            listed = told(client, "/episodes", filter="run.name == 'Grüße'")["episodes"]
+            number = told(client, "/episodes")["count"]
+            for asked, name in (
+                ({"episode": listed[0]["id"]}, f"Gr%C3%BC%C3%9Fe-episode-{listed[0]['episode']}.mcap"),
+                ({"filter": "run.name == 'Grüße'"}, f"Gr%C3%BC%C3%9Fe-{len(listed)}-episodes.mcap"),
+                ({"dataset": "CartPole-v1"}, f"CartPole-v1-{number}-episodes.mcap"),
+                ({}, f"CartPole-v1-{number}-episodes.mcap"),
+            ):
+                answer = client.get("/download", params=asked)
+                assert answer.headers["content-disposition"] == f"attachment; filename*=utf-8''{name}"
+
     def test_those_of_too_many_recordings_are_not_downloaded(self, tmp_path: Path) -> None:
         """All would be open at the same time, and a process may open so many files."""
         box = gym.spaces.Box(-1, 1, (1,))
@@ -411,7 +427,9 @@ class TestChosen:
 
     def test_a_film(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
-        assert b"ftyp" in web.get(f"/episode/{uri}/film.mp4").content[:16]
+        film = web.get(f"/episode/{uri}/film.mp4")
+        assert b"ftyp" in film.content[:16]
+        assert re.search(r'filename="\w+-episode-\d+.mp4"', film.headers["content-disposition"])
 
     def test_rerun(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         pytest.importorskip("rerun", reason="rerun-sdk is not installed")

@@ -294,7 +294,7 @@ class TestTable:
             expect(page.locator("td.spark path")).to_have_count(12)
             with page.expect_download() as download:
                 page.get_by_role("button", name="Download", exact=True).click()
-            assert download.value.suggested_filename == "ppo-seed0-12-episodes.mcap"
+            assert download.value.suggested_filename == "CartPole-v1-12-episodes.mcap"
 
     def test_skipping_to_the_content(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab) as (page, _):

@@ -108,6 +108,11 @@ def page(
     return Response(made.encode("utf-8", "replace"), status, media_type="text/html")
 
 
+def attachment(name: str) -> dict[str, str]:
+    """The header of an answer that a browser saves as a file of this name, which may have any letters."""
+    return {"Content-Disposition": f"attachment; filename*=utf-8''{quote(name)}"}
+
+
 def address(*path: object, **params: Any) -> str:
     """The address of a page; parameters that are None or empty are left out."""
     given = {key: value for key, value in params.items() if value not in (None, "", [], False)}

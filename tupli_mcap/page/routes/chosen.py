@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, Final, NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 from fastapi import APIRouter, HTTPException, Query, Request, Response
@@ -17,10 +16,10 @@ from tupli_mcap import files, jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.page import charts
-from tupli_mcap.page.answers import PageRoute, Shown, page
+from tupli_mcap.page.answers import PageRoute, Shown, attachment, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
 from tupli_mcap.page.curves import Track
-from tupli_mcap.page.datasets import seen_in
+from tupli_mcap.page.datasets import dataset_of, seen_in
 from tupli_mcap.page.routes.episode import FIELDS, Seen, look
 from tupli_mcap.page.shelf import Shelf, find_episode, find_some
 from tupli_mcap.plots.measure import thinned_to
@@ -101,29 +100,43 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
         seen = seen_in(shelf, connection, dataset)
         return each_once(find_episodes(connection, wanted, **seen))
 
-    def ask(connection: Connection) -> tuple[EpisodeHeader | None, dict[str, list[int]]]:
-        first: EpisodeHeader | None = None
+    def ask(connection: Connection) -> tuple[str, dict[str, list[int]]]:
+        runs = set[str]()
+        datasets: dict[tuple[str, str], EpisodeHeader] = {}  # with an episode of each
         numbers_of: dict[str, list[int]] = {}
         for header in find(connection):  # of what may be a million, only the numbers are kept
-            first = first or header
+            runs.add(_run_name(header))
+            datasets.setdefault((header.benchmark_id, str(header.run.get("environment"))), header)
             numbers_of.setdefault(header.recording, []).append(header.episode)
-        return first, numbers_of
+        if len(runs) == 1:
+            return runs.pop(), numbers_of
+        one = next(iter(datasets.values())) if len(datasets) == 1 else None
+        return "" if one is None else dataset_of(shelf, connection, one).name, numbers_of
 
-    first, numbers_of = shelf.ask(ask)
-    if first is None:
+    name, numbers_of = shelf.ask(ask)
+    if not numbers_of:
         raise NotFoundError("no episode matches; choose others, or another filter")
-    name = files.as_file_name(str(first.run.get("name", "")) or name_after(first.recording))
-    count = sum(map(len, numbers_of.values()))
-    what = f"episode-{first.episode}" if count == 1 else f"{count}-episodes"
+    numbers = list(itertools.chain.from_iterable(numbers_of.values()))
+    what = f"episode-{numbers[0]}" if len(numbers) == 1 else f"{len(numbers)}-episodes"
     answer = recording_of(shelf, numbers_of)
-    answer.headers["Content-Disposition"] = f'attachment; filename="{quote(name)}-{what}.mcap"'
+    answer.headers.update(attachment(_file_name(name, f"{what}.mcap")))
     return answer
 
 
 @router.get("/episode/{uri}/film.mp4")
 def film(shelf: Shown, uri: str) -> FileResponse:
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
-    return sent(film_file(shelf, header), f"episode-{header.episode}.mp4", "video/mp4")
+    name = _file_name(_run_name(header), f"episode-{header.episode}.mp4")
+    return sent(film_file(shelf, header), name, "video/mp4")
+
+
+def _run_name(header: EpisodeHeader) -> str:
+    return str(header.run.get("name", "")) or name_after(header.recording)
+
+
+def _file_name(of: str, what: str) -> str:
+    """The name of a file to download: of a run or a dataset (empty for several), and what it holds of it."""
+    return "-".join(filter(None, (files.as_file_name(of), what)))
 
 
 # --- small lines ---

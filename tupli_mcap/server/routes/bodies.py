@@ -18,6 +18,7 @@ from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from tupli_mcap.page.answers import attachment
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
@@ -63,12 +64,13 @@ def body_of(
     size = blobs.size(name)
     if size is None:
         raise LostError(f"the server has lost {name}; restore it from a backup")
+    named = attachment(file_name) if file_name else {}
     # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
     if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
-        told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **_disposition(file_name)}
+        told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **named}
         return Response(headers=told, media_type=_MEDIA)
     _check_version(request, tag)
-    headers = {**(headers or {}), "ETag": tag, **_disposition(file_name)}
+    headers = {**(headers or {}), "ETag": tag, **named}
     if not is_bucket:
         return _File(blobs.place(name), headers=headers, media_type=_MEDIA)
     return _from_bucket(blobs, request, name, size, tag, headers)
@@ -98,11 +100,6 @@ async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) 
     yield first
     for begin in range(start + PIECE, stop, PIECE):
         yield await run_in_threadpool(blobs.piece, name, begin, min(begin + PIECE, stop))
-
-
-def _disposition(file_name: str) -> dict[str, str]:
-    told = f"attachment; filename*=utf-8''{quote(file_name)}"
-    return {"Content-Disposition": told} if file_name else {}
 
 
 def _check_version(request: Request, tag: str) -> None:
