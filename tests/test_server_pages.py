@@ -369,6 +369,11 @@ class TestPeople:
             assert len(episodes_of(bob)) == 2
             assert ">global<" in ann.get("/share?dataset=-").text
             assert bob.post("/share", data={**told, "code": code(bob)}).status_code == 403
+            form = '<form method="post" action="/share"'
+            assert [form in each.get("/share?dataset=-").text for each in (ann, bob)] == [True, False]
+            assert "Nothing of this is yours" in bob.get("/share?dataset=-").text
+            for page in ("/dataset/-", "/episodes?dataset=-"):
+                assert ["/share?" in each.get(page).text for each in (ann, bob)] == [True, False]
             assert ann.post("/share", data={**told, "published": "false"}).status_code == 303
             assert episodes_of(bob) == []
             assert ann.post("/share", data={**told, "group": "nobody's"}).status_code == 404

@@ -66,6 +66,11 @@ class Dataset:
         unnamed = f"benchmark {self.benchmark_id[:8]}" if self.benchmark_id else only or _UNNAMED
         return named or self.environment or unnamed
 
+    def has_of(self, user: str) -> bool:
+        """Whether its benchmark or some of its episodes are a user's."""
+        owners = {part.owner for part in self.audiences}
+        return user in owners or (self.benchmark is not None and self.benchmark.created_by == user)
+
     @property
     def description(self) -> str:
         return self.benchmark.metadata.description if self.benchmark else ""

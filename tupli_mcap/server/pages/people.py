@@ -64,7 +64,10 @@ def _groups(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = N
     with visit.library.database.reading() as connection:
         groups = accounts.list_groups(connection, visit.caller)
         own = accounts.memberships_of(connection, visit.caller.name)
-    return visit.page("groups.html", {"groups": groups}, wrong, status, sent=sent, own=own)
+    may_create = visit.caller.may(Right.GROUP_CREATE)
+    return visit.page(
+        "groups.html", {"groups": groups}, wrong, status, sent=sent, own=own, may_create=may_create
+    )
 
 
 @router.get("/group")

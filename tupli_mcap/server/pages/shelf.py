@@ -47,7 +47,8 @@ class LibraryShelf:
         if not self.user:
             return [("/sign-in", "Sign in")]
         users = [("/users", "Users")] if self._caller.may(Right.USER_READ) else []
-        return [("/upload", "Upload"), ("/groups", "Groups"), *users, ("/account", self.user)]
+        upload = [("/upload", "Upload")] if self._caller.may(Right.EPISODE_CREATE, self.user) else []
+        return [*upload, ("/groups", "Groups"), *users, ("/account", self.user)]
 
     def ask(self, question: Callable[[Connection], T]) -> T:
         with self._library.database.reading() as connection:
