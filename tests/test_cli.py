@@ -594,7 +594,8 @@ class TestLook:
         assert [line.split()[0] for line in result.out.splitlines()] == ["RECORDING", "good.mcap"]
         first, second = result.err.splitlines()
         assert first.startswith("error: bad.mcap: expected an MCAP file, found b'nonsense'")
-        assert second == "error: gone.mcap does not exist; give a recording (.mcap) or a directory of them"
+        missing = "gone.mcap does not exist; give a recording (.mcap) or a directory of them"
+        assert second == f"error: {missing} (here: bad.mcap, good.mcap)"
         as_json = run("ls", "bad.mcap", "--json")
         assert as_json.code == 1
         assert json.loads(as_json.out)["result"][0]["error"].startswith("bad.mcap: expected an MCAP file")
@@ -1175,6 +1176,22 @@ def test_changing_episodes_of_which_none_matches(
 @pytest.mark.parametrize("command", [("edit", "--name", "x"), ("compact",), ("tag", "--undo"), ("info",)])
 def test_a_file_that_does_not_exist(command: tuple[str, ...], here: Path) -> None:
     assert "no.mcap does not exist; give" in fails(*command, "no.mcap")
+
+
+def test_what_may_be_meant_by_a_path_that_does_not_exist(here: Path, cartpole: Path) -> None:
+    (here / "runs").mkdir()
+    shutil.copy(cartpole, "runs/ppo.mcap")
+    for path, meant in (
+        ("runs/pop.mcap", "runs/ppo.mcap"),
+        ("rnus/ppo.mcap", "runs/ppo.mcap"),
+        ("rnus", "runs"),
+    ):
+        for command in ("ls", "info", "episodes", "compact", "push"):
+            assert fails(command, path).endswith(f" (did you mean '{meant}'?)")
+    for name in "abcd":
+        shutil.copy(cartpole, f"runs/{name}.mcap")
+    assert fails("ls", "runs/dreamer.mcap").endswith(" (in runs: a.mcap, b.mcap, c.mcap and 2 more)")
+    assert fails("ls", "elsewhere/x.mcap").endswith(" or a directory of them")
 
 
 def test_episodes_of_what_is_missing(here: Path) -> None:

@@ -9,6 +9,7 @@ import contextlib
 import difflib
 import errno
 import functools
+import itertools
 import os
 import sys
 import warnings
@@ -69,6 +70,7 @@ _OTHERWISE: Final = {
 }
 """Other names of columns, of the number of steps and of `filter`, and ours: the error names the first that there is."""
 
+_LOOKED_AT: Final = 1000  # entries of a directory, for names like one that is not there
 _OURS: Final = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__, functools.__file__)  # no caller's
 
 
@@ -206,6 +208,35 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     close = [meant for meant in _OTHERWISE.get(str(name), ()) if meant in names]
     close = close or difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def no_file(path: Path, give: str = "give a recording (.mcap) or a directory of them") -> RecordingError:
+    """The error for a path that does not exist: what to give, and what is there instead."""
+    return RecordingError(f"{path} does not exist; {give}{_there_instead(path)}")
+
+
+def _there_instead(path: Path) -> str:
+    """` (did you mean 'runs/ppo.mcap'?)`, or else ` (in runs: a.mcap, b.mcap, c.mcap and 3 more)`; or nothing."""
+    try:
+        folder = next(each for each in path.parents if each.is_dir())
+        missing, *rest = path.relative_to(folder).parts
+        with os.scandir(folder) as entries:
+            names = sorted(
+                each.name for each in itertools.islice(entries, _LOOKED_AT) if each.name[:1] != "."
+            )
+    except (OSError, ValueError, StopIteration):  # a NUL in the path, for example
+        return ""
+    by_stem = {name.removesuffix(".mcap"): name for name in names}
+    for stem in difflib.get_close_matches(missing.removesuffix(".mcap"), by_stem, n=3):
+        meant = folder.joinpath(by_stem[stem], *rest)
+        if meant.exists():
+            return f" (did you mean {str(meant)!r}?)"
+    files = [name for name in names if name.endswith(".mcap")]
+    if not files or rest:
+        return ""
+    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    where = "here" if folder == Path() else f"in {folder}"
+    return f" ({where}: {', '.join(files[:3])}{more})"
 
 
 class SaysWhatIsMeant:

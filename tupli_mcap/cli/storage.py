@@ -44,7 +44,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import is_roomy, say
-from tupli_mcap.errors import Gathered, RecordingError, bytes_of
+from tupli_mcap.errors import Gathered, bytes_of, no_file
 from tupli_mcap.remote import is_server
 
 
@@ -253,7 +253,7 @@ def compact(
     from tupli_mcap.storage.sidecar import storage_of
 
     if given is not None and not given.exists():
-        raise RecordingError(f"{given} does not exist; give a recording (.mcap), a directory or a storage")
+        raise no_file(given, "give a recording (.mcap), a directory or a storage")
     place, only = given or storage_path, None
     if place.is_file():
         file, place = place.absolute(), storage_of(place.absolute())

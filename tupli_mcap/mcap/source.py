@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 from urllib.parse import unquote, urlsplit
 
-from tupli_mcap.errors import FormatError, RecordingError, os_reason
+from tupli_mcap.errors import FormatError, RecordingError, no_file, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
 _LARGEST_LENT = 4 << 20
@@ -143,7 +143,7 @@ class PathSource(_Checked):
                 f"{path} is a directory; give one file, a recording (.mcap); tupli_mcap.open takes directories"
             ) from err
         except FileNotFoundError as err:
-            raise RecordingError(f"{path} does not exist; give the path of a recording (.mcap)") from err
+            raise no_file(path, "give the path of a recording (.mcap)") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be opened: {os_reason(err)}") from err
         except ValueError as err:

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from sqlalchemy import ColumnElement, Connection, true
 
-from tupli_mcap.errors import NotFoundError, RecordingError
+from tupli_mcap.errors import NotFoundError, no_file
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
 from tupli_mcap.storage import FileStorage
@@ -30,7 +30,7 @@ def shelf_of(path: Path) -> DirectoryShelf | FileShelf:
     if path.is_dir():
         return DirectoryShelf(path)
     if not path.exists():
-        raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
+        raise no_file(path)
     return FileShelf(path)
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import RecordingError, TupliError, os_reason
+from tupli_mcap.errors import RecordingError, TupliError, no_file, os_reason
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import INTERRUPTED
@@ -240,7 +240,7 @@ def recordings_at(place: str | os.PathLike[str]) -> list[str]:
     if path.exists():
         return [str(path)]
     if not glob.has_magic(name):
-        raise RecordingError(f"{path} does not exist; give a recording (.mcap) or a directory of them")
+        raise no_file(path)
     found = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207 - Path.glob takes no absolute pattern
     if not (files := [file for file in found if not Path(file).is_dir()]):
         raise RecordingError(f"no file matches {str(path)!r}; give the path of a recording (.mcap)")

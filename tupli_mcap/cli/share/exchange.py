@@ -26,7 +26,7 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import counted, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say
-from tupli_mcap.errors import RecordingError, TupliError, bytes_of
+from tupli_mcap.errors import TupliError, bytes_of, no_file
 from tupli_mcap.remote import copied, is_url, path_of, shown
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def push(
         raise typer.BadParameter("--filter and --benchmark go with the directory of a storage")
     for source in sources:
         if source not in files and not Path(source).is_dir():
-            raise RecordingError(f"{source} does not exist; give a recording (.mcap) or a directory of them")
+            raise no_file(Path(source))
     chosen = filter_of(filter_text)
     with server_at(url, dry_run=dry_run) as client:
         if not sources:
