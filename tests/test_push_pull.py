@@ -754,6 +754,14 @@ def test_pull_says_why_it_fetched_nothing(admin: TupliAPIClient, tmp_path: Path)
     assert said == f"sent 0 episodes of 1 benchmark to {admin.url}; no episode matches\n"
 
 
+def test_push_of_a_directory_without_recordings_says_so(admin: TupliAPIClient, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    said = run("push", tmp_path / "empty")
+    assert said.startswith(
+        f"sent 0 episodes to {admin.url}; the directory has no episodes: give one with recordings"
+    )
+
+
 def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "lab" / "run.mcap"
     path.parent.mkdir()

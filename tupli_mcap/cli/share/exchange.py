@@ -276,6 +276,8 @@ def _why_none(copied: int, source: TupliStorage, chosen: BaseFilter | None) -> s
     if copied:
         return ""
     there = source.count_episodes(chosen)
+    if not there and chosen is None:
+        return "; the directory has no episodes: give one with recordings (.mcap), or record some (tupli-mcap record)"
     return f"; none of the {there:,} that match is new" if there else "; no episode matches"
 
 
