@@ -106,7 +106,7 @@ def filter_(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Write the episodes that match a filter, or that you name, into a new file.
+    """Write the episodes that you choose into a new file.
 
     Episodes of one recording keep their ids; those of several get new ones. They lie in the
     order of their times. A signature is dropped.
