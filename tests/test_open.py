@@ -162,8 +162,8 @@ def test_a_mask_may_be_of_pandas_and_has_a_flag_for_each_episode(dataset: Datase
     table = dataset.to_pandas("episodes")
     assert ids(dataset[table["steps"] > 20]) == ids(dataset[dataset.lengths > 20])
     some = pandas.Series([True, pandas.NA, False] * 12, dtype="boolean")
-    for mask in (some, some.array, some.fillna(False)):
-        assert ids(dataset[mask]) == ids(dataset[::3]) == table[mask]["id"].tolist()
+    for mask in (some, some.array, some.fillna(False), some[::-1], some.sample(frac=1, random_state=0)):
+        assert ids(dataset[mask]) == ids(dataset[::3]) == table[some]["id"].tolist()
     for wrong in ([True], some[:7], np.ones(37, bool)):
         with pytest.raises(TupliError, match=f"expected a mask of 36 episodes, found one of {len(wrong)}$"):
             dataset[wrong]

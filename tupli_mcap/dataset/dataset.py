@@ -131,7 +131,7 @@ class Dataset(RandomAccess):
     def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
     def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
         """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets. What is missing in a mask of
-        pandas counts as False.
+        pandas counts as False; that of a table which was sorted is put in order by its index.
 
         Raises:
             IndexError: there is no such episode.
@@ -734,8 +734,10 @@ class Dataset(RandomAccess):
 
 def _places(chosen: Any, count: int) -> list[int]:
     """The places that a mask or a list of numbers names."""
-    of_pandas = hasattr(chosen, "fillna") and chosen.ndim == 1 and chosen.dtype.kind == "b"
-    array = np.asarray(chosen.fillna(False), np.bool_) if of_pandas else np.asarray(chosen)
+    if hasattr(chosen, "fillna") and chosen.ndim == 1 and chosen.dtype.kind == "b":
+        array = _mask_of_pandas(chosen)
+    else:
+        array = np.asarray(chosen)
     if array.ndim == 1 and array.dtype == np.bool_:
         if len(array) != count:
             raise DatasetError(f"expected a mask of {count} episodes, found one of {len(array)}")
@@ -747,6 +749,16 @@ def _places(chosen: Any, count: int) -> list[int]:
     if len(array) and not -count <= array.min() <= array.max() < count:
         raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")
     return [int(i) % count for i in array]
+
+
+def _mask_of_pandas(mask: Any) -> Array:
+    """The flags of the episodes in their order; a Series of a sorted table says by its index which is whose."""
+    array: Array = np.asarray(mask.fillna(False), np.bool_)
+    index = getattr(mask, "index", None)
+    if index is None or index.dtype.kind not in "iu":
+        return array
+    order = np.argsort(np.asarray(index), kind="stable")
+    return array[order] if np.array_equal(index[order], np.arange(len(array))) else array
 
 
 def _same_text(value: Any) -> str:
