@@ -384,6 +384,20 @@ def test_keys_can_be_written_in_filters(tmp_path: Path) -> None:
         dataset.sort("run.metadata.a b.c")
 
 
+def test_keys_of_values_in_dicts(tmp_path: Path) -> None:
+    settings = {"opt": {"lr": 1e-3, "v1.0": 2}, "algo": "ppo"}
+    with tupli_mcap.RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", metadata=settings) as env:
+        roll(env, 5)
+    dataset = tupli_mcap.open(tmp_path)
+    found = [key for key in dataset.keys if key.startswith("run.metadata.")]
+    assert found == ["run.metadata.algo", 'run.metadata.opt."v1.0"', "run.metadata.opt.lr"]
+    assert set(found) < set(dataset.to_pandas("episodes"))
+    with pytest.raises(FilterError, match=r"no episode has run\.metadata\.opt\.lrr \(did you mean 'lr'\?\)"):
+        dataset.filter("run.metadata.opt.lrr < 1")
+    with pytest.raises(FilterError, match=r"did you mean 'run\.metadata\.opt\.lr'\?"):
+        dataset.sort("metadata.opt.lr")
+
+
 def test_sort_keeps_equal_ones_in_order(dataset: Dataset) -> None:
     for descending in (False, True):
         found = dataset.sort("metadata.side", descending=descending)

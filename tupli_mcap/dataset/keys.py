@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.jsonvalue import spelled
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, FilterType, filter_keys, format_key
 from tupli_mcap.schema.facts import comparisons, path_in
+from tupli_mcap.schema.keys import leaves_of
 from tupli_mcap.schema.predicate import MISSING, look_up
 from tupli_mcap.storage.base import uuid_of
 
@@ -18,9 +19,8 @@ _KINDS: Final = {bool: "true or false", int: "a number", float: "a number", str:
 def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
     """The keys of facts about episodes, and of the metadata of any of them."""
     runs = {id(header.run): header.run for header in headers}.values()
-    own: set[tuple[str, ...]] = {("metadata", key) for header in headers for key in header.metadata}
-    own |= {("run", key) for run in runs for key in run if key != "metadata"}
-    own |= {("run", "metadata", key) for run in runs for key in run.get("metadata", {})}
+    own = {("metadata", *path) for header in headers for path, _ in leaves_of(header.metadata)}
+    own |= {("run", *path) for run in runs for path, _ in leaves_of(run)}
     return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | set(map(format_key, own)))
 
 
@@ -51,22 +51,40 @@ def matching(
 
 def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
     """FilterError if a filter that matches no episode names metadata, or parts of runs, that no episode has."""
-    known = {
-        ("metadata",): {key for header in among for key in header.metadata},
-        ("run",): {key for header in among for key in header.run},
-        ("run", "metadata"): {key for header in among for key in header.run.get("metadata", {})},
+    known: dict[tuple[str, ...], set[str]] = {
+        ("metadata",): set(),
+        ("run",): set(),
+        ("run", "metadata"): set(),
     }
+    for header in among:
+        _note_keys(header.metadata, ("metadata",), known)
+    for run in {id(header.run): header.run for header in among}.values():
+        _note_keys(run, ("run",), known)
     for comparison in comparisons(wanted) if among else ():
         path = path_in(comparison.key or "", EpisodeHeader)
         for there, keys in known.items():
             if path[:-1][: len(there)] == there and (name := path[len(there)]) not in keys:
-                elsewhere = [format_key((*place, name)) for place, others in known.items() if name in others]
+                elsewhere = [
+                    format_key((*place, *path[len(there) :]))
+                    for place, others in known.items()
+                    if name in others
+                ]
                 written = sorted(format_key([key]) for key in keys)
                 meant = f" (did you mean {elsewhere[0]!r}?)" if elsewhere else did_you_mean(name, written)
                 raise FilterError(
                     f"no episode has {comparison.key}{meant}; "
                     f"{'.'.join(there)} has {', '.join(written) or 'no keys'}"
                 )
+
+
+def _note_keys(
+    value: Mapping[str, Any], within: tuple[str, ...], known: dict[tuple[str, ...], set[str]]
+) -> None:
+    """Adds the keys of nested mappings, by the path of each mapping."""
+    known.setdefault(within, set()).update(value)
+    for key, inside in value.items():
+        if isinstance(inside, Mapping):
+            _note_keys(inside, (*within, key), known)
 
 
 def unlike_any(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> str:
