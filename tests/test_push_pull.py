@@ -667,7 +667,7 @@ def test_who_may_see_a_benchmark_can_load_it(admin: TupliAPIClient) -> None:
     env.publish()
     bob = signed_in(admin, "bob")
     loaded = WindyWrapper.load(bob, uri, trust=True)
-    assert np.array_equal(loaded.unwrapped.data, env.unwrapped.data)  # type: ignore[attr-defined]
+    assert np.array_equal(loaded.get_wrapper_attr("data"), env.get_wrapper_attr("data"))
 
 
 def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClient) -> None:

@@ -143,9 +143,9 @@ def recover_recording(
 def filter_dataset(
     dataset: Episodes,
     target: str | os.PathLike[str],
-    filter: BaseFilter | str | None,
+    filter: BaseFilter | str,
     *,
-    chosen: tuple[str, Collection[str]] | None = None,
+    query: str = "",
     sort: str = "",
     limit: int | None = None,
     overwrite: bool = False,
@@ -154,7 +154,7 @@ def filter_dataset(
     """Writes the episodes of a dataset that a filter is true of to `target`, as `Dataset.save` does.
 
     Args:
-        chosen: a text such as "3,7-9", and the ids of the episodes that it names; the others are left out.
+        query: what `made_of.json` and errors say in place of the filter.
         sort, limit: only the first `limit` of them in the order of a key; of "-return", the highest returns come first.
 
     Raises:
@@ -162,16 +162,10 @@ def filter_dataset(
         RecordingError: it is true of no episode, or as `Dataset.save`.
         DatasetError: as `Dataset.save`.
     """
-    target = file_path(target)
-    count = len(dataset)
-    kept = dataset if filter is None else dataset.filter(filter)
-    query = [] if filter is None else [str(filter)]
-    if chosen is not None:
-        text, ids = chosen
-        kept = kept[[header.id in ids for header in kept.headers]]
-        query.append(f"episodes {text}")
+    target, query, count = file_path(target), query or str(filter), len(dataset)
+    kept = dataset.filter(filter)
     if not len(kept):
-        raise RecordingError(f"expected an episode that matches {filter}, found none among {count:,}")
+        raise RecordingError(f"expected an episode that matches {query}, found none among {count:,}")
     if sort:
         kept = kept.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
     if limit is not None:
@@ -180,7 +174,7 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    return report._replace(size=save(kept, target, ", ".join(query), overwrite=overwrite).stat().st_size)
+    return report._replace(size=save(kept, target, query, overwrite=overwrite).stat().st_size)
 
 
 def trim(

@@ -111,20 +111,23 @@ def filter_(
     Episodes of one recording keep their ids; those of several get new ones. They lie in the
     order of their times. A signature is dropped.
     """
-    if episodes is None and filter_text is None:
+    from tupli_mcap.dataset.chosen import chosen_ids
+    from tupli_mcap.dataset.curate import filter_dataset
+    from tupli_mcap.schema import FilterIN
+
+    wanted, query = filter_of(filter_text), filter_text or ""
+    if episodes is not None:
+        wanted = FilterIN(key="id", value=sorted(chosen_ids(sources, episodes, wanted)))
+        query = f"episodes {episodes}" if filter_text is None else f"{filter_text}, episodes {episodes}"
+    if wanted is None:
         raise typer.BadParameter(
             "expected --filter or --episodes, found neither; to copy all episodes, merge them"
         )
-    from tupli_mcap.dataset.chosen import chosen_ids
-    from tupli_mcap.dataset.curate import filter_dataset
-
-    wanted = filter_of(filter_text)
-    chosen = None if episodes is None else (episodes, chosen_ids(sources, episodes, wanted))
     report = filter_dataset(
         dataset_of(sources),
         output,
-        filter_text,
-        chosen=chosen,
+        wanted,
+        query=query,
         sort=sort,
         limit=limit,
         overwrite=force,
