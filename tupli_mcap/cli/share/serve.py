@@ -133,6 +133,7 @@ def serve(
         if password is not None:
             say(f"user admin, password {password} (shown only this once; `tupli-mcap password` changes it)")
         say(f"serving {directory} at {address} (Ctrl-C ends it)")
+        flush()
 
     settings = Settings(
         directory.absolute(),
