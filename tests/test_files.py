@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -165,6 +167,21 @@ def test_what_a_killed_process_left_is_told_from_what_is_in_use(tmp_path: Path) 
         assert files.left_in(below) == [temporary] == list(files.left_below(tmp_path))
     assert files.remove_left(files.left_in(below)) == len(b"half of it")
     assert list(below.iterdir()) == []
+
+
+def test_a_file_is_held_even_if_somebody_looks_at_it_as_it_is_made(tmp_path: Path) -> None:
+    path = files.temporary_path(tmp_path)
+    path.mkdir()
+    (path / "new").touch()
+    own, other = (os.open(path, os.O_RDONLY) for _ in range(2))
+    fcntl.flock(other, fcntl.LOCK_EX)
+    looked = threading.Timer(0.1, os.close, [other])
+    looked.start()
+    files.hold(own)
+    looked.join()
+    assert files.left_in(tmp_path) == []
+    os.close(own)
+    assert files.left_in(tmp_path) == [path]
 
 
 def test_a_file_that_was_just_made_is_left_alone(tmp_path: Path) -> None:
