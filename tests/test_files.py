@@ -174,7 +174,8 @@ def test_a_file_is_held_even_if_somebody_looks_at_it_as_it_is_made(tmp_path: Pat
     path.mkdir()
     (path / "new").touch()
     own, other = (os.open(path, os.O_RDONLY) for _ in range(2))
-    fcntl.flock(other, fcntl.LOCK_EX)
+    fcntl.flock(other, fcntl.LOCK_SH)
+    assert files.left_in(tmp_path) == [path]  # somebody else looks, too
     looked = threading.Timer(0.1, os.close, [other])
     looked.start()
     files.hold(own)

@@ -192,7 +192,7 @@ def _is_unheld(fd: int, path: Path) -> bool:
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         return False
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: whoever else looks does not hold it
     except OSError:
         return False
     is_empty = not status.st_size if stat.S_ISREG(status.st_mode) else not os.listdir(fd)
