@@ -661,6 +661,37 @@ def test_a_copy_of_somebody_else_s_benchmark_comes_and_goes_with_its_artifacts(
     assert bob.load_artifact(artifact) == b"wind"
 
 
+def test_a_pushed_bundle_of_somebody_else_s_benchmark_comes_with_it_and_its_artifacts(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    env = WindyWrapper(windy(), tmp_path / "lab")
+    uri = env.store(name="windy")
+    env.reset(seed=7)
+    while not env.step(env.action_space.sample())[3]:
+        pass
+    env.close()
+    with FileStorage(tmp_path / "lab") as lab:
+        lab.bundle(uri, tmp_path / "bundle.mcap")
+        plain = tmp_path / "lab" / lab.list_episodes()[0].recording
+        copy_episodes(lab, admin)
+    run("publish", uri)
+    bob, of_bob = signed_in(admin, "bob"), F("created_by") == "bob"
+    run("push", plain)  # it has no artifacts, and the server has its benchmark
+    run("push", tmp_path / "bundle.mcap", "--dry-run")
+    assert not bob.list_benchmarks(of_bob) and not bob.list_artifacts(of_bob)
+    for _ in range(2):
+        run("push", tmp_path / "bundle.mcap")
+    assert len(bob.list_benchmarks(of_bob)) == len(bob.list_artifacts(of_bob)) == 1
+    run("publish", uri)
+    bob.login("admin", PASSWORD)
+    assert bob.delete_benchmark(uri, episodes=True) == 1
+    for artifact in bob.list_artifacts(F("created_by") == "admin"):
+        bob.delete_artifact(artifact.id)
+    cid = signed_in(bob, "cid")
+    assert WindyWrapper.load(cid, uri, trust=True).get_wrapper_attr("data").shape == (50,)
+    assert [header.created_by for header in cid.list_episodes()] == ["bob"]
+
+
 def test_who_may_see_a_benchmark_can_load_it(admin: TupliAPIClient) -> None:
     env = WindyWrapper(windy(), admin)
     uri = env.store(name="windy")

@@ -245,14 +245,8 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
         StorageError: the server refuses it: its benchmark is neither stored there nor in the file.
     """
     with without_deleted(path, name) as kept, Recording(kept) as recording:
-        carries = bool(recording.benchmark_id) and DOCUMENT_NAME in recording.attachments
-        if carries and not client.list_benchmarks(FilterEQ(key="id", value=recording.benchmark_id)):
-            record, _, query = carried_benchmark(recording, path)
-            for data, metadata in carried_artifacts(recording, record, path):
-                if not dry_run:
-                    client.store_artifact(data, metadata)
-            if not dry_run:
-                client.store_benchmark(query)
+        if recording.benchmark_id and DOCUMENT_NAME in recording.attachments:
+            _send_carried(client, recording, path, dry_run=dry_run)
         if dry_run:
             return Pushed("", recording.benchmark_id, len(recording), False)
         with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
@@ -260,6 +254,27 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
         stored = _stored(client, sent.name)
         say_what_was_deleted(len(recording) - stored, None)
         return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)
+
+
+def _send_carried(client: TupliAPIClient, recording: Recording, path: Path, *, dry_run: bool) -> None:
+    """Stores the benchmark and artifacts that a recording carries, unless the caller has stored the benchmark. The
+    caller gets a copy of somebody else's: they may hide or delete theirs. If the recording lacks an artifact, nothing
+    is stored; StorageError then, unless the server has the benchmark."""
+    of_id = FilterEQ(key="id", value=recording.benchmark_id)
+    if client.list_benchmarks(_own(client, of_id)):
+        return
+    record, _, query = carried_benchmark(recording, path)
+    try:
+        artifacts = carried_artifacts(recording, record, path)
+    except StorageError:
+        if client.list_benchmarks(of_id):
+            return
+        raise
+    if dry_run:
+        return
+    for data, metadata in artifacts:
+        client.store_artifact(data, metadata)
+    client.store_benchmark(query)
 
 
 def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiting]:
