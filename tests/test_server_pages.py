@@ -425,6 +425,34 @@ class TestPeople:
             assert ann.post("/users/delete", data={**told, "code": code(ann)}).status_code == 403
             assert admin.post("/users/delete", data={**told, "code": code(admin)}).status_code == 303
 
+    def test_quotas(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "admin", PASSWORD) as admin:
+
+            def stored() -> dict[str, Any]:
+                told: dict[str, Any] = admin.get("/users?format=json").json()["stored"]["ann"]
+                return told
+
+            used = ann.get("/account?format=json").json()["used"]
+            assert used > 0
+            assert stored() == {"used": used, "quota": None, "own_quota": None}
+            for text in ("Stored", "Quota", "/users/quota"):
+                assert (text in admin.get("/users").text, text in ann.get("/users").text) == (True, False)
+            assert list(ann.get("/users?format=json").json()) == ["users"]
+            told = {"username": "ann", "gigabytes": "1.5"}
+            assert ann.post("/users/quota", data={**told, "code": code(ann)}).status_code == 403
+            told["code"] = code(admin)
+            assert admin.post("/users/quota", data=told).status_code == 303
+            assert stored() == {"used": used, "quota": 1_500_000_000, "own_quota": 1_500_000_000}
+            shown = admin.get("/users").text
+            assert "B of 1.5 GB</td>" in shown and 'value="1.5" aria-label="Quota of ann in GB"' in shown
+            for wrong in ("-1", "nan", "inf", "1e10", "much"):
+                refused = admin.post("/users/quota", data={**told, "gigabytes": wrong})
+                assert (refused.status_code, "gigabytes: Input should be" in refused.text) == (400, True)
+            nobody = admin.post("/users/quota", data={**told, "username": "nobody"})
+            assert (nobody.status_code, "User does not exist" in nobody.text) == (404, True)
+            assert admin.post("/users/quota", data={**told, "gigabytes": ""}).status_code == 303
+            assert stored()["quota"] is None
+
     def test_tokens_of_machines(self, server: str) -> None:
         with browser(server, "ann") as ann:
             made = ann.post("/account/tokens", data={"code": code(ann), "name": "node 7", "scope": "read"})

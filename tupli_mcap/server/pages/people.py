@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Response
 
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.schema import Right
 from tupli_mcap.server.pages.session import Code, Member, Visit, tried
-from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.access import GLOBAL
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
@@ -39,12 +39,27 @@ def delete_user(visit: Code, username: _Text = "") -> Response:
     return tried(change, partial(_users, visit), "/users")
 
 
+@router.post("/users/quota")
+def set_quota(
+    visit: Code, username: _Text = "", gigabytes: Annotated[float | None, Form(ge=0, le=1e9)] = None
+) -> Response:
+    """Sets how much a user may store; an empty field stands for the server's quota."""
+    size = None if gigabytes is None else round(gigabytes * 1e9)
+    change = partial(visit.change, limits.set_quota, username, size)
+    return tried(change, partial(_users, visit), "/users")
+
+
 def _users(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     visit.caller.demand(Right.USER_READ)
+    rights = {"create": Right.USER_CREATE, "set_quota": Right.USER_UPDATE, "delete": Right.USER_DELETE}
+    may = {verb: visit.caller.may(right) for verb, right in rights.items()}
     with visit.library.database.reading() as connection:
-        users = accounts.list_users(connection, visit.caller)
-    may = {"create": visit.caller.may(Right.USER_CREATE), "delete": visit.caller.may(Right.USER_DELETE)}
-    return visit.page("users.html", {"users": users}, wrong, status, sent=sent, may=may)
+        facts: dict[str, Any] = {"users": accounts.list_users(connection, visit.caller)}
+        if may["set_quota"]:
+            usages = limits.usages(connection, visit.library.settings)
+            facts["stored"] = {name: usage._asdict() for name, usage in usages.items()}
+    quota = visit.library.settings.quota
+    return visit.page("users.html", facts, wrong, status, sent=sent, may=may, quota=quota)
 
 
 @router.get("/groups")

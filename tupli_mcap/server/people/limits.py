@@ -8,11 +8,13 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import AsyncIterable, AsyncIterator, Mapping
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError, plural
+from tupli_mcap.schema import Right
+from tupli_mcap.server.database import audit
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, UPLOAD, USER
@@ -20,6 +22,11 @@ from tupli_mcap.storage.texts import escape_text
 
 _SECONDS: Final = 60
 _MOST_WAITING: Final = 100  # requests of a user
+_SIZES: Final = (
+    (FILE.c.created_by, FILE.c.size),
+    (ITEM.c.created_by, ITEM.c.size),
+    (UPLOAD.c.user, UPLOAD.c.length),
+)
 _T = TypeVar("_T")
 
 
@@ -98,16 +105,28 @@ class FullError(StorageError):
     """A user's quota is used up, or the server's disk is full."""
 
 
+class Usage(NamedTuple):
+    """The bytes that a user has stored, and may store (`quota`; None: without a limit). own_quota: None if the quota is
+    that of the settings."""
+
+    used: int
+    quota: int | None
+    own_quota: int | None
+
+
+def usages(connection: Connection, settings: Settings) -> dict[str, Usage]:
+    """What each user has stored, and may store."""
+    used = Counter[str]()
+    for owner, size in _SIZES:
+        for name, total in connection.execute(select(owner, func.sum(size)).group_by(owner)):
+            used[name] += int(total)
+    quotas = connection.execute(select(USER.c.name, USER.c.quota))
+    return {name: Usage(used[name], settings.quota if own is None else own, own) for name, own in quotas}
+
+
 def used_by(connection: Connection, user: str) -> int:
     """The bytes that a user has stored, with the final sizes of unfinished uploads."""
-    sums = (
-        select(func.coalesce(func.sum(size), 0)).where(owner == user)
-        for size, owner in (
-            (FILE.c.size, FILE.c.created_by),
-            (ITEM.c.size, ITEM.c.created_by),
-            (UPLOAD.c.length, UPLOAD.c.user),
-        )
-    )
+    sums = (select(func.coalesce(func.sum(size), 0)).where(owner == user) for owner, size in _SIZES)
     return sum(int(connection.execute(each).scalar_one()) for each in sums)
 
 
@@ -117,11 +136,13 @@ def quota_of(connection: Connection, settings: Settings, user: str) -> int | Non
     return settings.quota if own is None else own
 
 
-def set_quota(connection: Connection, user: str, size: int | None) -> None:
+def set_quota(connection: Connection, caller: Caller, user: str, size: int | None) -> None:
     """Gives a user a quota of their own (bytes); None for the quota of the settings. NotFoundError if there is no such
     user."""
+    caller.demand(Right.USER_UPDATE)
     if not connection.execute(update(USER).where(USER.c.name == user).values(quota=size)).rowcount:
         raise NotFoundError("User does not exist")
+    audit(connection, caller.name, "set_quota", f"{user}: {size}")
 
 
 def demand_room(connection: Connection, settings: Settings, caller: Caller, size: int) -> None:

@@ -8,7 +8,6 @@ from fastapi import APIRouter
 from pydantic import BaseModel, FailFast, Field
 
 from tupli_mcap.schema import Group, Right, UserRole
-from tupli_mcap.server.database import audit
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
@@ -149,10 +148,8 @@ def delete_user(library: Served, caller: Person, username: str) -> None:
 @router.put("/users/{username}/quota")
 def set_quota(library: Served, caller: Writer, username: str, told: Quota) -> None:
     """Sets how much a user may store."""
-    caller.demand(Right.USER_UPDATE)
     with library.database.writing() as connection:
-        limits.set_quota(connection, username, told.bytes)
-        audit(connection, caller.name, "set_quota", f"{username}: {told.bytes}")
+        limits.set_quota(connection, caller, username, told.bytes)
 
 
 @router.put("/users/{username}/password")
