@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Form, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 import tupli_mcap
 from tupli_mcap.errors import TupliError
-from tupli_mcap.page.answers import PageRoute, address, page
+from tupli_mcap.page.answers import PageRoute, page
 from tupli_mcap.page.routes import lists
 from tupli_mcap.server.pages.session import COOKIE, Code, Member, Visit, Visitor, done, tried
 from tupli_mcap.server.people import accounts, limits
@@ -21,12 +21,17 @@ router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _Text = Annotated[str, Form()]
 _Next = Annotated[str, Form(alias="next")]
 _Flag = Annotated[bool, Form()]
+_CHANGED: Final = "tupli_mcap_password_changed"
 
 
 @router.get("/account")
-def show(visit: Member, changed: bool = False) -> Response:
-    """The user's account and tokens, with forms to change them. changed: the password was changed just now."""
-    return _page(visit, changed=changed)
+def show(visit: Member) -> Response:
+    """The user's account and tokens, with forms to change them. After a change of the password, it says so once."""
+    changed = _CHANGED in visit.request.cookies
+    response = _page(visit, changed=changed)
+    if changed:
+        response.delete_cookie(_CHANGED, path="/account", httponly=True, samesite="lax")
+    return response
 
 
 @router.post("/account/password")
@@ -34,11 +39,12 @@ def change_password(visit: Code, old: _Text = "", new: _Text = "") -> Response:
     """Changes the user's password; every other sign-in ends."""
     library, name = visit.library, visit.caller.name
     change = partial(library.change_password, visit.caller, name, new, old=old)
-    response = tried(change, partial(_page, visit), address("account", changed="yes"))
+    response = tried(change, partial(_page, visit), "/account")
     if response.status_code == 303:
         with library.database.writing() as connection:
             pair = library.tokens.pair(connection, name)
         visit.begin(response, pair["refresh_token"])
+        response.set_cookie(_CHANGED, "1", max_age=60, path="/account", httponly=True, samesite="lax")
     return response
 
 
