@@ -18,7 +18,9 @@ from serving import ENGINES, PASSWORD, serving, settings_of
 
 import tupli_mcap
 from tupli_mcap.page.routes import PAGES
+from tupli_mcap.schema import Right
 from tupli_mcap.server.pages import PAGES as OF_SERVERS
+from tupli_mcap.server.people.access import DEFAULT_ROLES
 from tupli_mcap.server.settings import Settings
 
 COOKIE = "tupli_mcap_session"
@@ -199,7 +201,65 @@ def forms() -> list[str]:
     return sorted(route.path for router in OF_SERVERS for route in router.routes if "POST" in route.methods)  # type: ignore[attr-defined]
 
 
+OF_ONES_OWN = {
+    "/sign-in", "/sign-out", "/account/access", "/account/password", "/account/tokens",
+    "/account/tokens/delete",
+}  # fmt: skip
+OF_RIGHTS = [
+    (Right.EPISODE_CREATE, "/share", "/share?dataset=-", {"dataset": "-", "group": "global"}),
+    (Right.GROUP_CREATE, "/groups", "/groups", {"name": "another crew"}),
+    (Right.GROUP_UPDATE, "/group/members", "/group?name=crew", {"name": "crew", "user": "bob"}),
+    (Right.GROUP_UPDATE, "/group/members/delete", "/group?name=crew", {"name": "crew", "user": "ann"}),
+    (Right.GROUP_DELETE, "/group/delete", "/group?name=crew", {"name": "crew"}),
+    (Right.USER_CREATE, "/users", "/users", {"username": "cid", "password": "cid's password"}),
+    (Right.USER_UPDATE, "/users/quota", "/users", {"username": "bob", "gigabytes": "1"}),
+    (Right.USER_DELETE, "/users/delete", "/users", {"username": "bob"}),
+]
+"""Forms that need a right: the right, the address, the page that has the form, and what may be in it."""
+
+
 class TestForms:
+    @pytest.mark.parametrize(("right", "address", "page", "told"), OF_RIGHTS)
+    def test_they_are_there_for_those_who_may(
+        self,
+        server: str,
+        monkeypatch: pytest.MonkeyPatch,
+        right: Right,
+        address: str,
+        page: str,
+        told: dict[str, str],
+    ) -> None:
+        """Everybody has several default roles, so that a user lacks a right only if each of these does."""
+
+        def give(rights: frozenset[Right]) -> None:
+            for role in DEFAULT_ROLES:
+                monkeypatch.setitem(DEFAULT_ROLES, role, rights)
+
+        with browser(server, "ann") as ann:
+            give(frozenset(Right))
+            told = {**told, "code": code(ann)}
+            ann.post("/groups", data={**told, "name": "crew"})
+            form = f'method="post" action="{address}"'
+            assert form in ann.get(page).text
+            give(frozenset(Right) - {right})
+            without = ann.get(page)
+            assert (without.status_code, form in without.text) == (200, False)
+            assert ann.post(address, data=told).status_code in (403, 404)
+
+    def test_each_is_one_s_own_or_needs_a_right(self) -> None:
+        assert {address for _, address, *_ in OF_RIGHTS} | OF_ONES_OWN == set(forms())
+
+    def test_links_to_pages_are_there_for_those_who_may(
+        self, server: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with browser(server, "ann") as ann:
+            for right, page in ((Right.EPISODE_CREATE, "/upload"), (Right.USER_READ, "/users")):
+                assert (f'href="{page}"' in ann.get("/").text, ann.get(page).status_code) == (True, 200)
+                with monkeypatch.context() as patch:
+                    for role, rights in DEFAULT_ROLES.items():
+                        patch.setitem(DEFAULT_ROLES, role, rights - {right})
+                    assert (f'href="{page}"' in ann.get("/").text, ann.get(page).status_code) == (False, 403)
+
     @pytest.mark.parametrize("address", [path for path in forms() if path != "/sign-in"])
     def test_they_need_their_code(self, server: str, address: str) -> None:
         """Every form of every page, so that none is forgotten."""

@@ -116,7 +116,7 @@ def _group(visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent:
         roles = [role["role"] for role in accounts.list_roles(connection)]
     caller = visit.caller
     may = {
-        "update": caller.may(Right.GROUP_UPDATE, name),
+        "change": caller.may(Right.GROUP_UPDATE, name),  # `may.update` would be a method of the dict
         "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
     }
     return visit.page("group.html", group, wrong, status, sent=sent, may=may, roles=roles)
