@@ -136,6 +136,64 @@ def test_what_a_loader_gives(runs: Path) -> None:
     assert list(batch["actions"]) == ["grip"]
 
 
+AROUND = {
+    "state": [-1, 0],
+    "state.arm": [-2, 0, 1],
+    'observation.arm."v.x"': [0],
+    "states.camera": [0],
+    "next_state.t": [0],
+    "next_state": [-2, 0, 1],
+    "action.grip": range(3),
+}
+
+
+def test_values_of_parts_around_steps(runs: Path, tmp_path: Path) -> None:
+    dataset = tupli_mcap.open(runs)
+    datasets: dict[str, Any] = {
+        "all": dataset,
+        "chosen": dataset.filter_steps("step > 0 or state.arm.q[0] > 0"),
+    }
+    if "said" not in dataset[0].states:
+        dataset.save_columns(tmp_path / "saved")
+        datasets["saved"] = open_columns(tmp_path / "saved")
+    for name, among in datasets.items():
+        items = among.delta_windows(AROUND)
+        # each of them from the whole, read by itself
+        for key, inside in {
+            "state": [], "state.arm": ["arm"], 'observation.arm."v.x"': ["arm", "v.x"],
+            "states.camera": ["camera"], "next_state.t": ["t"], "next_state": [], "action.grip": ["grip"],
+        }.items():  # fmt: skip
+            whole_key = key.partition(".")[0]
+            whole = among.delta_windows({whole_key: AROUND[key]})
+            for at in (np.array([7, 0, 3, 3]), 4):
+                expected = whole[at][whole_key]
+                for part in inside:
+                    expected = expected[part]
+                assert same(items[at][key], expected), (name, key)
+                assert same(items[at].masks[key], whole[at].masks[whole_key]), (name, key)
+        again = pickle.loads(pickle.dumps(items))
+        again.limit(1 << 20, 1)
+        assert same(again[:].values, items[:].values), name
+
+
+def test_an_image_is_read_at_its_own_distances_alone(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    camera = gym.spaces.Box(0, 255, (320, 320, 3), np.uint8)  # ten in a chunk
+    space = gym.spaces.Dict({"arm": ARM, "camera": camera})
+    with EpisodeWriter(path, space, ACTION, compression="none", chunk_size=1) as writer:
+        writer.begin()
+        for step in range(12):
+            state = {"arm": ARM.sample(), "camera": np.full(camera.shape, 100 + step, np.uint8)}
+            writer.step(state, ACTION.sample(), 1.0, step == 11)
+    image = bytes([100]) * camera.sample().size
+    path.write_bytes(path.read_bytes().replace(image, b"?" + image[1:], 1))
+    dataset = tupli_mcap.open(path)
+    around = dataset.delta_windows({"state.arm": [-11, 0], "state.camera": [0]})
+    assert around[11]["state.camera"].max() == 111
+    with pytest.raises(TupliError, match="damaged"):
+        dataset.delta_windows({"state": [-11, 0], "state.camera": [0]})[11]
+
+
 def test_parts_that_cannot_be_read_alone(runs: Path) -> None:
     dataset = tupli_mcap.open(runs)
     for read in (
@@ -154,6 +212,22 @@ def test_parts_that_cannot_be_read_alone(runs: Path) -> None:
         ):
             read(["state.arm", "next_states"])
         assert same(read(["state", "state.arm"]).states, read(["state"]).states)
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("next_state.amr", r"found state.amr \(did you mean 'state.arm'"),
+        ("state.arm.q[0]", r"found state.arm.q\[0\]; read state.arm.q, and index it"),
+        ("state.t[0]", "expected all of state.t, which is a Tuple"),
+        ('state.arm."v', r"""found state.arm."v \(did you mean 'state.arm."v.x"'"""),
+        ("reward.x", "found 'reward.x'; read 'rewards'"),
+        ("info.x", "expected deltas of state, .*, found 'info.x'"),
+    ],
+)
+def test_keys_of_delta_windows_that_cannot_be_read(runs: Path, key: str, said: str) -> None:
+    with pytest.raises(TupliError, match=said):
+        tupli_mcap.open(runs).delta_windows({key: [0]})
 
 
 def test_a_part_of_what_has_none(tmp_path: Path) -> None:

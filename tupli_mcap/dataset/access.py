@@ -136,11 +136,14 @@ class RandomAccess(SaysWhatIsMeant):
     ) -> DeltaWindows:
         """The values around each step: `{"state": [-2, -1, 0], "action": range(16)}`, in steps or seconds.
 
-        See `DeltaWindows`. `step_seconds` is by default that in the labels of the recordings.
+        See `DeltaWindows`. A key may be a part of a Dict: `{"state.arm": [-2, -1, 0], "state.camera": [0]}` reads one
+        image of each item, and `item["state.arm"]` is the value of that part. `step_seconds` is by default that in the
+        labels of the recordings.
 
         Raises:
             SamplingError: the dataset is empty, a key is unknown, or the recordings do not agree on the time of a step.
-            SpaceError: one array cannot hold the values at a key of two of the recordings.
+            SpaceError: one array cannot hold the values at a key of two of the recordings, or one of them has no such
+                part.
         """
         if unit == "seconds" and step_seconds is None:
             step_seconds = self._step_seconds()

@@ -203,27 +203,29 @@ def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
 
 def leaves_in(parts: Collection[str], leaves: Sequence[Leaf]) -> list[Leaf]:
     """The leaves that lie in parts of a value. SpaceError if a part has none."""
-    found = [leaf for leaf in leaves if any(_lies_in(part, leaf.path) for part in parts)]
     paths = [leaf.path for leaf in leaves]
+    names = dict.fromkeys(name for leaf in leaves for name, _ in _names_around(leaf))
     for part in parts:
-        if not any(_lies_in(part, leaf.path) for leaf in found):
-            whole = next((path for path in paths if _lies_in(path, part)), None)
-            names = [
-                name_within(leaf.root, *leaf.keys[:end])
-                for leaf in leaves
-                for end in range(len(leaf.keys) + 1)
-            ]
-            known = [name for name in dict.fromkeys(names) if name != leaves[0].root] or paths
+        if part not in names:
+            whole = next((path for path in paths if part.startswith((f"{path}.", f"{path}["))), None)
+            known = [name for name in names if name != leaves[0].root] or paths
             hint = did_you_mean(part, known) if whole is None else f"; read {whole}, and index it"
             more = "" if len(known) <= _MOST_SHOWN else ", …"
             raise SpaceError(
                 f"expected a part such as {', '.join(known[:_MOST_SHOWN])}{more}, found {part:.80}{hint}"
             )
-    return found
+    return [leaf for leaf in leaves if any(name in parts for name, _ in _names_around(leaf))]
 
 
-def _lies_in(part: str, path: str) -> bool:
-    return path == part or path.startswith((f"{part}.", f"{part}["))
+def keys_to(part: str, leaves: Sequence[Leaf]) -> tuple[Any, ...]:
+    """The keys that lead to a part of a value, in which one of the leaves lies."""
+    return next(keys for leaf in leaves for name, keys in _names_around(leaf) if name == part)
+
+
+def _names_around(leaf: Leaf) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    """The names of the values that a leaf lies in, and its own, each with the keys that lead there."""
+    for end in range(len(leaf.keys) + 1):
+        yield name_within(leaf.root, *leaf.keys[:end]), leaf.keys[:end]
 
 
 def space_of(space: gym.Space[Any], leaves: Sequence[Leaf]) -> gym.Space[Any]:

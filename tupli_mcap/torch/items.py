@@ -39,7 +39,7 @@ class ReadItems:
             return ColumnDict(tensors(self.items[index].asdict()))
         if self._limited_in != os.getpid():
             self._limited_in = os.getpid()
-            self.items.source.limit(self._worker_cache_bytes, 1)
+            self.items.limit(self._worker_cache_bytes, 1)
         return packed(self.items[index].asdict())
 
 

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import functools
+import operator
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.items import StepItems
-from tupli_mcap.dataset.items.steps import SamplingError, Steps
+from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, Steps, steps_and_fields
 from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
-from tupli_mcap.recording.columns.fields import OTHER_NAMES, OTHER_STEP_NAMES, Parts
+from tupli_mcap.messages.shared_dtypes import field_leaves
+from tupli_mcap.recording.columns.fields import FIELD_OF, Parts, fields_and_parts, split_name, step_name
+from tupli_mcap.spaces.leaves import keys_to
 
 Unit = Literal["steps", "seconds", "clock"]
 UNITS = ("steps", "seconds", "clock")
-KEYS = {
-    "state": "states", "action": "actions", "reward": "rewards", "terminal": "terminals",
-    "timeout": "timeouts", "next_state": "next_states", "time": "times",
-}  # fmt: skip
-_FIELDS = {**KEYS, **{field: field for field in KEYS.values()}, **OTHER_NAMES, **OTHER_STEP_NAMES}
+KEYS = tuple(map(step_name, FIELDS))
 _CLOSEST = 1e-4  # seconds by which a delta may miss a step
 _FARTHEST = 1 << 48  # steps: beyond every episode
 _LONGEST = 1e9  # seconds, 31 years: beyond every episode
@@ -29,8 +29,8 @@ _LONGEST = 1e9  # seconds, 31 years: beyond every episode
 
 @dataclass(frozen=True, repr=False)
 class DeltaWindow(Parts):
-    """Values around one step, or around B steps, by key ("state", "action", …). `window["state"]` is
-    `window.values["state"]`.
+    """Values around one step, or around B steps, by key ("state", "action.grip", …). `window["state"]` is
+    `window.values["state"]`; `window["action.grip"]` is the value of that part alone.
 
     Attributes:
         values: by key, a column of shape (K, ...), or (B, K, ...), where K is the number of the key's deltas; nested as
@@ -55,8 +55,9 @@ class DeltaWindows(StepItems[DeltaWindow]):
     Values come from the step's own episode, and from between the cuts of a tuple filter.
 
     Args:
-        deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time", or the name of the
-            column), the distances from the step: `{"state": [-2, -1, 0], "action": range(16)}`.
+        deltas: by key ("state", "action", "reward", "terminal", "timeout", "next_state", "time", the name of the
+            column, or a part of a Dict, such as "state.arm"), the distances from the step:
+            `{"state.arm": [-2, -1, 0], "state.camera": [0], "action": range(16)}`.
         unit: "steps"; "seconds", where each step takes `step_seconds`; or "clock", seconds by the recorded times: the
             step with the nearest time is taken.
         step_seconds: time that a step takes (s).
@@ -64,6 +65,7 @@ class DeltaWindows(StepItems[DeltaWindow]):
     Raises:
         SamplingError: a key is unknown; a delta is no number, or no whole number of steps (seconds: within 0.1 ms); or
             the time of a step is not known.
+        SpaceError: there is no such part.
     """
 
     def __init__(
@@ -84,6 +86,16 @@ class DeltaWindows(StepItems[DeltaWindow]):
         self.deltas = given if unit == "clock" else _in_steps(given, unit, step_seconds)
         self._lasts = steps.breaks
         self._firsts = np.concatenate([[0], self._lasts[:-1] + 1])
+        self.source = _with_parts(steps, list(given))
+        alike: dict[bytes, list[str]] = {}
+        for key, values in self.deltas.items():
+            alike.setdefault(values.tobytes(), []).append(key)
+        self._together = [_Together.of(steps, self.deltas[keys[0]], keys) for keys in alike.values()]
+
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        sources = {id(source): source for source in (self.source, *(one.source for one in self._together))}
+        for source in sources.values():
+            source.limit(cache_bytes // len(sources), threads)
 
     def _one(self, item: int) -> DeltaWindow:
         return self._read(np.array([item]), single=True)
@@ -94,16 +106,11 @@ class DeltaWindows(StepItems[DeltaWindow]):
     def _read(self, steps: Array, *, single: bool) -> DeltaWindow:
         pieces = self._lasts.searchsorted(steps)
         firsts, lasts = self._firsts[pieces], self._lasts[pieces]
-        together: dict[bytes, list[str]] = {}  # keys with the same deltas are read at once
-        for key, deltas in self.deltas.items():
-            together.setdefault(deltas.tobytes(), []).append(key)
         values: dict[str, Any] = {}
         masks: dict[str, Array] = {}
-        for keys in together.values():
-            rows, mask = self._rows(steps, self.deltas[keys[0]], firsts, lasts)
-            columns = self.source.read(list(dict.fromkeys(_FIELDS[key] for key in keys)), rows.reshape(-1))
-            for key in keys:
-                column = columns[_FIELDS[key]]
+        for together in self._together:
+            rows, mask = self._rows(steps, together.deltas, firsts, lasts)
+            for key, column in together.read(rows.reshape(-1)).items():
                 values[key] = column if single else shaped_rows(column, rows.shape)
                 masks[key] = mask[0] if single else mask
         episodes = self._episodes(steps)
@@ -143,13 +150,46 @@ class DeltaWindows(StepItems[DeltaWindow]):
         return f"<{len(self)} delta windows of {', '.join(self.deltas)}>"
 
 
+class _Together(NamedTuple):
+    """Keys with the same deltas, which are read at once: no image that belongs only to other keys."""
+
+    deltas: Array
+    source: Steps
+    places: dict[str, tuple[str, tuple[Any, ...]]]  # key -> column, and the keys that lead to a part of it
+
+    @classmethod
+    def of(cls, steps: Steps, deltas: Array, keys: Sequence[str]) -> _Together:
+        source, places = _with_parts(steps, keys), {}
+        for key in keys:
+            (field,), parts = fields_and_parts(key, FIELDS, SamplingError)
+            leaves = [] if source.layout is None else field_leaves(field, source.layout) or []
+            places[key] = field, keys_to(parts[0], leaves) if parts else ()
+        return cls(deltas, source, places)
+
+    def read(self, rows: Array) -> dict[str, Any]:
+        columns = self.source.read(list(dict.fromkeys(field for field, _ in self.places.values())), rows)
+        return {
+            key: functools.reduce(operator.getitem, inside, columns[field])
+            for key, (field, inside) in self.places.items()
+        }
+
+
+def _with_parts(steps: Steps, keys: Sequence[str]) -> Steps:
+    """The steps with only those parts of states and actions that keys name. Next states have the parts of states."""
+    named = [split_name(key) for key in keys]
+    fields = [f"{FIELD_OF[word].removeprefix('next_')}{part}" for word, part in named]
+    return steps_and_fields(steps, fields, FIELDS)[0]
+
+
 def _checked_keys(deltas: Mapping[str, Iterable[float]]) -> Mapping[str, Iterable[float]]:
     if not isinstance(deltas, Mapping) or not deltas:
         raise SamplingError(f"expected deltas such as {{'state': [-1, 0]}}, found {deltas!r:.80}")
-    unknown = [key for key in deltas if key not in _FIELDS]
+    unknown = [key for key in deltas if FIELD_OF.get(split_name(str(key))[0]) not in FIELDS]
     if unknown:
         found = f"{', '.join(map(repr, unknown))}{did_you_mean(unknown[0], KEYS)}"
         raise SamplingError(f"expected deltas of {', '.join(KEYS)}, found {found}")
+    for key in deltas:
+        fields_and_parts(key, FIELDS, SamplingError)
     return deltas
 
 

@@ -155,6 +155,10 @@ class Items(ABC, Generic[T]):
             )
         return self._values_of(expression)
 
+    def limit(self, cache_bytes: int, threads: int) -> None:
+        """As `Steps.limit`, of the steps that are read."""
+        self.source.limit(cache_bytes, threads)
+
     def of_episodes(self, values_of: Callable[[F | BaseFilter], Array]) -> Self:
         """Gives these items a function for the values of expressions over their episodes; returns them."""
         self._values_of = values_of
