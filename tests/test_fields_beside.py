@@ -295,6 +295,7 @@ def touching(tmp_path: Path) -> tupli_mcap.Dataset:
         for n in range(4):
             contact = {"left": np.array([n, 0.5]), "right": {"grip": n > 1}}
             said = {"contact": contact, "grid": np.full((1, 2), n, np.int32), "a.b": n, "texts": {"x": "y"}}
+            said |= {"ids": np.array([2**60 + n, 0]), "on": np.array([n > 0, False])}
             ragged = {"ragged": np.zeros(n + 1), "list": [[n], [n, n]]}
             writer.step(box.sample(), box.sample(), 1.0, info={**said, **ragged} if n < 3 else {})
         writer.end(box.sample())
@@ -305,7 +306,8 @@ def test_tables_have_a_column_for_each_number_in_infos(touching: tupli_mcap.Data
     table = touching.to_pandas()
     assert [name for name in table if name.startswith("info")] == [
         "info.contact.left[0]", "info.contact.left[1]", "info.contact.right.grip", "info.grid[0,0]",
-        "info.grid[0,1]", 'info."a.b"', "info.texts", "info.ragged", "info.list",
+        "info.grid[0,1]", 'info."a.b"', "info.texts", "info.ids[0]", "info.ids[1]", "info.on[0]", "info.on[1]",
+        "info.ragged", "info.list",
     ]  # fmt: skip
     np.testing.assert_array_equal(table["info.contact.left[0]"], [0, 1, 2, np.nan])
     grips = table["info.contact.right.grip"]
@@ -315,7 +317,13 @@ def test_tables_have_a_column_for_each_number_in_infos(touching: tupli_mcap.Data
         True,
         None,
     ]
-    assert touching.to_arrow()["info.grid[0,1]"].to_pylist() == [0, 1, 2, None]
+    numbers = {"info.grid[0,1]": [0, 1, 2, None], "info.ids[0]": [2**60, 2**60 + 1, 2**60 + 2, None]}
+    numbers["info.on[0]"] = [False, True, True, None]
+    for name, dtype in zip(numbers, ("Int32", "Int64", "boolean"), strict=True):
+        assert table[name].dtype == dtype
+        assert table[name].to_numpy(object, na_value=None).tolist() == numbers[name]
+        assert touching.to_arrow()[name].to_pylist() == numbers[name]
+    assert touching.to_arrow()["info.grid[0,1]"].type == "int32"
     assert table["info.texts"][0] == {"x": "y"} and table["info.ragged"][1].shape == (2,)
     assert touching.to_arrow()["info.list"].to_pylist()[1] == [[1], [1, 1]]
 

@@ -63,7 +63,8 @@ def columns_in(infos: Sequence[Mapping[Any, Any]], most: int) -> Iterator[tuple[
     """The key, name and values of each column of infos: `("x", "info.x", [3, None])`, with None where there is none.
 
     If an info is always an array of at most `most` numbers, of one shape, or a dict of about as many in those and by
-    themselves, each has a column: `info.contact.left[0]`; those in arrays are arrays, masked where there is none.
+    themselves, each has a column: `info.contact.left[0]`; those in arrays are arrays of their dtype, masked where there
+    is none.
     """
     for key in dict.fromkeys(key for info in infos for key in info):
         name, values = name_within("info", key), [info.get(key) for info in infos]
@@ -84,13 +85,13 @@ def _numbers_within(name: str, values: list[Any], most: int) -> dict[str, Any] |
             columns |= parts
         return columns
     if given and all(isinstance(value, np.ndarray) for value in given):
-        column = info_column(values)
+        column = info_column(given)
         if isinstance(column, list) or not 0 < column[0].size <= most:
             return None
         flat = column.reshape(len(column), column[0].size)
         if len(given) < len(values):
-            flat = np.ma.masked_array(flat)
-            flat[[value is None for value in values]] = np.ma.masked
+            there, flat = flat, np.ma.masked_array(np.zeros((len(values), flat.shape[1]), flat.dtype), True)
+            flat[[value is not None for value in values]] = there
         names = indexed_names(name, column.shape[1:], np.arange(column[0].size))
         return {own: flat[:, i] for i, own in enumerate(names)}
     return {name: values} if given and all(isinstance(value, _NUMBER) for value in given) else None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.arrays import are_floats
+from tupli_mcap.arrays import Array, are_floats
 from tupli_mcap.dataset.columns.convert import import_pandas
 from tupli_mcap.dataset.sources import DatasetError, Episodes
 from tupli_mcap.errors import missing_extra
@@ -157,9 +157,18 @@ def _column(values: list[Any]) -> Any:
 
 def _info_columns(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
-        name: values if isinstance(values, np.ndarray) else _column(values)
+        name: _with_gaps(values) if isinstance(values, np.ndarray) else _column(values)
         for _, name, values in columns_in(infos, _MOST_COLUMNS)
     }
+
+
+def _with_gaps(values: Array) -> Any:
+    """An array; with pandas' nullable dtype if it is one of integers or flags that some steps lack."""
+    if not isinstance(values, np.ma.MaskedArray) or values.dtype.kind == "f":
+        return values
+    column = import_pandas().array(values.filled(0))
+    column[np.ma.getmaskarray(values)] = import_pandas().NA
+    return column
 
 
 def _floats(values: Sequence[Any]) -> Any:
