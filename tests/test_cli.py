@@ -1393,7 +1393,7 @@ class TestSharing:
             env.reset()
             env.step(0)
         ok("bundle", "bare.mcap", "-o", "c.mcap")
-        assert fails("import", "c.mcap", "--storage", "lab").startswith("'c.mcap' carries no environment")
+        assert ok("import", "c.mcap", "--storage", "lab") == "imported 1 of 1 episode, 0 of 0 artifacts\n"
 
     def test_artifacts_come_along(self, here: Path) -> None:
         from tupli_mcap.environment import capture
@@ -1451,9 +1451,20 @@ class TestSharing:
         line = fails("import", "b.mcap", "--storage", "file/storage")
         assert line.startswith(f"cannot use the storage '{Path('file/storage').absolute()}': ")
 
-    def test_a_plain_recording_is_no_bundle(self, here: Path, cartpole: Path) -> None:
-        line = fails("import", cartpole, "--storage", "lab")
-        assert "recorded outside a storage; make a bundle of it (tupli-mcap bundle), or copy it into" in line
+    def test_a_recording_without_a_benchmark(self, here: Path, cartpole: Path) -> None:
+        with Recording(cartpole) as recording:
+            episodes = len(recording)
+        told = [
+            run("import", cartpole, "--storage", "lab", *words, "--json").json
+            for words in (["--dry-run"], [], [])
+        ]
+        assert [one["new_episodes"] for one in told] == [episodes, episodes, 0]
+        assert {(one["benchmark_id"], one["name"]) for one in told} == {("", "")}
+        assert [path.name for path in Path("lab/recordings").glob("*.mcap")] == [cartpole.name]
+        assert (
+            len(run("list-episodes", "--storage", "lab", "--filter", "benchmark_id = ''", "--json").json)
+            == episodes
+        )
 
     def test_trust(self, lab: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
         (path,) = Path("lab/recordings", lab[2]).glob("*.mcap")

@@ -53,7 +53,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import FileStorage, TupliAPIClient, TupliStorage, TupliStorageError
 from tupli_mcap.storage.benchmark_json import BenchmarkContent, benchmark_hash, facts_about, pack, unpack
-from tupli_mcap.storage.bundles import bundle_recording
+from tupli_mcap.storage.bundles import bundle_recording, preview_import
 from tupli_mcap.storage.catalog import database, entries
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
@@ -62,6 +62,7 @@ from tupli_mcap.storage.from_values import conform, infer_space
 from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.storage.verify import verify_paths
 from tupli_mcap.wrappers import RecordEpisodes
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 BAD_IDS = [
     "",
@@ -906,11 +907,58 @@ class TestFileStorage(StorageContract):
         with pytest.raises(NotFoundError, match="there is no artifact"):
             storage.bundle(benchmark, tmp_path / "none.mcap")
         assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["all.mcap"]
-        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "plain.mcap") as env:
+        with RecordEpisodes(
+            gym.make("CartPole-v1"), tmp_path / "bare.mcap", benchmark_id=benchmark, attachments={}
+        ) as env:
             env.reset()
             env.step(0)
-        with pytest.raises(StorageError, match="recorded outside a storage"):
-            storage.import_bundle(tmp_path / "plain.mcap")
+        before = storage.list_episodes()
+        with pytest.raises(StorageError, match="names a benchmark, but carries no environment"):
+            storage.import_bundle(tmp_path / "bare.mcap")
+        assert storage.list_episodes() == before
+
+    @pytest.mark.parametrize("carries_environment", [True, False])
+    def test_a_recording_without_a_benchmark_is_imported_without_one(
+        self, storage: FileStorage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, carries_environment: bool
+    ) -> None:
+        path = tmp_path / "run.mcap"
+        if carries_environment:
+            with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+                for seed in range(3):
+                    env.reset(seed=seed, options={})
+                    env.step(0)
+        else:
+            with EpisodeWriter(path, spaces.Box(-1, 1, (2,)), spaces.Discrete(2)) as writer:
+                for score in range(3):
+                    writer.begin(metadata={"score": score})
+                    writer.step(np.zeros(2, np.float32), 0, 1.0)
+                    writer.end(np.ones(2, np.float32))
+        with Recording(path) as recording:
+            ids = [f"{recording.uuid}-{n}" for n in range(3)]
+            rewards = recording.read().rewards
+        assert preview_import(storage, path)._replace(episodes=0) == ("", "", 0, 3, 0, 0)
+        monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "somebody else"))
+        for _ in range(2):
+            assert storage.import_bundle(path, trust=True) == ""
+            assert [header.id for header in storage.list_episodes(F("benchmark_id") == "")] == ids
+        assert [one.name for one in (storage.root / "recordings").glob("*.mcap")] == ["run.mcap"]
+        dataset = tupli_mcap.open(storage.root)
+        assert (dataset.read().rewards == rewards).all() and storage.list_benchmarks() == []
+        if carries_environment:
+            with Recording(storage.root / "recordings" / "run.mcap") as recording:
+                recording.benchmark.make_env().close()  # it is trusted
+        # what was deleted stays so; another file of the same name goes beside it
+        storage.delete_episode(ids[1])
+        with pytest.warns(UserWarning, match="not copied: 1 episode that had been deleted there"):
+            storage.import_bundle(path)
+        assert [header.id for header in storage.list_episodes()] == [ids[0], ids[2]]
+        record_rollouts("CartPole-v1", tmp_path / "other" / "run.mcap", episodes=1)
+        storage.import_bundle(tmp_path / "other" / "run.mcap")
+        record_rollouts("CartPole-v1", tmp_path / "third.mcap", episodes=1)
+        storage.import_bundle((tmp_path / "third.mcap").rename(tmp_path / "third"))
+        assert {header.recording for header in storage.list_episodes()} == {
+            f"recordings/{name}.mcap" for name in ("run", "run-2", "third")
+        }
 
     def test_another_name_is_shown_and_the_benchmark_stays_the_same(
         self, storage: FileStorage, tmp_path: Path
@@ -964,8 +1012,7 @@ class TestFileStorage(StorageContract):
         bundle_recording(tmp_path / "robot.mcap", tmp_path / "copy.mcap")
         with Recording(tmp_path / "copy.mcap") as copy:
             assert (copy.benchmark_id, len(copy)) == ("", 1)
-        with pytest.raises(StorageError, match="carries no environment"):
-            storage.import_bundle(tmp_path / "copy.mcap")
+        assert storage.import_bundle(tmp_path / "copy.mcap") == ""
 
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -36,7 +34,7 @@ from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
-from tupli_mcap.storage.bundles.read import deleted_beside, say_what_was_deleted
+from tupli_mcap.storage.bundles.read import deleted_beside, place_for, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
@@ -161,10 +159,11 @@ def _copy_recording(
             with progress(path.stat().st_size, f"sending {place}", in_bytes=True) as bar:
                 sent = target.send(path, bar.advance, file_name(name))
             return _stored(target, sent.name)
-        if uri or not isinstance(target, FileStorage):
-            goal = target.new_recording_path(uri)
-        else:
-            goal = _unused(target.root / "recordings" / name.rpartition("/")[2])
+        goal = (
+            place_for(target, uri, name)
+            if isinstance(target, FileStorage)
+            else target.new_recording_path(uri)
+        )
         with os_errors("cannot write", goal), fill(goal) as new:
             shutil.copyfile(path, new)
         target.ingest(goal)
@@ -174,12 +173,6 @@ def _copy_recording(
 def _stored(client: TupliAPIClient, name: str) -> int:
     """How many episodes of a recording a server has: those that were deleted there are not stored again."""
     return client.count_episodes(FilterEQ(key="recording", value=name))
-
-
-def _unused(path: Path) -> Path:
-    """A path like this one, at which there is nothing: `run.mcap`, `run-2.mcap`, …"""
-    others = (path.with_name(f"{path.stem}-{number}.mcap") for number in itertools.count(2))
-    return next(each for each in itertools.chain([path], others) if not os.path.lexists(each))
 
 
 @contextlib.contextmanager

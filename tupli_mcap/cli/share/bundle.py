@@ -127,11 +127,13 @@ def import_(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Copy a bundle into a storage.
+    """Copy a recording into a storage.
 
-    A missing storage is created. Importing a file twice changes nothing, and what was deleted
-    from the storage stays deleted until restore brings it back. Nothing in the file is
-    executed. If a key that you trust has signed it, its environment may be rebuilt later.
+    A bundle brings its benchmark and artifacts. A recording that has no benchmark is stored
+    without one; bundle makes one of the environment that it carries. A missing storage is
+    created. Importing a file twice changes nothing, and what was deleted from the storage
+    stays deleted until restore brings it back. Nothing in the file is executed. If a key that
+    you trust has signed it, its environment may be rebuilt later.
     """
     from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key
@@ -148,7 +150,7 @@ def import_(
         with open_storage(storage_path, create=True) as storage:
             preview = preview_import(storage, path)
             if not dry_run:
-                storage.import_bundle(path, trust=trust, require_signature=required, signers=keys)
+                storage.import_bundle(path, trust=trust, require_signature=required, signers=keys, name=file)
     if as_json:
         print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})
         return
@@ -158,7 +160,9 @@ def import_(
         f"{number(preview.new_artifacts)} of {counted(preview.artifacts, 'artifact')}"
     )
     signer = [("signed by", signed_by)] if signed_by is not None else []
-    print_facts([("benchmark", preview.benchmark_id), ("name", preview.name), *signer])
+    about = [("benchmark", preview.benchmark_id), ("name", preview.name)] if preview.benchmark_id else []
+    if about or signer:
+        print_facts([*about, *signer])
 
 
 def _signing_key(path: Path) -> SigningKey:

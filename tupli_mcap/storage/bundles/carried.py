@@ -31,8 +31,8 @@ def carried_environment(recording: Recording, path: Path) -> EnvironmentRecord:
     """The environment that a recording carries; raises StorageError if there is none, FormatError if it is damaged."""
     if DOCUMENT_NAME not in recording.attachments:
         raise StorageError(
-            f"{str(path)!r} carries no environment ({DOCUMENT_NAME}), so it has no benchmark to import; "
-            "copy it into the storage's directory, where its episodes are found (tupli-mcap verify checks it before)"
+            f"{str(path)!r} names a benchmark, but carries no environment ({DOCUMENT_NAME}); ask for a bundle, or copy "
+            "it into the storage's directory, where its episodes are found (tupli-mcap verify checks it before)"
         )
     return recording.benchmark.record
 
@@ -56,8 +56,8 @@ def carried_benchmark(
 def _header(record: EnvironmentRecord, path: Path) -> BenchmarkHeader:
     if not (record.benchmark or {}).get("id"):
         raise StorageError(
-            f"{str(path)!r} carries an environment, but no benchmark: it was recorded outside a storage; make a bundle "
-            "of it (tupli-mcap bundle), or copy it into the storage's directory, where its episodes are found"
+            f"{str(path)!r} names a benchmark, but carries only an environment ({DOCUMENT_NAME}); ask for a bundle, or "
+            "copy it into the storage's directory, where its episodes are found"
         )
     try:
         return header_of(record.benchmark)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from tupli_mcap import trust as _trust
+from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, StorageError, plural, warn
 from tupli_mcap.files import create
 from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.sign.sign import episodes_alike
-from tupli_mcap.schema import EpisodeHeader, FilterEQ, FilterIN
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkQuery, EpisodeHeader, FilterEQ, FilterIN
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import artifacts_of
-from tupli_mcap.storage.bundles.carried import carried_artifacts, carried_benchmark, checked_signature
+from tupli_mcap.storage.bundles.carried import (
+    carried_artifacts,
+    carried_benchmark,
+    carried_environment,
+    checked_signature,
+)
 
 if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
@@ -25,7 +33,7 @@ _PIECE = 1 << 22
 
 
 class ImportPreview(NamedTuple):
-    """The contents of a file, and how much of it a storage lacks."""
+    """The contents of a file, and how much of it a storage lacks; without a benchmark, its id and name are empty."""
 
     benchmark_id: str
     name: str
@@ -42,8 +50,10 @@ def read_bundle(
     trust: bool = False,
     require_signature: bool = False,
     signers: Sequence[str] = (),
+    name: str = "",
 ) -> str:
-    """Import a recording with its benchmark and artifacts into a storage; returns the benchmark's id.
+    """Import a recording, with its benchmark and artifacts if it has a benchmark, into a storage; returns the
+    benchmark's id, or an empty text.
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
     needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
@@ -52,36 +62,38 @@ def read_bundle(
 
     require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
         else by a key that this user trusts.
+    name: its path or URL, where `path` is a copy.
 
     Raises:
         SignatureError: A signature is required, and missing, not fitting, or of another key.
         FormatError: The file is damaged, or its contents are not what its benchmark says.
-        StorageError: It carries no benchmark, or lacks an artifact; or the storage holds episodes of this recording
-            already, with other contents.
+        StorageError: It lacks its benchmark, or an artifact; or the storage holds episodes of this recording already,
+            with other contents.
     """
     with Recording(path) as recording:  # what is refused leaves nothing behind
         signature = checked_signature(recording, require_signature, signers)
-        record, header, query = carried_benchmark(recording, path)
+        carried = _Carried.by(recording, path, storage)
         say_what_was_deleted(_missing(storage, recording)[1], storage.root)
-        for data, metadata in carried_artifacts(recording, record, path, storage):
+        for data, metadata in carried.artifacts:
             storage.store_artifact(data, metadata)
-        if trust:
-            _trust.trust(record.digest)
-        elif signature is not None and signature.trusted:
-            _trust.vouch(record.digest, signature.public_key)
+        if carried.digest and trust:
+            _trust.trust(carried.digest)
+        elif carried.digest and signature is not None and signature.trusted:
+            _trust.vouch(carried.digest, signature.public_key)
         with storage.import_lock:
-            storage.store_benchmark(query)
+            if carried.query is not None:
+                storage.store_benchmark(carried.query)
 
             def check(copy: Recording) -> None:
                 if require_signature:
                     checked_signature(copy, True, signers)
-                if carried_benchmark(copy, path)[1].id != header.id:
+                if _Carried.by(copy, path, storage).benchmark_id != carried.benchmark_id:
                     raise FormatError(
                         f"{path} was replaced by another bundle while it was imported; import that"
                     )
 
-            _copy(storage, recording, header.id, check)
-    return header.id
+            _copy(storage, recording, place_for(storage, carried.benchmark_id, name or str(path)), check)
+    return carried.benchmark_id
 
 
 def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
@@ -90,21 +102,56 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
     `storage` None stands for an empty one.
     """
     with Recording(path) as recording:
-        record, header, _ = carried_benchmark(recording, path)
-        artifacts = artifacts_of(record, str(path))
-        carried_artifacts(recording, record, path, storage)
+        carried = _Carried.by(recording, path, storage)
         stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
         missing, deleted = _missing(storage, recording)
         if storage is not None:
             say_what_was_deleted(deleted, storage.root)
         return ImportPreview(
-            benchmark_id=header.id,
-            name=header.metadata.name,
+            benchmark_id=carried.benchmark_id,
+            name="" if carried.query is None else carried.query.metadata.name,
             episodes=len(recording),
             new_episodes=len(missing),
-            artifacts=len(artifacts),
-            new_artifacts=len(set(artifacts) - stored),
+            artifacts=len(carried.needed),
+            new_artifacts=len(set(carried.needed) - stored),
         )
+
+
+class _Carried(NamedTuple):
+    """What a file brings besides its episodes; all of it is empty if it carries no environment, and all but the digest
+    if it has no benchmark.
+
+    Attributes:
+        digest: of its environment.
+        needed: the ids of the artifacts that its benchmark needs, of which the file carries `artifacts`.
+    """
+
+    digest: str = ""
+    benchmark_id: str = ""
+    query: BenchmarkQuery | None = None
+    needed: Sequence[str] = ()
+    artifacts: Sequence[tuple[bytes, ArtifactMetadata]] = ()
+
+    @classmethod
+    def by(cls, recording: Recording, path: Path, storage: FileStorage | None) -> _Carried:
+        if recording.benchmark_id:
+            record, header, query = carried_benchmark(recording, path)
+            artifacts = carried_artifacts(recording, record, path, storage)
+            return cls(record.digest, header.id, query, artifacts_of(record, str(path)), artifacts)
+        has_environment = DOCUMENT_NAME in recording.attachments
+        return cls(carried_environment(recording, path).digest) if has_environment else cls()
+
+
+def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
+    """An unused path for a recording that is copied into a storage from a path or a URL; without a benchmark, it keeps
+    its file's name: `run.mcap`, or `run-2.mcap`."""
+    if benchmark_id:
+        return storage.new_recording_path(benchmark_id)
+    place, stem = storage.root / "recordings", file_name(name).removesuffix(".mcap") or "recording"
+    others = (place / f"{stem}-{number}.mcap" for number in itertools.count(2))
+    return next(
+        each for each in itertools.chain([place / f"{stem}.mcap"], others) if not os.path.lexists(each)
+    )
 
 
 def deleted_beside(storage: FileStorage, held: Iterable[EpisodeHeader]) -> set[str]:
@@ -162,14 +209,13 @@ class _NothingNewError(Exception):
 
 
 def _copy(
-    storage: FileStorage, recording: Recording, benchmark_id: str, check: Callable[[Recording], None]
+    storage: FileStorage, recording: Recording, target: Path, check: Callable[[Recording], None]
 ) -> None:
-    """Copy the episodes that the storage does not hold yet.
+    """Copy the episodes that the storage does not hold yet into a new file of it.
 
     Others may change the file at any time. So it is copied to where nobody else can write: `check` is called with the
     copy, and the copy goes into the storage.
     """
-    target = storage.new_recording_path(benchmark_id)
     try:
         with os_errors("cannot import", target), fill(target) as new:
             if recording.complete:

@@ -335,10 +335,12 @@ class FileStorage(TupliStorage):
         trust: bool = False,
         require_signature: bool = False,
         signers: Sequence[str] = (),
+        name: str = "",
     ) -> str:
-        """Import a file that `bundle` wrote, see `read_bundle`; returns the benchmark's id."""
+        """Import a file that `bundle` wrote, or any other recording, see `read_bundle`; returns the benchmark's id,
+        or an empty text if it has none."""
         return read_bundle(
-            self, Path(path), trust=trust, require_signature=require_signature, signers=signers
+            self, Path(path), trust=trust, require_signature=require_signature, signers=signers, name=name
         )
 
     def _settings(self) -> _Settings:
