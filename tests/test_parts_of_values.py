@@ -14,6 +14,7 @@ import pytest
 import tupli_mcap
 from tupli_mcap import EpisodeWriter, SpaceError, TupliError
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.columns import statistics
 from tupli_mcap.dataset.items import RecordedSteps
 
 ARM = gym.spaces.Dict({"q": gym.spaces.Box(-9, 9, (2,)), "v.x": gym.spaces.Box(-9, 9, (3,), np.float32)})
@@ -127,6 +128,47 @@ def test_statistics_read_no_image(tmp_path: Path) -> None:
     assert list(dataset.stats(["states"])) == ["state.arm.q", 'state.arm."v.x"']
     with pytest.raises(TupliError, match="damaged"):
         dataset.read(["states"])
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_statistics_of_an_image_that_is_named(
+    tmp_path: Path, channels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = gym.spaces.Box(0, 255, (6, 4, channels), np.uint8)
+    record(
+        tmp_path / "r.mcap", gym.spaces.Dict({"arm": ARM, "camera": camera, "t": NESTED["t"]}), [5, 4, 1], 0
+    )
+    monkeypatch.setattr(statistics, "_IMAGES", 3 * 6 * 4 * channels)  # in several blocks
+    dataset = tupli_mcap.open(tmp_path)
+    found = dataset.stats(["state.camera", "next_states.camera", "state.t[1]", "state.arm.q"])
+    assert list(found) == ["state.camera", "next_state.camera", "state.t[1]", "state.arm.q"]
+    whole = dataset.read(["states", "next_states"])
+    for name, images in {
+        "states.camera": whole.states["camera"],
+        "next_state.camera": whole.next_states["camera"],
+        "observations.t[1]": whole.states["t"][1],
+    }.items():
+        of, pixels = found[name], images.astype(float)
+        assert (of.count == images[..., 0].size).all()
+        for own, expected in {
+            "mean": pixels.mean, "std": pixels.std, "min": pixels.min, "max": pixels.max,
+        }.items():  # fmt: skip
+            np.testing.assert_allclose(getattr(of, own), expected(axis=(0, 1, 2))[None, None])
+        for q, values in of.quantiles.items():
+            np.testing.assert_allclose(values, np.quantile(pixels, q, axis=(0, 1, 2))[None, None])
+        scaled = (images - of.mean) / of.std
+        assert scaled.shape == images.shape and abs(scaled.mean()) < 1e-9
+    assert "state.camera" not in dataset.stats() and "state.camera" not in dataset.stats(["states"])
+
+
+def test_statistics_of_states_that_are_images(tmp_path: Path) -> None:
+    record(tmp_path / "r.mcap", CAMERA, [5, 1], 0)
+    dataset = tupli_mcap.open(tmp_path)
+    assert list(dataset.stats()) == ["action.grip", "action.move", "reward"]
+    for name in ("state", "observations"):
+        assert dataset.stats([name])["states"].mean.shape == (1, 1, 3)
+    with pytest.raises(TupliError, match="expected steps to take statistics of, found none"):
+        dataset.head(0).stats(["state"])
 
 
 def test_what_a_loader_gives(runs: Path) -> None:

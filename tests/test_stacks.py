@@ -18,7 +18,14 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 
-from tupli_mcap import FormatError, RecordEpisodes, Recording, TupliDataset, jsonvalue
+from tupli_mcap import (
+    FormatError,
+    RecordEpisodes,
+    Recording,
+    TupliDataset,
+    jsonvalue,
+    open as open_recordings,
+)
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.journal.committed import even_rows
@@ -143,6 +150,21 @@ def pictures(path: Path) -> list[Array]:
             else:
                 found.append(np.frombuffer(data, np.uint8).reshape(image.height, image.step))
     return found
+
+
+@BOTH
+@pytest.mark.parametrize("shape", [(H, W), (H, W, 3)])
+def test_statistics_of_a_stack_are_those_of_its_channels(
+    tmp_path: Path, placed: Any, shape: tuple[int, ...]
+) -> None:
+    states, _ = record(placed(FrameStackObservation(Screen(shape), 4)), tmp_path / "r.mcap", 30)
+    found = open_recordings(tmp_path).stats(["states"])["state"]
+    whole = np.stack(states)
+    channel = (-2 if placed is frames_last else -1) % whole.ndim if len(shape) == 3 else None
+    axes = tuple(axis for axis in range(whole.ndim) if axis != channel)
+    for name, of in {"mean": np.mean, "std": np.std, "min": np.min, "max": np.max}.items():
+        np.testing.assert_allclose(getattr(found, name), of(whole, axis=axes, keepdims=True)[0])
+    assert (found.count == whole.size // found.count.size).all()
 
 
 @pytest.mark.sampled(5, keep=["raw-frames_last-reset-shape0"])

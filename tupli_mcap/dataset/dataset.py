@@ -27,8 +27,10 @@ from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.statistics import (
     STATISTICAL,
     FieldStatistics,
+    images_of,
     part_of,
     statistics_of,
+    statistics_of_image,
     statistics_of_infos,
 )
 from tupli_mcap.dataset.items import ListedEpisodes, RecordedSteps, Steps
@@ -56,6 +58,7 @@ from tupli_mcap.recording.columns.fields import (
     field_names,
     fields_and_parts,
     split_name,
+    step_name,
 )
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
@@ -507,33 +510,38 @@ class Dataset(RandomAccess):
             remote=any(map(is_url, {header.recording for header in self.headers})),
         )
 
-    def stats(
-        self, fields: Sequence[str] = ("states", "actions", "rewards")
-    ) -> Mapping[str, FieldStatistics]:
+    def stats(self, fields: Sequence[str] | None = None) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf by name: `state`, or `state.arm`; `action`, `reward`.
 
         The names of columns (`states.arm`) and Gymnasium's find them, too. Steps are read once, one block after the
-        other, and the result is kept. Images, and leaves of variable size (texts, graphs), have no statistics.
+        other, and the result is kept. Leaves of variable size (texts, graphs) have no statistics. An image has those of
+        its channels, only if it is named itself ("state.camera"; "state" if states are images): it is decoded for them.
 
         Args:
             fields: of states, actions, rewards, next_states, infos; also a part of one, such as "state.arm" or
-                "info.contact.left". Infos are all read into memory; steps without an info do not count.
+                "info.contact.left". Infos are all read into memory; steps without an info do not count. By default,
+                states, actions and rewards, without images.
 
         Raises:
             DatasetError: a field has no numbers, or there is no step.
             SamplingError: no step has such an info.
             SpaceError: one array cannot hold a field of two of the recordings.
         """
-        keys, given = info_keys(fields)
+        keys, given = info_keys(("states", "actions", "rewards") if fields is None else fields)
         parts = [split_name(name) if isinstance(name, str) else (name, "") for name in given]
         names = field_names([word for word, _ in parts], (*STATISTICAL, INFOS), DatasetError)
-        if missing := [name for name in names if name not in self._stats]:
+        images = {} if fields is None else images_of(self.steps, names)
+        wanted = {f"{step_name(FIELD_OF[word])}{part}": (FIELD_OF[word], part) for word, part in parts}
+        numbers = {field: None for name, (field, _) in wanted.items() if name not in images}
+        if missing := [field for field in numbers if field not in self._stats]:
             self._stats |= statistics_of(self.steps, missing)
+        if missing := [name for name in wanted if name in images and name not in self._stats]:
+            self._stats |= {name: {name: statistics_of_image(self.steps, *images[name])} for name in missing}
         if missing := [key for key in keys if f"info.{key}" not in self._stats]:
             self._stats |= statistics_of_infos(self.steps, self._infos(), missing)
         found: dict[str, Any] = {}
-        for word, part in parts:
-            found |= part_of(FIELD_OF[word], part, self._stats[FIELD_OF[word]])
+        for name, (field, part) in wanted.items():
+            found |= self._stats[name] if name in images else part_of(field, part, self._stats[field])
         for key in keys:
             found |= self._stats[f"info.{key}"]
         return ColumnDict(found)

@@ -73,10 +73,9 @@ class DatasetVerbs(SaysWhatIsMeant):
         """A PyTorch `DataLoader` of windows of `length` steps, or of transitions."""
         return self.dataset.loader(length, **chosen)
 
-    def stats(
-        self, fields: Sequence[str] = ("states", "actions", "rewards")
-    ) -> Mapping[str, FieldStatistics]:
-        """Count, mean, std, min, max and quantiles of each leaf, or info: `stats(["states", "info.force"])`."""
+    def stats(self, fields: Sequence[str] | None = None) -> Mapping[str, FieldStatistics]:
+        """Count, mean, std, min, max and quantiles of each leaf, or info: `stats(["states", "info.force"])`; of the
+        channels of an image that is named: `stats(["state.camera"])`."""
         return self.dataset.stats(fields)
 
     def to_pandas(self, level: Level = "steps") -> pd.DataFrame:

@@ -27,17 +27,20 @@ STATISTICAL = ("states", "actions", "rewards", "next_states")
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 _SAMPLED = 1 << 16  # steps that quantiles are computed from, at even distances
 _BLOCK = 1 << 16  # steps
+_IMAGES = 8 << 20  # bytes of images in memory at once
 
 
 @dataclass(frozen=True, repr=False)
 class FieldStatistics:
-    """Statistics of a leaf; each array has the leaf's shape.
+    """Statistics of a leaf; each array has the leaf's shape. Those of an image are of all pixels of each channel: the
+    other axes have the length 1, so that `(images - mean) / std` fits.
 
     Attributes:
         count: number of finite values (int64).
         mean, std: float64; the standard deviation is that of the population.
         min, max: of the finite values.
-        quantiles: by fraction (0.5 is the median); exact up to 65,536 steps, else of 65,536 steps at even distances.
+        quantiles: by fraction (0.5 is the median); exact for images and up to 65,536 steps, else of 65,536 steps at
+            even distances.
     """
 
     count: Array
@@ -71,6 +74,50 @@ def statistics_of(steps: Steps, fields: Sequence[str]) -> dict[str, dict[str, Fi
     ]
     found = _statistics(steps, leaves)
     return {field: {one.name: found[one.name] for one in leaves if one.field == field} for field in fields}
+
+
+def images_of(steps: Steps, fields: Sequence[str]) -> dict[str, tuple[str, Leaf]]:
+    """The field and the leaf of each image in some fields, by name."""
+    layout = _layout_of(steps)
+    return {
+        name_within(step_name(field), *leaf.keys): (field, leaf)
+        for field in fields
+        for leaf in field_leaves(field, layout) or ()
+        if leaf.apart
+    }
+
+
+def statistics_of_image(steps: Steps, field: str, leaf: Leaf) -> FieldStatistics:
+    """The statistics of each channel of an image, or of a stack of them, from how often each value occurs in it."""
+    steps = _only(steps, [leaf])
+    n_channels = leaf.stored_shape[-1] if leaf.kind == "image" or len(leaf.shape) == 4 else 1
+    counts = np.zeros((n_channels, 256), np.int64)
+    block = max(1, _IMAGES // leaf.size)
+    for first in range(0, len(steps), block):
+        column = leaf.get(steps.read([field], np.arange(first, min(first + block, len(steps))))[field])
+        stored = np.moveaxis(column, -1, 1) if leaf.frames_last else column
+        for own, values in zip(counts, stored.reshape(-1, n_channels).T, strict=True):
+            own += np.bincount(values, minlength=256)
+    total, levels = counts.sum(axis=1), np.arange(256)
+    mean = counts @ levels / total
+    variance = (counts * (levels - mean[:, None]) ** 2).sum(axis=1) / total
+
+    def shaped(values: Array) -> Array:
+        found: Array = leaf.as_values(values.reshape(*[1] * (len(leaf.shape) - 1), n_channels))
+        return found
+
+    def ranked(ranks: Array) -> Array:
+        """The values at places (from 0) among the sorted ones of each channel."""
+        found: Array = (counts.cumsum(axis=1) <= ranks[:, None]).sum(axis=1)
+        return found
+
+    quantiles = {}
+    for q in QUANTILES:
+        at = q * (total - 1)
+        low = np.floor(at)
+        quantiles[q] = shaped(ranked(low) + (ranked(np.ceil(at)) - ranked(low)) * (at - low))
+    least, most = (shaped(ranked(ranks).astype(np.float64)) for ranks in (0 * total, total - 1))
+    return FieldStatistics(shaped(total), shaped(mean), shaped(np.sqrt(variance)), least, most, quantiles)
 
 
 def statistics_of_infos(
@@ -116,7 +163,8 @@ def part_of(field: str, part: str, leaves: Mapping[str, FieldStatistics]) -> dic
     }
     if part and not found:
         raise DatasetError(
-            f"expected a part of {field} that has numbers, such as {', '.join(leaves) or 'none'}, found {own!r:.80}"
+            f"expected a part of {field} that has numbers, or the name of an image, such as "
+            f"{', '.join(leaves) or 'none'}, found {own!r:.80}"
             f"{did_you_mean(own, leaves)}"
         )
     return found
@@ -140,7 +188,7 @@ class _Named(NamedTuple):
 def _statistics(steps: Steps, leaves: Sequence[_Named]) -> dict[str, FieldStatistics]:
     """The statistics of leaves, by their names."""
     steps, total, fields = (
-        _without_images(steps, leaves),
+        _only(steps, [one.leaf for one in leaves if one.field in ("states", "next_states", "actions")]),
         len(steps),
         list(dict.fromkeys(one.field for one in leaves)),
     )
@@ -158,13 +206,11 @@ def _statistics(steps: Steps, leaves: Sequence[_Named]) -> dict[str, FieldStatis
     return {name: _of(leaf, known[name], np.concatenate(samples[name])) for name, _, leaf, _ in leaves}
 
 
-def _without_images(steps: Steps, leaves: Sequence[_Named]) -> Steps:
-    """The steps with only those parts of states and actions that have leaves, so that images beside them are not read;
-    with all, where an image is in a Tuple, of which no part can be read alone."""
+def _only(steps: Steps, leaves: Sequence[Leaf]) -> Steps:
+    """The steps with only these leaves of states and actions, so that images beside them are not read; with all, where
+    one is in a Tuple, of which no part can be read alone."""
     with contextlib.suppress(SpaceError):
-        return steps.only(
-            [one.leaf.path for one in leaves if one.field in ("states", "next_states", "actions")]
-        )
+        return steps.only([leaf.path for leaf in leaves])
     return steps
 
 
