@@ -35,6 +35,7 @@ from tupli_mcap.errors import (
     FilterError,
     FormatError,
     NotFoundError,
+    RecordingError,
     SpaceError,
     StorageError,
     TupliError,
@@ -947,11 +948,25 @@ class TestFileStorage(StorageContract):
         if carries_environment:
             with Recording(storage.root / "recordings" / "run.mcap") as recording:
                 recording.benchmark.make_env().close()  # it is trusted
-        # what was deleted stays so; another file of the same name goes beside it
+        # what was deleted beside the file is left out
+        tupli_mcap.open(path).filter(F("id") == ids[2]).delete()
+        with FileStorage(tmp_path / "second") as second:
+            assert preview_import(second, path)[2:4] == (2, 2)
+            second.import_bundle(path)
+            assert [header.id for header in second.list_episodes()] == ids[:2]
+        # what was deleted in the storage stays so; another file of the same name goes beside it
         storage.delete_episode(ids[1])
         with pytest.warns(UserWarning, match="not copied: 1 episode that had been deleted there"):
             storage.import_bundle(path)
         assert [header.id for header in storage.list_episodes()] == [ids[0], ids[2]]
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap") as env:
+            env.reset()
+            env.step(0)
+            for use in (storage.import_bundle, lambda live: preview_import(storage, live)):
+                with pytest.raises(
+                    RecordingError, match="is being recorded; import it when its writer has closed it"
+                ):
+                    use(tmp_path / "live.mcap")
         record_rollouts("CartPole-v1", tmp_path / "other" / "run.mcap", episodes=1)
         storage.import_bundle(tmp_path / "other" / "run.mcap")
         record_rollouts("CartPole-v1", tmp_path / "third.mcap", episodes=1)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from tupli_mcap import trust as _trust
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import FormatError, StorageError, plural, warn
+from tupli_mcap.errors import FormatError, RecordingError, StorageError, plural, warn
 from tupli_mcap.files import create
+from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.sign.sign import episodes_alike
@@ -25,6 +26,7 @@ from tupli_mcap.storage.bundles.carried import (
     carried_environment,
     checked_signature,
 )
+from tupli_mcap.storage.sidecar import Notes
 
 if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
@@ -57,8 +59,8 @@ def read_bundle(
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
     needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
-    file twice changes nothing. Episodes that were deleted in the storage, and can be restored there, stay deleted; a
-    warning says how many.
+    file twice changes nothing. Episodes that were deleted beside the file are left out. Those that were deleted in the
+    storage, and can be restored there, stay deleted; a warning says how many.
 
     require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
         else by a key that this user trusts.
@@ -67,13 +69,15 @@ def read_bundle(
     Raises:
         SignatureError: A signature is required, and missing, not fitting, or of another key.
         FormatError: The file is damaged, or its contents are not what its benchmark says.
+        RecordingError: It is being recorded.
         StorageError: It lacks its benchmark, or an artifact; or the storage holds episodes of this recording already,
             with other contents.
     """
     with Recording(path) as recording:  # what is refused leaves nothing behind
+        deleted = _deleted_beside(recording, path)
         signature = checked_signature(recording, require_signature, signers)
         carried = _Carried.by(recording, path, storage)
-        say_what_was_deleted(_missing(storage, recording)[1], storage.root)
+        say_what_was_deleted(_missing(storage, recording, deleted)[1], storage.root)
         for data, metadata in carried.artifacts:
             storage.store_artifact(data, metadata)
         if carried.digest and trust:
@@ -92,7 +96,8 @@ def read_bundle(
                         f"{path} was replaced by another bundle while it was imported; import that"
                     )
 
-            _copy(storage, recording, place_for(storage, carried.benchmark_id, name or str(path)), check)
+            target = place_for(storage, carried.benchmark_id, name or str(path))
+            _copy(storage, recording, target, check, deleted)
     return carried.benchmark_id
 
 
@@ -102,15 +107,16 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
     `storage` None stands for an empty one.
     """
     with Recording(path) as recording:
+        left_out = _deleted_beside(recording, path)
         carried = _Carried.by(recording, path, storage)
         stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
-        missing, deleted = _missing(storage, recording)
+        missing, deleted = _missing(storage, recording, left_out)
         if storage is not None:
             say_what_was_deleted(deleted, storage.root)
         return ImportPreview(
             benchmark_id=carried.benchmark_id,
             name="" if carried.query is None else carried.query.metadata.name,
-            episodes=len(recording),
+            episodes=len(recording) - len(left_out),
             new_episodes=len(missing),
             artifacts=len(carried.needed),
             new_artifacts=len(set(carried.needed) - stored),
@@ -168,10 +174,20 @@ def say_what_was_deleted(episodes: int, directory: Path | None) -> None:
         warn(f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}")
 
 
-def _missing(storage: FileStorage | None, recording: Recording) -> tuple[list[int], int]:
-    """Numbers of the episodes that the storage lacks, and how many others it can restore. StorageError if it holds
-    other episodes with the same ids."""
-    ids = {episode_id(recording.uuid, int(number)): int(number) for number in recording.index["episode"]}
+def _deleted_beside(recording: Recording, path: Path) -> set[int]:
+    """Numbers of the episodes of a file that were deleted. RecordingError if more of them may still come."""
+    if not recording.complete and is_locked(path):
+        raise RecordingError(f"{path} is being recorded; import it when its writer has closed it")
+    return Notes.read(path).about(recording.metadata).deleted & set(recording.index["episode"].tolist())
+
+
+def _missing(
+    storage: FileStorage | None, recording: Recording, left_out: Collection[int]
+) -> tuple[list[int], int]:
+    """Numbers of the episodes that the storage lacks, without some, and how many others it can restore. StorageError if
+    it holds other episodes with the same ids."""
+    numbers = [number for number in recording.index["episode"].tolist() if number not in left_out]
+    ids = {episode_id(recording.uuid, number): number for number in numbers}
     if storage is None:
         return list(ids.values()), 0
     known = by_recording(storage.list_episodes(FilterIN(key="id", value=list(ids))))
@@ -209,9 +225,13 @@ class _NothingNewError(Exception):
 
 
 def _copy(
-    storage: FileStorage, recording: Recording, target: Path, check: Callable[[Recording], None]
+    storage: FileStorage,
+    recording: Recording,
+    target: Path,
+    check: Callable[[Recording], None],
+    left_out: Collection[int],
 ) -> None:
-    """Copy the episodes that the storage does not hold yet into a new file of it.
+    """Copy the episodes that the storage does not hold yet into a new file of it, without some.
 
     Others may change the file at any time. So it is copied to where nobody else can write: `check` is called with the
     copy, and the copy goes into the storage.
@@ -226,7 +246,7 @@ def _copy(
                 rewrite_recording(recording, new)  # with what is in its journal
             with Recording(new) as copy:
                 check(copy)
-                missing, _ = _missing(storage, copy)
+                missing, _ = _missing(storage, copy, left_out)
                 if not missing:
                     raise _NothingNewError
                 if len(missing) < len(copy):
