@@ -78,7 +78,7 @@ def test_of_a_directory_as_info_shows_it(runs: Path, which: str) -> None:
     place = [str(runs), "--episodes", which]
     shown = json.loads(run("info", *place, "--json"))["result"]["episodes"]
     tagged = json.loads(run("tag", *place, "good=true", "--dry-run", "--json"))["result"]
-    deleted = json.loads(run("delete", *place, "--force", "--dry-run", "--json"))["result"]["episodes"]
+    deleted = json.loads(run("delete", *place, "--dry-run", "--json"))["result"]["episodes"]
     assert shown == sum(len(one["episodes"]) for one in tagged) == len(deleted)
     assert "runs has no episode 9; choose from 0 to 3" in run("delete", str(runs), "-e", "9", code=1)
 
@@ -98,11 +98,11 @@ def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
     sizes = [path.stat().st_size for path in (one, other)]
     run("delete", str(one), str(other), "--episodes", "0")
     assert "a.mcap" in run("compact", str(one), "--dry-run")
-    assert "rewrote 1 recording" in run("compact", str(one))
+    assert "compacted 1 recording" in run("compact", str(one))
     assert (one.stat().st_size < sizes[0], other.stat().st_size) == (True, sizes[1])
     assert (seeds(one), seeds(other)) == ([1, 2, 3], [1, 2, 3])
     assert "restored 0 episodes" in run("restore", str(one))
-    assert "rewrote 1 recording" in run("compact", str(other.parent))
+    assert "compacted 1 recording" in run("compact", str(other.parent))
     assert other.stat().st_size < sizes[1]
 
 
@@ -120,7 +120,7 @@ def test_the_space_of_one_that_was_not_finished(tmp_path: Path) -> None:
     run("delete", str(file), "-e", "1")
     told = run("compact", str(file))
     assert (
-        f"rewrote 1 recording, which freed nothing: {bytes_of(file.stat().st_size - sizes[0])} more are used"
+        f"compacted 1 recording, which freed nothing: {bytes_of(file.stat().st_size - sizes[0])} more are used"
         in told
     )
 
@@ -183,18 +183,17 @@ def test_of_a_directory_by_filter(runs: Path) -> None:
     assert seeds(runs) == [0, 1, 2, 0, 1]
 
 
-def test_never_a_whole_recording_by_the_way(runs: Path) -> None:
-    assert "which nothing brings back" in run("delete", str(runs), "--filter", "steps > 0", code=1)
-    assert seeds(runs) == [0, 1, 2, 3] * 2
+def test_a_whole_recording_comes_back_until_compact_removes_it(runs: Path) -> None:
     assert "say which" in run("delete", str(runs), code=2)
-    words = "delete", str(runs / "a.mcap"), "--episodes", "all", "--force"
-    size = bytes_of((runs / "a.mcap").stat().st_size)
-    gone = f"{runs / 'a.mcap'} ({size}), which nothing brings back\n"
-    assert run(*words, "--dry-run") == f"would delete 4 episodes\nwould remove {gone}"
-    some = run("delete", str(runs / "a.mcap"), "--episodes", "0-2", "--force", "--dry-run")
-    assert some == "would delete 3 episodes\n"
-    assert run(*words) == f"deleted 4 episodes\nremoved {gone}"
-    assert [path.name for path in runs.rglob("*.mcap")] == ["b.mcap"]
+    words = "delete", str(runs / "a.mcap"), "--episodes", "all"
+    assert run(*words, "--dry-run") == "would delete 4 episodes\n"
+    assert run(*words) == "deleted 4 episodes\n"
+    assert seeds(runs) == [0, 1, 2, 3]
+    assert run("restore", str(runs)) == "restored 4 episodes\n"
+    assert seeds(runs) == [0, 1, 2, 3] * 2
+    run(*words)
+    assert "freed" in run("compact", str(runs))
+    assert [path.name for path in runs.rglob("[!.]*.mcap*")] == ["b.mcap"]
 
 
 def test_another_recording_of_the_same_name_loses_nothing(runs: Path) -> None:
@@ -260,17 +259,15 @@ def test_one_episode_in_python(runs: Path) -> None:
     assert seeds(runs) == [2, 3, 0, 1, 2, 3]
 
 
-def test_in_python_never_a_whole_recording_by_the_way(runs: Path) -> None:
+def test_a_whole_recording_of_several_in_python(runs: Path) -> None:
     one, other = tupli_mcap.open(runs / "a.mcap"), tupli_mcap.open(FileStorage(runs / "deep"))
-    for dry_run in (True, False):
-        with pytest.raises(
-            RecordingError, match=r"b\.mcap: all its episodes.*choose fewer episodes, or pass force"
-        ):
-            (one.filter("seed == 0") + other).delete(dry_run=dry_run)
+    chosen = one.filter("seed == 0") + other
+    assert chosen.delete(dry_run=True) == 5
     assert seeds(runs) == [0, 1, 2, 3] * 2
-    assert (one.filter("seed == 0") + other).delete(force=True) == 5
-    assert [path.name for path in runs.rglob("*.mcap")] == ["a.mcap"]
+    assert chosen.delete() == 5
     assert seeds(runs) == [1, 2, 3]
+    assert len(tupli_mcap.restore_episodes([runs, runs / "deep"])) == 5
+    assert seeds(runs) == [0, 1, 2, 3] * 2
 
 
 def test_in_a_storage_the_catalog_knows(runs: Path) -> None:
@@ -305,7 +302,8 @@ def test_a_link_is_the_file_that_it_names(runs: Path, tmp_path: Path) -> None:
     run("compact", str(link))
     assert link.is_symlink() and file.stat().st_size < before
     assert seeds(file) == seeds(link.parent) == [0, 2, 3]
-    run("delete", str(link), "--episodes", "all", "--force")
+    run("delete", str(link), "--episodes", "all")
+    run("compact", str(link))
     assert not (file.exists() or link.is_symlink())
 
 

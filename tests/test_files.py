@@ -228,7 +228,7 @@ def test_commands_name_and_remove_what_is_left(recording: Path, tmp_path: Path) 
         run("compact", "--storage", storage, "--dry-run")
         == "would remove 2 temporary files of killed processes\n"
     )
-    assert run("compact", "--storage", storage) == "rewrote 0 recordings, freed 20 B\n"
+    assert run("compact", "--storage", storage) == "compacted 0 recordings, freed 20 B\n"
     assert not any((*storage.glob(".*.tmp"), *places[2].glob(".*.tmp")))
     recover_recording(recording, tmp_path / "again.mcap")
     assert not any(tmp_path.glob(".*.tmp"))

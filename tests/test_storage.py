@@ -342,11 +342,11 @@ class StorageContract:
         benchmark = storage.store_benchmark(query()).id
         headers = storage.record_episodes([episode(benchmark, score=float(i)) for i in range(5)])
         dataset = tupli_mcap.open(storage)
-        assert (dataset.delete(force=True, dry_run=True), storage.count_episodes()) == (5, 5)
-        assert dataset.filter("metadata.score >= 3").delete(force=True) == 2
-        assert dataset[0].delete(force=True) == 1
+        assert (dataset.delete(dry_run=True), storage.count_episodes()) == (5, 5)
+        assert dataset.filter("metadata.score >= 3").delete() == 2
+        assert dataset[0].delete() == 1
         assert [h.id for h in storage.list_episodes()] == [h.id for h in headers[1:3]]
-        assert dataset.delete(force=True) == 2
+        assert dataset.delete() == 2
 
     def test_publish_episode(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id
@@ -598,13 +598,14 @@ class TestFileStorage(StorageContract):
         with pytest.warns(UserWarning, match="skipped a recording"):
             assert storage.count_episodes() == 0
 
-    def test_deleting_the_last_episode_removes_the_file(self, storage: FileStorage) -> None:
+    def test_a_file_without_episodes_stays_as_long_as_its_benchmark(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id), episode(header.id)])
         for one in made:
             storage.delete_episode(one.id)
-        assert not (storage.root / made[0].recording).exists()
-        assert list((storage.root / "recordings" / header.id).iterdir()) == []
+        assert storage.list_episodes() == []
+        assert storage.restore_episodes() == len(storage.list_episodes()) == 2
+        assert storage.delete_episodes(FilterEQ(key="benchmark_id", value=header.id)) == 2
         storage.delete_benchmark(header.id)
         assert list((storage.root / "recordings").iterdir()) == []
 
@@ -850,6 +851,7 @@ class TestFileStorage(StorageContract):
             patch.setattr(entries, "Recording", None)  # a dead recording is read once
             assert storage.count_episodes() == 1
         storage.delete_episode(item.id)
+        assert storage.compact() > 0
         assert list(storage.root.rglob("*.mcap*")) == []
 
     # --- bundles ---

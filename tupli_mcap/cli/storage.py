@@ -140,12 +140,6 @@ def delete(
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Remove recordings whose episodes are all deleted, which nothing undoes."
-        ),
-    ] = False,
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
@@ -153,8 +147,7 @@ def delete(
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json
-    still shows them. Episodes on a server are gone. So is a recording that loses all of its
-    episodes, which needs --force; --dry-run names it.
+    still shows them. Episodes on a server are gone.
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")
@@ -168,43 +161,30 @@ def delete(
         ids = [header.id for header in chosen.headers]
         if not ids:
             raise none_in(places, filter_text)
-        count, removed = chosen.delete(force=force, dry_run=dry_run), dict[str, int]()
+        count = chosen.delete(dry_run=dry_run)
     else:
         paths = list(map(local_path, places))
-        ids, count, removed = _delete_in_files(paths, episodes, filter_text, force, dry_run)
-    would = "would " if dry_run else ""
+        ids, count = _delete_in_files(paths, episodes, filter_text, dry_run)
     print_result(
-        {"dry_run": dry_run, "episodes": ids, "removed": list(removed)},
-        f"{would}{'delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
-        *(
-            f"{would}{'remove' if dry_run else 'removed'} {file} ({bytes_of(size)}), which nothing brings back"
-            for file, size in removed.items()
-        ),
+        {"dry_run": dry_run, "episodes": ids},
+        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
         as_json=as_json,
     )
 
 
 def _delete_in_files(
-    paths: Sequence[Path], episodes: str | None, filter_text: str | None, force: bool, dry_run: bool
-) -> tuple[list[str], int, dict[str, int]]:
-    """Deletes episodes; returns the ids of those that were chosen, how many were still there, and the sizes of the
-    recordings that had no others, by path."""
+    paths: Sequence[Path], episodes: str | None, filter_text: str | None, dry_run: bool
+) -> tuple[list[str], int]:
+    """Deletes episodes; returns the ids of those that were chosen, and how many were still there."""
     from tupli_mcap.dataset import curate
     from tupli_mcap.dataset.sources import FilesSource
-    from tupli_mcap.dataset.which import candidates
-    from tupli_mcap.recording import Recording
     from tupli_mcap.storage.base import episode_id
 
     gathered = Gathered()
     doomed = chosen_in(paths, episodes, filter_text, gathered)
     gathered.raise_all()
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
-    source, removed = FilesSource(file for file, _ in doomed), dict[str, int]()
-    for (file, _), numbers in doomed.items() if force else ():
-        with Recording(file) as recording:
-            if len(candidates(recording)) == len(numbers):
-                removed[file] = Path(file).stat().st_size
-    return ids, curate.delete(source, doomed, force=force, dry_run=dry_run), removed
+    return ids, curate.delete(FilesSource(file for file, _ in doomed), doomed, dry_run=dry_run)
 
 
 def restore(
@@ -218,8 +198,7 @@ def restore(
 ) -> None:
     """Bring deleted episodes back, by default all.
 
-    It cannot bring back episodes whose space compact has freed, nor a recording all of whose
-    episodes were deleted.
+    It cannot bring back episodes whose space compact has freed.
     """
     from tupli_mcap.dataset import restore_episodes
 
@@ -244,9 +223,9 @@ def compact(
 ) -> None:
     """Free the space of deleted episodes.
 
-    Rewrites recordings without their deleted episodes, and removes temporary files of killed
-    processes. Episodes that stay keep their ids. Recordings that a process is writing to are
-    left alone.
+    Rewrites recordings without their deleted episodes, or removes them if they have no others;
+    removes temporary files of killed processes. Episodes that stay keep their ids. Recordings
+    that a process is writing to are left alone.
     """
     from tupli_mcap.files import left_below
     from tupli_mcap.storage.listing import compactable
@@ -279,7 +258,7 @@ def compact(
     told = (
         f"freed {bytes_of(freed)}" if freed >= 0 else f"which freed nothing: {bytes_of(-freed)} more are used"
     )
-    say(f"rewrote {counted(len(recordings), 'recording')}, {told}")
+    say(f"compacted {counted(len(recordings), 'recording')}, {told}")
 
 
 def rename(

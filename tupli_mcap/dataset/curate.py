@@ -338,7 +338,6 @@ def delete(
     source: EpisodeSource,
     by_recording: Mapping[tuple[str, str], Collection[int]],
     *,
-    force: bool = False,
     dry_run: bool = False,
 ) -> int:
     """Deletes episodes by their numbers; returns how many were still there, or would be deleted.
@@ -353,10 +352,10 @@ def delete(
         storage, known_as = source.home_of(name)
         by_storage.setdefault(storage, {})[known_as, uuid] = numbers
     if dry_run or len(by_storage) > 1:  # if one refuses, none deletes
-        count = sum(storage.delete_numbers(d, force=force, dry_run=True) for storage, d in by_storage.items())
+        count = sum(storage.delete_numbers(d, dry_run=True) for storage, d in by_storage.items())
     if dry_run:
         return count
-    return sum(storage.delete_numbers(doomed, force=force) for storage, doomed in by_storage.items())
+    return sum(storage.delete_numbers(doomed) for storage, doomed in by_storage.items())
 
 
 def restore_episodes(
@@ -367,7 +366,7 @@ def restore_episodes(
 ) -> list[str]:
     """Brings deleted episodes back, and returns their ids.
 
-    Those whose space `compact` has freed, those of a file that was removed, and those on a server cannot be restored.
+    Those whose space `compact` has freed, and those on a server cannot be restored.
 
     Args:
         places: the paths of recordings, directories and storages.

@@ -676,7 +676,7 @@ class Dataset(RandomAccess):
         """
         return curate.undo_annotation(self._whole())
 
-    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
+    def delete(self, *, dry_run: bool = False) -> int:
         """Deletes the episodes where they are stored: `ds.filter("return < 0").delete()`; returns their number.
 
         Files are not touched: a file beside each (FILE.json) lists its deleted episodes, and `restore_episodes` brings
@@ -684,19 +684,17 @@ class Dataset(RandomAccess):
         still lists them; open it again.
 
         Args:
-            force: also delete all episodes of a file, and with them the file, which cannot be restored.
             dry_run: delete nothing, but return the number.
 
         Raises:
-            RecordingError: all episodes of a file would be deleted (without `force`), or a file is at a URL; then none
-                is deleted.
+            RecordingError: a file is at a URL; then none is deleted.
             StorageError: an episode on a server is somebody else's, the server cannot be reached, the notes beside a
                 file cannot be written, ...
         """
         doomed: dict[tuple[str, str], list[int]] = {}
         for header in self._whole().headers:
             doomed.setdefault((header.recording, uuid_of(header)), []).append(header.episode)
-        return curate.delete(self._source, doomed, force=force, dry_run=dry_run)
+        return curate.delete(self._source, doomed, dry_run=dry_run)
 
     # ---- showing
 

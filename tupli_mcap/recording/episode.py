@@ -213,13 +213,13 @@ class Episode(GymnasiumNames):
         if self.listed is not None:
             self.listed.metadata = self.metadata
 
-    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
+    def delete(self, *, dry_run: bool = False) -> int:
         """Deletes the episode where it is stored; returns 1, or 0 if it was deleted before. See `Dataset.delete`.
 
         To delete many, `dataset.filter(function).delete()` is quicker.
         """
         alone = self._recording.filter(F("id") == self.id) if self.alone is None else self.alone()
-        return alone.delete(force=force, dry_run=dry_run)
+        return alone.delete(dry_run=dry_run)
 
     @cached_property
     def start(self) -> EpisodeStart:

@@ -204,18 +204,13 @@ class TupliStorage(ABC):
         self,
         by_recording: Mapping[tuple[str, str], Collection[int]],
         *,
-        force: bool = False,
         dry_run: bool = False,
     ) -> int:
         """Delete episodes by their numbers; returns how many were still there, or would be deleted.
 
         Args:
             by_recording: numbers of episodes, by the name that headers give their recording, and by its UUID.
-            force: in a directory, also delete all episodes of a recording, and with them its file.
             dry_run: delete nothing.
-
-        Raises:
-            RecordingError: all episodes of a file would be deleted (without `force`); then none is deleted.
         """
         ids = [episode_id(uuid, n) for (_, uuid), numbers in by_recording.items() for n in numbers]
         count = 0

@@ -137,15 +137,17 @@ class FileStorage(TupliStorage):
         return self._benchmarks.list(filter)
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
+        directory = self.root / "recordings" / uri
         with self._lock:
-            deleted = 0
+            headers = []
             if episodes:
                 self._recordings.refuse_live(uri)
-                deleted = self._recordings.delete(
-                    self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
-                )
+                headers = self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
+            deleted = self._recordings.delete(headers)
             self._benchmarks.delete(uri)
-            self._recordings.remove_directory(self.root / "recordings" / uri)
+            others = [self.root / header.recording for header in headers]
+            self._recordings.remove_emptied({*directory.glob("*.mcap"), *others})
+            self._recordings.remove_directory(directory)
             return deleted
 
     def beginning_recording(self) -> AbstractContextManager[object]:
@@ -233,17 +235,15 @@ class FileStorage(TupliStorage):
         self,
         by_recording: Mapping[tuple[str, str], Collection[int]],
         *,
-        force: bool = False,
         dry_run: bool = False,
     ) -> int:
         # The recordings may be copies of others, which the catalog does not list.
-        return self._recordings.delete_numbers(by_recording, force=force, dry_run=dry_run)
+        return self._recordings.delete_numbers(by_recording, dry_run=dry_run)
 
     def deleted_episodes(self, recordings: Collection[str] | None = None) -> list[str]:
         """The ids of deleted episodes that can be restored, because `compact` has not freed their space.
 
-        A recording whose episodes were all deleted was removed and cannot be restored. `recordings`: only those at
-        these paths below `root`.
+        `recordings`: only those at these paths below `root`.
         """
         return self._recordings.deleted(recordings)
 

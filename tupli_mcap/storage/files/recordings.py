@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import stat
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap import files
-from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError, asking
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
 from tupli_mcap.recording import Recording, journal_path
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
@@ -134,17 +134,16 @@ class RecordingFiles:
             sidecar.write(path)  # the next query notices
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> int:
-        """Delete episodes, all or none, and recordings that have no others; returns how many were still there."""
+        """Delete episodes, all or none; returns how many were still there."""
         by_recording: dict[tuple[str, str], set[int]] = {}
         for header in headers:
             by_recording.setdefault((header.recording, uuid_of(header)), set()).add(header.episode)
-        return self.delete_numbers(by_recording, force=True)
+        return self.delete_numbers(by_recording)
 
     def delete_numbers(
         self,
         by_recording: Mapping[tuple[str, str], Collection[int]],
         *,
-        force: bool,
         dry_run: bool = False,
     ) -> int:
         """See `TupliStorage.delete_numbers`; recordings are named by their paths below the root.
@@ -152,10 +151,10 @@ class RecordingFiles:
         A copy of a recording is another one: only the recordings that are named here lose episodes.
         """
         if dry_run:  # leaves no lock behind
-            return sum(len(note.deleted) for note in self._doomed(by_recording, force).values())
+            return sum(len(note.deleted) for note in self._doomed(by_recording).values())
         with self._lock:
             self._finish_deletion()
-            doomed = self._doomed(by_recording, force)
+            doomed = self._doomed(by_recording)
             if len(doomed) > 1:
                 Deletion(
                     deleted={relative: note.deleted for relative, note in doomed.items()},
@@ -164,21 +163,12 @@ class RecordingFiles:
             self._do_deletion(doomed)
         return sum(len(note.deleted) for note in doomed.values())
 
-    def _doomed(
-        self, by_recording: Mapping[tuple[str, str], Collection[int]], force: bool
-    ) -> dict[str, Sidecar]:
+    def _doomed(self, by_recording: Mapping[tuple[str, str], Collection[int]]) -> dict[str, Sidecar]:
         """Those of the episodes that are still there, by path below the root."""
         doomed: dict[str, Sidecar] = {}
         for (relative, uuid), numbers in by_recording.items():
             with contextlib.suppress(NotFoundError):  # somebody else was first
-                path = self.path(relative)
-                left = self._left(path, uuid)
-                gone = left.intersection(numbers)
-                if gone == left and gone and not force:
-                    raise RecordingError(
-                        f"{path}: all its episodes would be deleted, and with them the file, which nothing brings "
-                        f"back; choose fewer episodes, or pass {asking('force=True', '--force')}"
-                    )
+                gone = self._left(self.path(relative), uuid).intersection(numbers)
                 if gone:
                     doomed[relative] = Sidecar(uuid=uuid, deleted=gone)
         return doomed
@@ -239,9 +229,6 @@ class RecordingFiles:
             sidecar.deleted |= note.deleted
             # first the note: a crash, or a writer that goes on with the file, must not bring anything back
             sidecar.write(path)  # the next query notices
-            with contextlib.suppress(FormatError, RecordingError):  # damaged: its note is enough
-                if not self._left(path):
-                    self._remove(path)
         Deletion().write(self._root)
 
     def _left(self, path: Path, uuid: str | None = None) -> set[int]:
@@ -253,18 +240,22 @@ class RecordingFiles:
             deleted = notes.about(recording.metadata).deleted
             return {int(number) for number in recording.index["episode"]} - deleted
 
-    def _remove(self, path: Path) -> None:
-        """Delete a recording, unless somebody is writing to it; the next query notices."""
-        try:
-            with writers_kept_out(path), os_errors("cannot delete the recording", path):
-                if self._left(path):  # somebody has written to it meanwhile
-                    return
-                file = path.resolve()
-                for gone in (file, journal_path(file), sidecar_path(file), path):
-                    gone.unlink(missing_ok=True)
-        except RecordingError:
-            return
+    def remove_emptied(self, paths: Iterable[Path]) -> None:
+        """Delete those of some recordings that have no episodes left, unless somebody is writing to them."""
+        for path in paths:
+            with contextlib.suppress(FormatError, RecordingError), writers_kept_out(path):
+                if not self._left(path):
+                    self._remove(path)
+
+    def _remove(self, path: Path) -> int:
+        """Delete a recording whose lock the caller holds; returns the bytes freed. The next query notices."""
+        file, freed = path.resolve(), 0
+        with os_errors("cannot delete the recording", path):
+            for gone in (file, journal_path(file), sidecar_path(file), path):
+                freed += gone.stat().st_size if gone.is_file() else 0
+                gone.unlink(missing_ok=True)
         self.remove_directory(path.parent)
+        return freed
 
     def remove_directory(self, directory: Path) -> None:
         """Remove the directory of a benchmark's recordings if it is empty and the benchmark is deleted.
@@ -288,6 +279,9 @@ class RecordingFiles:
                     continue
                 try:
                     with writers_kept_out(path):  # nobody appends meanwhile
+                        if not self._left(path):
+                            freed += self._remove(path)
+                            continue
                         freed += self._compact(path)
                 except RecordingError:
                     if path.exists() and not is_locked(path):
