@@ -127,7 +127,7 @@ untrust: untrust --key key.pub
 filter: filter runs/a.mcap --filter steps>15 -o some.mcap
 trim: trim runs/a.mcap --steps :5 -o trimmed.mcap
 delete: delete runs/a.mcap --episodes 0-1
-delete: delete runs/a.mcap --episodes all --force --dry-run
+delete: delete runs/a.mcap --episodes all --dry-run
 restore: restore runs --dry-run --episodes 1
 restore: restore runs
 merge: merge runs/a.mcap -o merged.mcap --dry-run
