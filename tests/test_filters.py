@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 from postgres import Cluster, ServerCatalog
+from pydantic import ValidationError
 from sqlalchemy import Connection, false, not_, or_
 
 from tupli_mcap.errors import FilterError
@@ -896,6 +897,17 @@ class TestConstruction:
     def test_what_has_no_meaning_is_refused(self, make: Any, message: str) -> None:
         with pytest.raises(FilterError, match=message):
             make()
+
+    @pytest.mark.parametrize("type", ["AND", "OR", "NOT"])
+    @pytest.mark.parametrize("depth", [33, 500, 5000])
+    def test_data_that_nests_too_deep_is_refused(self, type: str, depth: int) -> None:
+        data: dict[str, Any] = {"type": "EQ", "key": "a", "value": 1}
+        for _ in range(depth):
+            data = {"type": type, "filters": [data]}
+        with pytest.raises(FilterError, match="^BaseFilter: filters nest at most 32 deep$"):
+            BaseFilter(**data)
+        with pytest.raises(ValidationError, match="filters nest at most 32 deep"):
+            BaseFilter.model_validate(data)
 
     def test_unknown_keys_are_refused_with_the_known_ones(self) -> None:
         misspelt = (F("metadata.x") == 1) & ~(F("n_tuple") == 1)

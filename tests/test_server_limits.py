@@ -148,16 +148,27 @@ def test_filters_that_cost_too_much_are_refused(tmp_path: Path, filter: Any, mes
             assert message in refused.json()["detail"], path
 
 
+def nested(depth: int, kind: str) -> str:
+    """The JSON of a comparison in so many combinations."""
+    opening, closing = f'{{"type": "{kind}", "filters": [', "]}"
+    return opening * depth + '{"type": "EQ", "key": "id", "value": "x"}' + closing * depth
+
+
 def test_filters_that_are_too_deep_are_refused(tmp_path: Path) -> None:
-    deep: Any = {"type": "EQ", "key": "steps", "value": 1}
-    for _ in range(33):
-        deep = {"type": "NOT", "filters": [deep]}
-    with server_with(tmp_path / "served") as admin:
-        deeper = "[" * 100_000
-        for body in (json.dumps({"filter": deep}), f'{{"filter": {deeper}'):
-            headers = {**token_of(admin), "Content-Type": "application/json"}
-            refused = httpx.post(f"{admin.url}/v1/episodes/list", content=body, headers=headers)
-            assert refused.status_code == 400, refused.text[:200]
+    asked = ("episodes/list", "episodes/count", "artifacts/list", "benchmarks/list", "query", "query/tickets")
+    with server_with(tmp_path / "served", guests=True) as admin:
+        headers = {"Content-Type": "application/json"}
+        for path, kind in itertools.product(asked, ("AND", "OR", "NOT")):
+            for depth in (33, 150, 160, 500, 5000):
+                body = f'{{"filter": {nested(depth, kind)}}}'
+                refused = httpx.post(f"{admin.url}/v1/{path}", content=body, headers=headers)
+                assert refused.status_code == 400, (path, kind, depth)
+                assert "nest at most 32 deep" in refused.text or depth > 160, refused.text
+        body = '{"filter": ' + "[" * 100_000
+        refused = httpx.post(f"{admin.url}/v1/episodes/list", content=body, headers=headers)
+        assert refused.status_code == 400, refused.text[:200]
+        body = f'{{"filter": {nested(32, "AND")}}}'
+        assert httpx.post(f"{admin.url}/v1/episodes/list", content=body, headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize("of", ["sqlite", "postgresql"])

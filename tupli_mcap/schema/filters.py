@@ -101,6 +101,8 @@ class BaseFilter(BaseModel):
     filters: Sequence[BaseFilter] = ()
 
     def __init__(self, **data: Any) -> None:
+        if _is_too_deep(data):  # before the parts are validated, which takes some of Python's stack for each level
+            raise FilterError(f"{type(self).__name__}: filters nest at most {MAX_DEPTH} deep")
         try:
             super().__init__(**data)
         except ValidationError as err:
@@ -140,8 +142,6 @@ class BaseFilter(BaseModel):
                 raise ValueError(f"{self.type} combines filters and takes no key or value")
             if self.type is FilterType.NOT and len(self.filters) != 1:
                 raise ValueError(f"NOT takes exactly one filter, found {len(self.filters)}")
-            if depth(self) > MAX_DEPTH:
-                raise ValueError(f"filters nest at most {MAX_DEPTH} deep")
             return self
         if self.key is None or "value" not in self.model_fields_set:
             raise ValueError(f"{self.type} needs a key and a value")
@@ -295,11 +295,21 @@ def path_of(filter: BaseFilter) -> tuple[str, ...]:
     return split_key(filter.key or "")
 
 
-def depth(filter: BaseFilter) -> int:
-    """How deep combinations nest: 0 for a comparison."""
-    if filter.type not in COMBINING:
-        return 0
-    return 1 + max((depth(item) for item in filter.filters), default=0)
+def _is_too_deep(filter: Any) -> bool:
+    """Whether the parts of a filter, or of data for one, nest deeper than `MAX_DEPTH`."""
+    level = [filter]
+    for _ in range(MAX_DEPTH + 1):
+        level = [part for each in level for part in _parts(each)]
+        if not level:
+            return False
+    return True
+
+
+def _parts(filter: Any) -> Sequence[Any]:
+    found = filter.filters if isinstance(filter, BaseFilter) else None
+    if isinstance(filter, Mapping):
+        found = filter.get("filters")
+    return found if isinstance(found, Sequence) else ()
 
 
 def _combined(cls: type[BaseFilter], type: FilterType, left: BaseFilter, right: object) -> Any:
