@@ -6,7 +6,6 @@ import base64
 import contextlib
 import hashlib
 import itertools
-import json
 import os
 import re
 import shutil
@@ -136,6 +135,9 @@ def test_json_has_a_limit_of_marks(tmp_path: Path) -> None:
         ({"type": "AND", "filters": [{"filters": [3] * 15_000}] * 2}, "at most 20000 values"),
         ({"type": "EQ", "key": "steps"}, "needs a key and a value"),
         (3, "filter"),
+        (f"steps in [{'1,' * 10_000}]", "text of at most 20000 characters, found 200"),
+        ("steps in [1", "needs ',' at character 11, found the end"),
+        ("not " * 33 + "seed = 1", "nest at most 32 deep"),
     ],
 )
 def test_filters_that_cost_too_much_are_refused(tmp_path: Path, filter: Any, message: str) -> None:

@@ -26,7 +26,7 @@ from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.remote import is_cut_cheaper
-from tupli_mcap.schema import BaseFilter, F, FilterEQ
+from tupli_mcap.schema import BaseFilter, F, FilterEQ, parse_filter
 from tupli_mcap.server.app import create_app
 from tupli_mcap.storage import TupliAPIClient
 
@@ -73,6 +73,30 @@ def kept(answer: httpx.Response, path: Path) -> Recording:
     path.write_bytes(answer.content)
     assert verify_recording(path).problems == []
     return Recording(path)
+
+
+def test_a_filter_may_be_the_text_of_one(users: Users, names: list[str], tmp_path: Path) -> None:
+    text = "metadata.score >= 595 and not metadata.best"
+    wanted = filtered(parse_filter(text))
+    same = {"recordings": [names[1]]}
+    with kept(asked(users.ann, filter=text, **same), tmp_path / "cut.mcap") as cut:
+        assert list(cut.index["episode"]) == [595, 596, 597, 598, 599]
+    for path, told in (("episodes/list", {}), ("episodes/count", {}), ("query/tickets", same)):
+        by_text, by_json = (
+            users.ann._session.ask("POST", f"/v1/{path}", {"filter": each, **told}) for each in (text, wanted)
+        )
+        if path != "query/tickets":  # whose addresses differ
+            assert by_text == by_json
+    assert by_text["path"].startswith("/v1/manifest?ticket=")
+    for path in ("benchmarks/list", "artifacts/list"):
+        assert users.ann._session.ask("POST", f"/v1/{path}", {"filter": 'id = "x"'})["items"] == []
+    for path in ("episodes/publish", "episodes/delete"):
+        told = {"filter": text, "group": "global"} if path == "episodes/publish" else {"filter": text}
+        assert users.ann._session.ask("POST", f"/v1/{path}", told) == {"episodes": 5}
+    document = httpx.get(f"{users.url}/openapi.json", timeout=60).json()["components"]["schemas"]
+    for model in ("Listing", "Chosen", "Shown", "EpisodeQuery"):
+        kinds = document[model]["properties"]["filter"]["anyOf"]
+        assert {"$ref": "#/components/schemas/BaseFilter"} in kinds and "string" in str(kinds), model
 
 
 def test_exactly_the_episodes_that_match(users: Users, names: list[str], tmp_path: Path) -> None:

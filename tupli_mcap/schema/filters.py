@@ -101,7 +101,8 @@ class BaseFilter(BaseModel):
     filters: Sequence[BaseFilter] = ()
 
     def __init__(self, **data: Any) -> None:
-        if _is_too_deep(data):  # before the parts are validated, which takes some of Python's stack for each level
+        # Before the parts are validated: each level of them takes some of Python's stack.
+        if _is_too_deep(data):
             raise FilterError(f"{type(self).__name__}: filters nest at most {MAX_DEPTH} deep")
         try:
             super().__init__(**data)

@@ -27,7 +27,7 @@ from tupli_mcap.errors import (
 )
 from tupli_mcap.page.answers import error_page, wants_page
 from tupli_mcap.recording.edit.merge import UnmergeableError
-from tupli_mcap.schema import ArtifactMetadata, BaseFilter
+from tupli_mcap.schema import ArtifactMetadata, BaseFilter, parse_filter
 from tupli_mcap.server.blobs import LostError
 from tupli_mcap.server.database import TooLongError, UnavailableError
 from tupli_mcap.server.people.access import DeniedError
@@ -40,6 +40,7 @@ from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
 _MOST_VALUES: Final = 20_000
+_LONGEST_TEXT: Final = 20_000  # characters of a filter
 _MOST_METADATA: Final = 64 << 10  # bytes of JSON
 _MOST_OFFSET: Final = 1 << 53  # larger numbers in JSON are not exact in all programs
 
@@ -81,8 +82,17 @@ class Error(BaseModel):
     error: str
 
 
+_FilterText = Annotated[str, Field(max_length=_LONGEST_TEXT, examples=["return > 45"])]
+
+
 def _affordable(told: Any) -> Any:
-    """The JSON of a filter, before each part of it is looked at, which takes long for many."""
+    """The JSON of a filter, before each part of it is looked at, which takes long for many; or the filter of a text."""
+    if isinstance(told, str):
+        if len(told) > _LONGEST_TEXT:
+            raise ValueError(
+                f"expected a filter's text of at most {_LONGEST_TEXT} characters, found {len(told)}; send JSON"
+            )
+        return parse_filter(told)
     count, parts = 0, [told]
     while parts and count <= _MOST_VALUES:
         part = parts.pop()
@@ -108,8 +118,10 @@ def _restored(value: Any) -> Any:
         raise ValueError(str(err)) from err
 
 
-AskedFilter = Annotated[BaseFilter, BeforeValidator(_affordable)]
-"""The filter of a request."""
+AskedFilter = Annotated[
+    BaseFilter, BeforeValidator(_affordable, json_schema_input_type=BaseFilter | _FilterText)
+]
+"""The filter of a request: as JSON, or as the text that commands take."""
 
 
 class Listing(BaseModel):
