@@ -213,6 +213,22 @@ def things(users: Users) -> Things:
     return Things(benchmark, artifact, users.ann.record_episodes([episode(benchmark), episode(benchmark, 5)]))
 
 
+@pytest.mark.parametrize("path", ["list", "count", "delete", "publish"])
+def test_a_misspelt_field_is_refused(users: Users, things: Things, path: str) -> None:
+    told = {"filtr": "steps > 1000", **({"group": "global"} if path == "publish" else {})}
+    refused = httpx.post(f"{users.url}/v1/episodes/{path}", json=told, headers=token_of(users.ann))
+    assert refused.status_code == 400
+    assert refused.json()["detail"] == "expected another request: filtr: there is no such field"
+    assert users.ann.count_episodes() == 2 and users.bob.count_episodes() == 0
+    for other in ("benchmarks/list", "artifacts/list", "query", "query/tickets", "tickets"):
+        told = {"after": "x", **({"recording": "x"} if other == "tickets" else {})}
+        refused = httpx.post(f"{users.url}/v1/{other}", json=told, headers=token_of(users.ann))
+        assert refused.status_code == 400 and "after: there is no such field" in refused.text, other
+    assert httpx.post(
+        f"{users.url}/episodes/list", json={"after": "x"}, headers=token_of(users.ann)
+    ).json(), "PyTupli's route ignores it"
+
+
 def statuses(user: Users, caller: TupliAPIClient, things: Things) -> dict[tuple[str, str], int]:
     """What each route that names something of ann's answers."""
     ids = {"/v1/benchmarks": things.benchmark, "/v1/artifacts": things.artifact}

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from starlette.exceptions import HTTPException
 
 from tupli_mcap import jsonvalue
@@ -124,7 +124,13 @@ AskedFilter = Annotated[
 """The filter of a request: as JSON, or as the text that commands take."""
 
 
-class Listing(BaseModel):
+class Asked(BaseModel):
+    """The body of a request. A field that it does not have is an error: a misspelt filter would mean everything."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Listing(Asked):
     """What to list: a filter, and which page of the matching items. `cursor` is the `next` of the page before."""
 
     filter: AskedFilter | None = None
@@ -213,7 +219,9 @@ def tell_errors(app: FastAPI) -> None:
         if not request.url.path.startswith("/v1/"):  # PyTupli's client expects this form
             return _Refusal({"detail": defects}, 422)
         where = ".".join(str(part) for part in defects[0]["loc"][1:])
-        detail = f"expected another request: {where or 'its body'}: {defects[0]['msg']}"
+        is_unknown = defects[0]["type"] == "extra_forbidden"
+        what = "there is no such field" if is_unknown else defects[0]["msg"]
+        detail = f"expected another request: {where or 'its body'}: {what}"
         return _Refusal({"detail": detail, "error": "StorageError"}, 400)
 
     @app.exception_handler(HTTPException)

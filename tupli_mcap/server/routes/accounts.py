@@ -11,6 +11,7 @@ from tupli_mcap.schema import Group, Right, UserRole
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
+from tupli_mcap.server.wire import Asked
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
 
@@ -22,7 +23,7 @@ class Credentials(BaseModel):
     password: str
 
 
-class Refresh(BaseModel):
+class Refresh(Asked):
     """The refresh token of the last answer."""
 
     refresh_token: str
@@ -51,20 +52,20 @@ class Me(User):
     quota: int | None = None
 
 
-class Quota(BaseModel):
+class Quota(Asked):
     """How many bytes a user may store; None for the server's quota."""
 
     bytes: int | None = Field(ge=0, le=1 << 60)
 
 
-class Password(BaseModel):
+class Password(Asked):
     """A new password; `old` is needed to change one's own."""
 
     password: str
     old: str | None = None
 
 
-class Member(BaseModel):
+class Member(Asked):
     """A user in a group."""
 
     user: str
@@ -77,7 +78,7 @@ class GroupWithMembers(Group):
     members: list[Member]
 
 
-class NewToken(BaseModel):
+class NewToken(Asked):
     """A token for a machine: its name, its scope (`read` or `write`), and its days (None: for ever)."""
 
     name: str

@@ -7,7 +7,7 @@ import json
 from typing import Annotated
 
 from fastapi import APIRouter, Body, Response
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import FilterEQ, Right
@@ -15,7 +15,7 @@ from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
-from tupli_mcap.server.wire import AskedFilter, Found, Listing, answer, listed
+from tupli_mcap.server.wire import Asked, AskedFilter, Found, Listing, answer, listed
 from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
@@ -25,7 +25,7 @@ _LONGEST_KEY = 200
 _MOST_KEYS, _MOST_KEYS_OF_A_USER = 100, 10  # each is a row for every episode that has it
 
 
-class Chosen(BaseModel):
+class Chosen(Asked):
     """The episodes to count or delete: all that match a filter."""
 
     filter: AskedFilter | None = None
@@ -38,7 +38,7 @@ class Shown(Chosen):
     published: bool = True
 
 
-class Key(BaseModel):
+class Key(Asked):
     """A key of episodes' metadata, such as `metadata.score`."""
 
     key: str = Field(max_length=_LONGEST_KEY)

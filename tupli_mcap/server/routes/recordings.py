@@ -25,6 +25,7 @@ from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
+from tupli_mcap.server.wire import Asked
 from tupli_mcap.storage.texts import is_hash
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
@@ -32,7 +33,7 @@ _TUS = {"Tus-Resumable": "1.0.0"}
 _AT_ONCE = 1 << 20  # bytes that are written at a time
 
 
-class Named(BaseModel):
+class Named(Asked):
     """A recording by its name, as in the headers of its episodes."""
 
     recording: str

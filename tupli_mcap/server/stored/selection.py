@@ -9,7 +9,7 @@ from operator import and_
 from typing import Final, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import Field
 from sqlalchemy import Connection, select
 
 from tupli_mcap.errors import NotFoundError, StorageError
@@ -23,13 +23,13 @@ from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Items
 from tupli_mcap.server.tables import FILE
-from tupli_mcap.server.wire import AskedFilter
+from tupli_mcap.server.wire import Asked, AskedFilter
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 _CACHE_BYTES: Final = 32 << 20  # cache of all recordings of an answer together
 
 
-class EpisodeQuery(BaseModel):
+class EpisodeQuery(Asked):
     """A query for the episodes that meet all given conditions.
 
     recordings: names of recordings, as in headers of episodes. episodes: numbers, if one recording is named. fields:
