@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
+from served import COMMAND
 from serving import PASSWORD, serving
 from typer.testing import CliRunner
 
@@ -28,6 +31,47 @@ def run(line: str, code: int = 0) -> str:
     done = CliRunner().invoke(app, line.split(), catch_exceptions=False)
     assert done.exit_code == code, done.output
     return done.stdout if code == 0 else done.stderr
+
+
+def typed(line: str, *answers: tuple[str, str]) -> str:
+    """What a command prints in a terminal, where each question is answered."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execve(
+            COMMAND,
+            ["tupli-mcap", *line.split()],
+            {k: v for k, v in os.environ.items() if "PASSWORD" not in k},
+        )
+    shown = ""
+    for question, answer in answers:
+        before = len(shown)
+        while not shown[before:].endswith(question):
+            shown += os.read(terminal, 1).decode()
+        os.write(terminal, f"{answer}\n".encode())
+    try:
+        while part := os.read(terminal, 4096):
+            shown += part.decode()
+    except OSError:  # the command has ended
+        pass
+    os.close(terminal)
+    assert os.waitpid(pid, 0)[1] == 0, shown
+    return shown.replace("\r", "")
+
+
+def test_passwords_that_are_typed(url: str) -> None:
+    assert typed("login admin", ("Password: ", PASSWORD)) == f"Password: \nsigned in to {url} as admin\n"
+    new, again = "Password of the new user: ", "Repeat for confirmation: "
+    shown = typed(
+        "signup ann", (new, "one-word"), (again, "two-words"), (new, "one-word"), (again, "one-word")
+    )
+    assert shown == (
+        f"{new}\n{again}\nError: The two entered values do not match.\n{new}\n{again}\n"
+        f"created the user ann at {url}\n"
+    )
+    typed("login ann", ("Password: ", "one-word"))
+    changed = (("Old password: ", "one-word"), ("New password: ", "another-word"), (again, "another-word"))
+    assert typed("password", *changed).endswith(f"changed the password of ann at {url}\n")
+    typed("login ann", ("Password: ", "another-word"))
 
 
 def test_a_group_of_two(url: str) -> None:

@@ -165,13 +165,14 @@ def warnings_in_one_line() -> Iterator[None]:
         yield
 
 
-def ask_secret(question: str) -> str | None:
-    """Ask for a text without showing what is typed; None if stdin is no terminal."""
+def ask_secret(question: str, *, twice: bool = False) -> str | None:
+    """Ask for a text without showing what is typed, `twice` until both answers are equal; None if stdin is no
+    terminal."""
     if not sys.stdin.isatty():
         return None
     import typer
 
-    answer: str = typer.prompt(visible(question), hide_input=True, err=True)
+    answer: str = typer.prompt(visible(question), hide_input=True, err=True, confirmation_prompt=twice)
     return answer
 
 

@@ -254,7 +254,7 @@ def login(username: Username, url: Url = None, as_json: Json = False) -> None:
     The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
     with server_at(url) as client:
-        client.login(username, _password("Password: "))
+        client.login(username, _password("Password"))
         _tell(client.url, username, f"signed in to {client.url} as {username}", as_json=as_json)
 
 
@@ -293,7 +293,7 @@ def signup(username: Username, url: Url = None, as_json: Json = False) -> None:
     user_create. The password is asked for, or taken from TUPLI_MCAP_PASSWORD.
     """
     with server_at(url) as client:
-        client.signup(username, _password("Password of the new user: "))
+        client.signup(username, _password("Password of the new user", twice=True))
         _tell(client.url, username, f"created the user {username} at {client.url}", as_json=as_json)
 
 
@@ -312,8 +312,8 @@ def password(
     with server_at(url) as client:
         me = client.whoami().username
         own = username in (None, me)
-        old = _password("Old password: ") if own else None
-        new = _password("New password: ", "TUPLI_MCAP_NEW_PASSWORD")
+        old = _password("Old password") if own else None
+        new = _password("New password", "TUPLI_MCAP_NEW_PASSWORD", twice=True)
         client.change_password(username or me, new, old=old)
         if own:
             client.login(me, new)
@@ -325,8 +325,8 @@ def _tell(url: str, username: str, line: str, *, as_json: bool) -> None:
     print_result({"url": url, "username": username}, line, as_json=as_json)
 
 
-def _password(question: str, variable: str = "TUPLI_MCAP_PASSWORD") -> str:
-    found = os.environ.get(variable) or ask_secret(question)
+def _password(question: str, variable: str = "TUPLI_MCAP_PASSWORD", *, twice: bool = False) -> str:
+    found = os.environ.get(variable) or ask_secret(question, twice=twice)
     if not found:
         raise StorageError(f"no password: stdin is no terminal to ask on; set {variable}")
     return found
