@@ -460,7 +460,7 @@ class TestTallies:
             "a.mcap", "u", "", "Cart-v1", 10, 30, [{"name": "r", "environment": "Cart-v1"}],
             4, 68, 2, -2.0, -3.0, 1.0, 2, 1, CREATED_NS // 1000 * 1000, (CREATED_NS + 10**9) // 1000 * 1000,
         )  # fmt: skip
-        assert (seen.episodes, seen.returns, seen.return_sum) == (1, 0, None)
+        assert (seen.episodes, seen.returns, seen.return_sum, seen.size) == (1, 0, None, None)
         catalog.remove_recording("a.mcap")
         with catalog._read() as connection:
             assert list(tallies(connection)) == []

@@ -364,7 +364,15 @@ class TestWhoSeesWhat:
                 (whole,) = [
                     d for d in ann.get("/?format=json").json()["datasets"] if d["key"] == "CartPole-v1"
                 ]
-                assert whole["episodes"] == 6
+                assert whole["episodes"] == 6 and whole["bytes"] > 0
+                address = "/dataset/CartPole-v1"
+                part, files = (bob.get(f"{address}?format=json").json()[name] for name in ("bytes", "files"))
+                assert (dataset["bytes"], part, files[0]["bytes"]) == (None, None, None)
+                recording = files[0]["recording"]
+                ticket = Api(server, "bob").post("/v1/tickets", recording=recording)
+                assert (ticket["whole"], ticket["size"], ticket["episodes"]) == (False, 0, 0)
+                assert "<dt>Size</dt><dd>–</dd>" in bob.get(address).text
+                assert "<dt>Size</dt><dd>–</dd>" not in ann.get(address).text
                 text = bob.get("/dataset/CartPole-v1").text
                 assert f"in {sum(e['n_tuples'] for e in seen):,} steps of 2 episodes" in text
                 assert bob.get(f"/episode/{carts[0]}").status_code == 404

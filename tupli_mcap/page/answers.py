@@ -123,6 +123,11 @@ def address(*path: object, **params: Any) -> str:
     return "/" + "/".join(parts) + (f"?{query}" if query else "")
 
 
+def _size(given: int | None) -> str:
+    """`1.2 MB`; a dash for None."""
+    return "–" if given is None else bytes_of(given)
+
+
 @functools.cache
 def _templates() -> Environment:
     made = Environment(
@@ -133,7 +138,7 @@ def _templates() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {name: getattr(texts, name) for name in texts.__all__}
-    made.filters |= {"size": bytes_of, "spelled": jsonvalue.spelled}
+    made.filters |= {"size": _size, "spelled": jsonvalue.spelled}
     made.globals |= {
         "can_film": importlib.util.find_spec("av") is not None,
         "can_replay": importlib.util.find_spec("rerun") is not None,

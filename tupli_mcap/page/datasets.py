@@ -99,9 +99,10 @@ class Dataset:
         return sum(item.steps for item in self.recordings)
 
     @property
-    def size(self) -> int:
-        """The size of the files (bytes)."""
-        return sum(item.size for item in self.recordings)
+    def size(self) -> int | None:
+        """The size of the files (bytes); None if the reader may see only some of the episodes in one."""
+        sizes = [item.size for item in self.recordings if item.size is not None]
+        return sum(sizes) if len(sizes) == len(self.recordings) else None
 
     @property
     def return_mean(self) -> float | None:

@@ -42,7 +42,7 @@ class Named(Asked):
 class Ticket(BaseModel):
     """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
 
-    digest, size, episodes: of the whole file.
+    digest: of the whole file. size, episodes: too; 0 unless `whole`.
     """
 
     path: str
@@ -186,7 +186,8 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
         found = episodes.file_of(connection, caller, told.recording)
     ticket = library.tokens.ticket(caller, recording=found.name, digest=found.digest)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
-    return Ticket(path=path, whole=found.whole, digest=found.digest, size=found.size, episodes=found.episodes)
+    size, count = (found.size, found.episodes) if found.whole else (0, 0)
+    return Ticket(path=path, whole=found.whole, digest=found.digest, size=size, episodes=count)
 
 
 @router.get("/files/" + FILE_NAME, response_class=Response, responses=BODY)

@@ -34,6 +34,7 @@ class Tally(NamedTuple):
     """A recording, and sums over its visible episodes.
 
     Attributes:
+        size: of the file (bytes); None unless all of its episodes are visible.
         returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is.
         told, succeeded: number of episodes that say whether they succeeded, and of those that did.
         first, last: when the first and the last of them ended (ns since 1970, UTC).
@@ -44,7 +45,7 @@ class Tally(NamedTuple):
     uuid: str
     benchmark_id: str
     environment: str
-    size: int
+    size: int | None
     mixed: int
     runs: list[dict[str, Any]]
     episodes: int
@@ -108,6 +109,8 @@ def tallies(
     `seen` is a condition on TALLY.c.created_by and .published_in, `of` one on RECORDING.
     """
     recording = [RECORDING.c[name] for name in Tally._fields[:7] if name != "recording"]
+    each = TALLY.alias()
+    count = select(func.sum(each.c.episodes)).where(each.c.recording_id == RECORDING.c.id).scalar_subquery()
     sums = [
         func.sum(TALLY.c.episodes),
         func.sum(TALLY.c.steps),
@@ -121,13 +124,14 @@ def tallies(
         func.max(TALLY.c.last),
     ]
     query = (
-        select(RECORDING.c.path, *recording, *sums)
+        select(RECORDING.c.path, count, *recording, *sums)
         .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
         .where(true() if seen is None else seen, true() if of is None else of)
         .group_by(RECORDING.c.id)
         .order_by(RECORDING.c.path)
     )
-    for path, uuid, benchmark_id, environment, size, mixed, runs, *summed in connection.execute(query):
+    for path, most, uuid, benchmark_id, environment, size, mixed, runs, *summed in connection.execute(query):
         counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
         named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
-        yield Tally(*named, size, mixed, jsonvalue.loads(runs), *counts)
+        seen_size = size if counts[0] == int(most) else None
+        yield Tally(*named, seen_size, mixed, jsonvalue.loads(runs), *counts)
