@@ -118,6 +118,10 @@ class TestSigningIn:
             assert (place.path, parse_qs(place.query)) == ("/sign-in", {"next": ["/episodes?sort=-return"]})
             assert guest.get("/episodes?format=json").status_code == 401
             assert guest.get("/", headers={"Accept": "*/*"}).json()["name"] == "tupli-mcap"
+            assert (guest.head("/").status_code, guest.head("/", headers={"Accept": "*/*"}).status_code) == (
+                303,
+                200,
+            )
 
     def test_the_cookie(self, server: str) -> None:
         with browser(server) as client:
@@ -371,6 +375,10 @@ class TestWhoSeesWhat:
                 recording = files[0]["recording"]
                 ticket = Api(server, "bob").post("/v1/tickets", recording=recording)
                 assert (ticket["whole"], ticket["size"], ticket["episodes"]) == (False, 0, 0)
+                head, got = (httpx.request(method, server + ticket["path"]) for method in ("HEAD", "GET"))
+                assert (head.status_code, got.status_code) == (200, 200) and got.content
+                assert "content-length" not in head.headers
+                assert head.headers["content-type"] == got.headers["content-type"]
                 assert "<dt>Size</dt><dd>–</dd>" in bob.get(address).text
                 assert "<dt>Size</dt><dd>–</dd>" not in ann.get(address).text
                 text = bob.get("/dataset/CartPole-v1").text

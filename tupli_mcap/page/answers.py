@@ -164,7 +164,7 @@ def error_page(request: Request, err: Exception) -> Response:
     """The page for an error; for `SignInNeededError`, a redirection to the sign-in page. `request.state.shelf` is the
     shelf, once it is known."""
     as_json = _wants_json(request)
-    if isinstance(err, SignInNeededError) and request.method == "GET" and not as_json:
+    if isinstance(err, SignInNeededError) and request.method in ("GET", "HEAD") and not as_json:
         here = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return _with_headers(RedirectResponse(address("sign-in", next=here), 303))
     status, text = _told(request, err)

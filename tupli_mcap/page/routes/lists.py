@@ -67,7 +67,7 @@ class Table:
         return charts.share((value - min(known)) / (max(known) - min(known)))
 
 
-@router.get("/")
+@router.api_route("/", methods=["GET", "HEAD"])
 def datasets(
     request: Request, shelf: Shown, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1
 ) -> Response:

@@ -99,7 +99,7 @@ def _page(
 # --- the first page, signing in and out ---
 
 
-@router.get("/", response_model=None)
+@router.api_route("/", methods=["GET", "HEAD"], response_model=None)
 def root(
     request: Request, visit: Visitor, q: str = "", number: Annotated[int, Query(alias="page", ge=1)] = 1
 ) -> Response:

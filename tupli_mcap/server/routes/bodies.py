@@ -22,13 +22,13 @@ from tupli_mcap.page.answers import attachment
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
-_MEDIA: Final = "application/octet-stream"
+MEDIA: Final = "application/octet-stream"
 _SIGNED_SECONDS: Final = 3600
-MADE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {_MEDIA: {}}}}
+MADE: Final[dict[int | str, dict[str, Any]]] = {200: {"content": {MEDIA: {}}}}
 """The part of the OpenAPI document for bytes that are made while they are sent."""
 BODY: Final = {
     **MADE,
-    206: {"description": "The range that was asked for.", "content": {_MEDIA: {}}},
+    206: {"description": "The range that was asked for.", "content": {MEDIA: {}}},
     304: {"description": "The caller has this version."},
     307: {"description": "The bytes are at another address."},
 }
@@ -68,11 +68,11 @@ def body_of(
     # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
     if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
         told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **named}
-        return Response(headers=told, media_type=_MEDIA)
+        return Response(headers=told, media_type=MEDIA)
     _check_version(request, tag)
     headers = {**(headers or {}), "ETag": tag, **named}
     if not is_bucket:
-        return _File(blobs.place(name), headers=headers, media_type=_MEDIA)
+        return _File(blobs.place(name), headers=headers, media_type=MEDIA)
     return _from_bucket(blobs, request, name, size, tag, headers)
 
 
@@ -86,10 +86,10 @@ def _from_bucket(
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
     status = 206 if part else 200
     if request.method == "HEAD":
-        return Response(status_code=status, headers=headers, media_type=_MEDIA)
+        return Response(status_code=status, headers=headers, media_type=MEDIA)
     first = blobs.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
     pieces = _pieces(blobs, name, first, start, stop)
-    return StreamingResponse(pieces, status, headers, media_type=_MEDIA)
+    return StreamingResponse(pieces, status, headers, media_type=MEDIA)
 
 
 class _File(FileResponse):

@@ -19,7 +19,7 @@ from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS
 from tupli_mcap.schema import Right
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.routes.bodies import BODY, body_of
+from tupli_mcap.server.routes.bodies import BODY, MEDIA, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.stored import episodes
@@ -206,9 +206,16 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
     if holder.ticket is not None and holder.ticket.get("digest", found.digest) != found.digest:
         raise HTTPException(412, "this has changed; open it again")
     if not found.whole:
-        return Response() if request.method == "HEAD" else streamed(library, selected)
+        return _of_unknown_length() if request.method == "HEAD" else streamed(library, selected)
     file_name = name.rpartition("/")[2]
     body = body_of(library, request, found.place, digest=found.digest, file_name=file_name)
     if holder.ticket is not None:
         body.headers.update(FOR_VIEWERS)
     return body
+
+
+def _of_unknown_length() -> Response:
+    """The answer to a HEAD for what is made while it is sent."""
+    answer = Response(media_type=MEDIA)
+    del answer.headers["Content-Length"]
+    return answer
