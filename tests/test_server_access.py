@@ -41,8 +41,8 @@ NO_ITEM = {
     "POST /access/groups/add-members, POST /access/groups/remove-members",
     "roles": "GET /v1/roles, POST /v1/roles, DELETE /v1/roles/{role}, POST /access/roles/create, "
     "GET /access/roles/list, DELETE /access/roles/delete",
-    "new items": "POST /v1/benchmarks, POST /v1/artifacts, POST /v1/uploads, POST /benchmarks/create, "
-    "POST /artifacts/upload, POST /episodes/record",
+    "new items": "POST /v1/benchmarks, POST /v1/artifacts, POST /v1/uploads, OPTIONS /v1/uploads, "
+    "POST /benchmarks/create, POST /artifacts/upload, POST /episodes/record",
     "the caller's uploads": "HEAD /v1/uploads/{upload_id}, PATCH /v1/uploads/{upload_id}, "
     "DELETE /v1/uploads/{upload_id}",
     "lists": "POST /v1/benchmarks/list, POST /v1/artifacts/list, POST /v1/episodes/list, POST /v1/episodes/count, "

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from typing import Annotated
 from urllib.parse import quote, unquote
 
-from fastapi import APIRouter, Body, Header, HTTPException, Request, Response
+from fastapi import APIRouter, Body, Depends, Header, HTTPException, Request, Response
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
@@ -29,7 +29,9 @@ from tupli_mcap.server.wire import Asked
 from tupli_mcap.storage.texts import is_hash
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
-_TUS = {"Tus-Resumable": "1.0.0"}
+_TUS_VERSION = "1.0.0"
+_TUS = {"Tus-Resumable": _TUS_VERSION}
+_TUS_MEDIA = "application/offset+octet-stream"
 _AT_ONCE = 1 << 20  # bytes that are written at a time
 
 
@@ -55,8 +57,32 @@ class Ticket(BaseModel):
 # --- sending ---
 
 
+def _demand_tus(request: Request) -> None:
+    """Raises HTTPException for a request of another version of tus, or bytes that are announced as something else."""
+    version = request.headers.get("Tus-Resumable", _TUS_VERSION)
+    if version != _TUS_VERSION:
+        detail = f"expected Tus-Resumable: {_TUS_VERSION}, found {version:.20}"
+        raise HTTPException(412, detail, {"Tus-Version": _TUS_VERSION})
+    media = request.headers.get("Content-Type", _TUS_MEDIA)
+    if request.method == "PATCH" and media != _TUS_MEDIA:
+        raise HTTPException(415, f"expected Content-Type: {_TUS_MEDIA}, found {media:.80}")
+
+
+_BY_TUS = [Depends(_demand_tus)]
+
+
+@router.options("/uploads", status_code=204)
+def describe_uploads(library: Served) -> Response:
+    """What tus can do here, and how large a recording may be."""
+    able = {"Tus-Version": _TUS_VERSION, "Tus-Extension": "creation,termination"}
+    return Response(
+        status_code=204, headers={**_TUS, **able, "Tus-Max-Size": str(library.settings.max_upload)}
+    )
+
+
 @router.post(
     "/uploads",
+    dependencies=_BY_TUS,
     status_code=201,
     response_class=Response,
     responses={
@@ -91,7 +117,7 @@ def begin_upload(
     return Response(status_code=201, headers=headers)
 
 
-@router.head("/uploads/{upload_id}", response_class=Response)
+@router.head("/uploads/{upload_id}", dependencies=_BY_TUS, response_class=Response)
 def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     """How much of an upload has arrived."""
     upload = _find(library, caller, upload_id)
@@ -99,7 +125,7 @@ def ask_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     return Response(headers={**_TUS, **told, "Cache-Control": "no-store"})
 
 
-@router.patch("/uploads/{upload_id}", status_code=204)
+@router.patch("/uploads/{upload_id}", dependencies=_BY_TUS, status_code=204)
 async def go_on_with_upload(
     library: Served,
     caller: Writer,
@@ -126,7 +152,7 @@ async def go_on_with_upload(
     return Response(status_code=204, headers=told)
 
 
-@router.delete("/uploads/{upload_id}", status_code=204)
+@router.delete("/uploads/{upload_id}", dependencies=_BY_TUS, status_code=204)
 def end_upload(library: Served, caller: Writer, upload_id: str) -> Response:
     """Deletes an upload."""
     library.forget_upload(_find(library, caller, upload_id))
