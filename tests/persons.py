@@ -31,11 +31,11 @@ def announced(data: bytes, length: int | None = None) -> dict[str, str]:
     }
 
 
-def cart_benchmark() -> dict[str, Any]:
+def cart_benchmark(name: str = "cart") -> dict[str, Any]:
     """CartPole as the JSON of a benchmark."""
-    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name="cart")
+    record, metadata = capture(gym.make("CartPole-v1")), BenchmarkMetadata(name=name)
     digest = benchmark_hash(BenchmarkContent(record, ()), metadata)
-    return {"hash": digest, "serialized": pack(record, ()), "metadata": {"name": "cart"}}
+    return {"hash": digest, "serialized": pack(record, ()), "metadata": {"name": name}}
 
 
 class Person:

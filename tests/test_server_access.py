@@ -1,4 +1,5 @@
-"""Who may do what with an item of somebody else: every route that names one, each role, private or published.
+"""Who may do what with an item of somebody else: every route that names one, each role, private or published; and what
+lists and queries give to each.
 
 The routes come from the OpenAPI document: an operation that is neither in this table nor in NO_ITEM fails it.
 """
@@ -15,6 +16,7 @@ import pytest
 from persons import Person, cart_benchmark
 from serving import ENGINES, serving, settings_of
 
+from tupli_mcap import Recording
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -149,6 +151,52 @@ class Lab:
         return {**ids, "files": recording}
 
 
+class Shared(NamedTuple):
+    """What ann has stored: the ids of three benchmarks and three artifacts, each for another audience, and a recording,
+    whose episodes are for one audience after another."""
+
+    benchmarks: list[str]
+    artifacts: list[str]
+    recording: str
+    episodes: list[str]
+
+
+def shared(ann: Person, folder: Path) -> Shared:
+    record_rollouts("CartPole-v1", folder / "shared.mcap", steps=150, seed=2)
+    recording = ann.send((folder / "shared.mcap").read_bytes())
+    benchmarks = [ann.ask("POST", "/v1/benchmarks", cart_benchmark(str(to)))["id"] for to in AUDIENCES]
+    artifacts = [
+        ann.ask("POST", "/v1/artifacts", headers=METADATA, content=str(to).encode())["id"] for to in AUDIENCES
+    ]
+    listed = ann.ask("POST", "/v1/episodes/list", {"filter": f'recording = "{recording}"'})["items"]
+    episodes = [each["id"] for each in sorted(listed, key=lambda each: each["episode"])]
+    assert len(episodes) > len(AUDIENCES)
+    for kind, ids in (("benchmarks", benchmarks), ("artifacts", artifacts), ("episodes", episodes)):
+        for number, uri in enumerate(ids):
+            if (group := AUDIENCES[number % len(AUDIENCES)]) is not None:
+                ann.ask("PUT", f"/v1/{kind}/{uri}/published", params={"group": group})
+    return Shared(benchmarks, artifacts, recording, episodes)
+
+
+READERS = {
+    "stranger": (False, True, False),
+    "guest": (False, True, False),
+    "colleague": (False, True, True),
+    "owner": (True, True, True),
+    "admin": (False, True, False),
+}
+"""Who reads what is private, published in `global`, and in the lab, as AUDIENCES has them."""
+
+
+def numbers_in(answer: httpx.Response, path: Path) -> list[int]:
+    """The numbers of the episodes in a recording that an answer holds."""
+    assert answer.status_code == 200, answer.text
+    path.write_bytes(answer.content)
+    with Recording(path) as recording:
+        numbers: list[int] = recording.index["episode"].tolist()
+    return numbers
+
+
 @pytest.fixture(params=ENGINES)  # for each test, since PyTupli's client may delete again what it has deleted
 def lab(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Lab]:
     with settings_of(request.param, request, tmp_path / "served") as settings:
@@ -172,10 +220,43 @@ def test_every_route_for_each_role(lab: Lab, audience: str | None) -> None:
     assert wrong == []
 
 
-def test_every_route_for_the_owner(lab: Lab) -> None:
-    ids = lab.stock(None)
+@pytest.mark.sampled(0, keep=[f"{ENGINES[0]}-private", f"{ENGINES[1]}-{LAB}"])
+@pytest.mark.parametrize("audience", AUDIENCES, ids=["private", *AUDIENCES[1:]])
+def test_every_route_for_the_owner(lab: Lab, audience: str | None) -> None:
+    ids = lab.stock(audience)
     for route in routes(lab.url):
         answer = route.ask(lab.ann, ids[route.kind])
         assert answer.status_code == 200, (route, answer.text)
         if route.verb != "read":
-            ids = lab.stock(None)
+            ids = lab.stock(audience)
+
+
+def test_lists_and_queries_give_what_may_be_read(lab: Lab, tmp_path: Path) -> None:
+    """Exactly that, to each reader: every operation on lists and queries of NO_ITEM that changes nothing."""
+    stored = shared(lab.ann, tmp_path)
+    people = {**lab.people, "stranger": lab.people["user"], "owner": lab.ann}
+    for reader, may in READERS.items():
+        person, file = people[reader], tmp_path / "answer.mcap"
+        numbers = [number for number in range(len(stored.episodes)) if may[number % len(may)]]
+        readable = {
+            "benchmarks": {uri for uri, seen in zip(stored.benchmarks, may, strict=True) if seen},
+            "artifacts": {uri for uri, seen in zip(stored.artifacts, may, strict=True) if seen},
+            "episodes": {stored.episodes[number] for number in numbers},
+        }
+        for kind, expected in readable.items():
+            listed = person.ask("POST", f"/v1/{kind}/list", {})["items"]
+            listed_by_pytupli = person.ask("POST", f"/{kind}/list", {})
+            for found in (listed, listed_by_pytupli):
+                assert sorted(each["id"] for each in found) == sorted(expected), (reader, kind)
+        assert person.ask("POST", "/v1/episodes/count", {}) == len(numbers), reader
+        assert numbers_in(person.call("POST", "/v1/query", {}), file) == numbers, reader
+        ticket = person.ask("POST", "/v1/tickets", {"recording": stored.recording})
+        assert ticket["whole"] == (reader == "owner")
+        assert numbers_in(httpx.get(lab.url + ticket["path"]), file) == numbers, reader
+        for guest_of_ticket in (False, True):
+            path = "/v1/manifest"
+            if guest_of_ticket:
+                path = person.ask("POST", "/v1/query/tickets", {})["path"]
+            asker = Person(lab.url) if guest_of_ticket else person
+            (source,) = asker.ask("GET", path)["sources"]
+            assert numbers_in(asker.call("GET", f"/v1/{source['url']}"), file) == numbers, (reader, path)
