@@ -6,6 +6,7 @@ import importlib
 import inspect
 import itertools
 from collections.abc import Iterator
+from datetime import datetime, timedelta
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -294,3 +295,14 @@ def test_guests_are_told_403(url: str) -> None:
         assert httpx.request(method, f"{url}/access/{path}").status_code == 403
     assert httpx.get(f"{url}/access/groups/list").json() == []
     assert httpx.post(f"{url}/episodes/list", json={"include_tuples": True}).json() == []
+
+
+def test_what_docs_say_of_times_and_errors(url: str, admin: Any, pytupli: ModuleType) -> None:
+    admin.store_artifact(b"wind", pytupli.ArtifactMetadata(name="wind"))
+    (listed,) = admin.list_artifacts()
+    assert datetime.fromisoformat(listed.created_at).utcoffset() == timedelta(0)
+    assert set(httpx.get(url).json()) == {"name", "version"}
+    denied = httpx.get(f"{url}/benchmarks/load", params={"benchmark_id": "x"})
+    assert set(denied.json()) == {"detail", "error"}
+    (invalid,) = httpx.post(f"{url}/access/groups/create", json={}).json()["detail"]
+    assert set(invalid) == {"type", "loc", "msg"}
