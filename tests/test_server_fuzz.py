@@ -28,7 +28,8 @@ def test_every_route_answers_as_the_document_says(
     if engine == "postgresql":
         request.getfixturevalue("postgres")  # skips where it is not installed
     with tool("server_fuzz").fuzzer(engine, tmp_path, seed=1) as fuzzer:
-        fuzzer.run(1)
+        for role in ("", "user", "admin"):
+            fuzzer.run(2, roles=[role])
         fuzzer.run_pages(4)
     assert fuzzer.findings == {}
     assert fuzzer.statuses["200"] > 10 and fuzzer.statuses["page 200"] > 20

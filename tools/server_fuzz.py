@@ -154,7 +154,7 @@ class Stock:
             "/v1/groups name": groups,
             "ticket": [ticket, self._query_ticket()],
             "upload_id": self._uploads(),
-            "filter": _FILTERS,
+            "filter": [*_FILTERS, *_TEXTS],
             "benchmark_filter": [{"type": "EQ", "key": "hash", "value": self._benchmark["hash"]}],
             "text filter": _TEXTS,
             "text benchmark_filter": ['metadata.name == "cart"'],
