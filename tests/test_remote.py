@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import gzip
 import itertools
 import json
@@ -111,6 +112,36 @@ def test_an_episode_takes_its_chunks_and_no_more(server: WebServer, large: Path)
     assert server.sent <= 1.2 * int(store.table["length"][chunks].sum())
 
 
+def _ranges(server: WebServer) -> list[tuple[str | None, bool]]:
+    """The requests since the last call: the range of each, and whether bytes came."""
+    found = [(asked.range, asked.sent > 0) for asked in server.asked]
+    server.asked.clear()
+    return found
+
+
+@pytest.mark.parametrize("no_suffix", [0, 416], ids=["suffixes", "none"])
+def test_what_opening_fetched_is_fetched_once_by_a_process(server: WebServer, no_suffix: int) -> None:
+    server.no_suffix = no_suffix
+    server.files["/other.mcap"] = server.files["/r.mcap"]
+    Recording(server.url("/other.mcap"))  # learns whether the server knows suffixes
+    _ranges(server)
+    dataset = tupli_mcap.open(server.url())
+    assert len(dataset) == EPISODES
+    opened = _ranges(server)
+    same = ("bytes=0-0", True) if no_suffix else ("bytes=-131072", False)
+    assert len(opened) == (2 if no_suffix else 1)
+    dataset[5].states  # noqa: B018
+    asked = _ranges(server)
+    assert len(asked) == 2 and asked[0] == same
+    assert len(dataset.filter("metadata.number == 5").read().states) == STEPS
+    assert _ranges(server) == [same]
+    assert len(tupli_mcap.open(server.url())) == EPISODES
+    assert _ranges(server) == [same]
+    server.tags["/r.mcap"] = '"second"'
+    assert len(tupli_mcap.open(server.url())) == EPISODES
+    assert _ranges(server) == opened
+
+
 def test_a_dataset_of_urls(server: WebServer, large: Path) -> None:
     local, remote = tupli_mcap.open(large), tupli_mcap.open(server.url())
     assert len(remote.filter("metadata.number < 3")) == 3
@@ -206,6 +237,32 @@ def test_a_server_that_knows_no_ranges(server: WebServer, large: Path) -> None:
         assert np.array_equal(recording.read().states, Recording(large).read().states)
 
 
+@pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("tag", ['"first"', ""], ids=["ETag", "Last-Modified"])
+def test_a_file_of_a_server_without_ranges_comes_once(server: WebServer, large: Path, tag: str) -> None:
+    server.ranges = False
+    server.files["/other.mcap"] = server.files["/r.mcap"]
+    server.tags = {"/r.mcap": tag, "/other.mcap": tag}
+    with pytest.warns(UserWarning, match="sends whole files only"):
+        dataset = tupli_mcap.open(server.url()).filter("metadata.number < 9")
+        assert len(dataset) == 9
+    assert [asked for asked, _ in _ranges(server)] == ["bytes=-131072", "bytes=0-0", None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.array_equal(dataset[3].states, Recording(large).episodes[3].states)
+        assert len(dataset.read(["rewards"]).rewards) == 9 * STEPS
+    del dataset
+    gc.collect()
+    assert set(_ranges(server)) == {(None, False)}
+    with pytest.warns(UserWarning, match="other.mcap: the server sends whole files only"):
+        Recording(server.url("/other.mcap")).close()
+    assert [asked for asked, _ in _ranges(server)] == ["bytes=0-0", None]
+    server.files["/r.mcap"], server.conditions = b"another", False
+    server.tags["/r.mcap"] = '"second"'
+    with pytest.warns(UserWarning, match="sends whole"), pytest.raises(tupli_mcap.FormatError):
+        Recording(server.url())
+
+
 def test_a_folder_of_a_bucket(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "ENDPOINT": server.url("")}.items():
         monkeypatch.setenv(f"AWS_{name}", value)
@@ -292,9 +349,7 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
 
 def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:
     with between(server.url("")) as proxy:
-        proxy.faults.extend(
-            [Fault(), *[Fault("reset", 400_000)] * 7]
-        )  # more often than one request is tried again
+        proxy.faults.extend([Fault("reset", 400_000)] * 7)  # more often than one request is tried again
         with copied(f"{proxy.url}/r.mcap") as path:
             assert path.read_bytes() == large.read_bytes()
         assert not proxy.faults
@@ -501,10 +556,13 @@ def test_fsspec_gives_a_whole_file_in_pieces(large: Path, monkeypatch: pytest.Mo
     system = fsspec.filesystem("memory")
     system.pipe("/runs/z.mcap", data)
     url = "memory://runs/z.mcap"
-    pieces = [bytes(piece) for piece in objects.find(url).pieces(7)]
-    assert b"".join(pieces) == data[7:]
+    whole = objects.find(url).whole()
+    pieces = [bytes(piece) for piece in whole.pieces]
+    assert b"".join(pieces) == data and whole.size == len(data)
+    assert b"".join(objects.find(url).pieces(7, whole.version)) == data[7:]
+    assert objects.find(url).newer(whole.version) is None
     assert max(map(len, pieces)) == 1 << 20
-    coming = objects.find(url).pieces()
+    coming = objects.find(url).whole().pieces
     next(coming)
     system.pipe("/runs/z.mcap", data + b"more")
     with pytest.raises(RecordingError, match="has been changed"):

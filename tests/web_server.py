@@ -36,7 +36,7 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.no_suffix = 0  # the status code of the answer to a suffix range, if that is refused
         self.lengths = self.heads = True  # whether it says how long files are, and answers HEAD
         self.failures: list[int] = []  # status codes of the next answers
-        self.delay = 0.0  # seconds before each answer
+        self.delay = 0.0  # seconds before each answer, and before its last byte
 
     def url(self, path: str = "/r.mcap") -> str:
         return f"http://127.0.0.1:{self.server_port}{path}"
@@ -66,6 +66,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             data or b"",
             {"ETag": tag, "Last-Modified": "Mon, 23 Nov 2026 00:00:00 GMT"},
         )
+        unless = self.headers.get("If-None-Match"), self.headers.get("If-Modified-Since")
         wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", asked or "") if server.ranges else None
         match = self.headers.get("If-Match")
         if server.failures:
@@ -76,6 +77,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             status, body = 404, b"no"
         elif server.conditions and match not in (None, tag):
             status, body = 412, b"no"
+        elif server.conditions and (unless[0] == tag or unless == (None, headers["Last-Modified"])):
+            status, body = 304, b""
         elif wanted and not wanted[1] and server.no_suffix:
             status, body = server.no_suffix, b"no"
         elif wanted:
@@ -88,6 +91,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         server.asked.append(Asked(self.command, asked, match, 0 if head else len(body)))
         self.send_response(status)
         for name, value in headers.items():
+            if name == "ETag" and not value:
+                continue
             self.send_header(name, value)
         if server.lengths:
             self.send_header("Content-Length", str(len(body)))
@@ -95,7 +100,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.close_connection = True
         self.end_headers()
         if not head:
-            self.wfile.write(body)
+            self.wfile.write(body[:-1])
+            time.sleep(server.delay)
+            self.wfile.write(body[-1:])
 
 
 @contextmanager

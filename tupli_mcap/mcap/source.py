@@ -265,6 +265,10 @@ class FileSource(_Checked):
         if self._owned:
             self._file.close()
 
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError):
+            self.close()
+
 
 def _is_system_file(file: BinaryIO) -> bool:
     raw = file.raw if type(file) is io.BufferedReader else file

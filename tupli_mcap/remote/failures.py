@@ -59,7 +59,7 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
         raise RecordingError(
             f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
         ) from None
-    except told.NotSupportedError:
+    except (told.NotSupportedError, told.NotModifiedError):
         raise
     except (told.BaseError, OSError, ValueError) as err:
         said = str(err).partition("\n")[0]

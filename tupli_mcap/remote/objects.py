@@ -6,9 +6,10 @@ their own tools do; all other kinds of URL by fsspec.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
-from datetime import timedelta
+from datetime import datetime, timedelta
 from typing import Any, NamedTuple, Protocol, TypeVar
 from urllib.parse import urlsplit
 
@@ -42,11 +43,7 @@ def _nobody(_: int) -> None:
 
 
 class NoRangesError(Exception):
-    """The server sends whole files only; this one has `size` bytes."""
-
-    def __init__(self, size: int) -> None:
-        super().__init__(size)
-        self.size = size
+    """The server sends whole files only."""
 
 
 class End(NamedTuple):
@@ -57,19 +54,36 @@ class End(NamedTuple):
     version: str
 
 
+class Whole(NamedTuple):
+    """All bytes of an object, which come in pieces, its size, and its version."""
+
+    pieces: Iterator[memoryview]
+    size: int
+    version: str
+
+
 class RemoteObject(Protocol):
     """An object on a server. Thread-safe."""
 
-    def tail(self, length: int) -> End:
-        """The last `length` bytes, or all if there are fewer. NoRangesError if the server sends whole files only."""
+    def tail(self, length: int, known: End | None = None) -> End:
+        """The last `length` bytes, or all if there are fewer; `known` if that is still the version.
+        NoRangesError if the server sends whole files only."""
         ...
 
     def get(self, start: int, stop: int, version: str, tell: Tell = ...) -> memoryview:
         """The bytes `start:stop`; `tell` is called as they arrive. RecordingError if the object has another version."""
         ...
 
-    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
         """The bytes from an offset on, from one request; RecordingError if the object has another version."""
+        ...
+
+    def whole(self) -> Whole:
+        """All bytes, from one request."""
+        ...
+
+    def newer(self, known: str) -> Whole | None:
+        """All bytes, from one request; None if the object still has the version `known`."""
         ...
 
 
@@ -178,6 +192,7 @@ class _StoredObject:
 
     def __init__(self, url: str) -> None:
         self._url = url
+        self._sends_whole = False
         self._store, self._path = open_store(url, _patience())
         if not self._path and not is_web(url):
             folder = shown(url).rstrip("/")
@@ -185,36 +200,43 @@ class _StoredObject:
                 f"{folder} is a bucket; give the URL of a recording, such as {folder}/x.mcap"
             )
 
-    def tail(self, length: int) -> End:
+    def tail(self, length: int, known: End | None = None) -> End:
         from obstore.exceptions import NotSupportedError
 
         server = urlsplit(self._url).netloc
         if server in _no_suffixes:
-            return self._tail_by_size(length)
+            return self._tail_by_size(length, known)
+        options: dict[str, Any] = {"range": {"suffix": length}}
+        if known is not None and _is_strong(known.version):
+            options["if_none_match"] = known.version
         try:
-            found = self._ask({"range": {"suffix": length}})
+            found = self._ask(options)
         except (RefusedError, NotSupportedError, RecordingError) as err:
             # Servers that know no suffixes fail, or say that there is no such file, or that it may not be read.
             if isinstance(err, BrokenOffError) and not isinstance(err, FailedError):
                 raise
-            end = self._tail_by_size(length)
+            end = self._tail_by_size(length, known)
             if end.size:  # of an empty object, every range is refused
                 _no_suffixes.add(server)
             return end
+        if found is None and known is not None:
+            return known
         return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
 
-    def _tail_by_size(self, length: int) -> End:
+    def _tail_by_size(self, length: int, known: End | None) -> End:
         """Its tail, from a server that knows no suffixes."""
         from obstore.exceptions import NotSupportedError
 
         try:
             meta = self._ask({"range": (0, 1)}).meta
         except (RefusedError, NotSupportedError) as err:
-            size = self._ask({}).meta["size"]
-            if not size:
+            if isinstance(err, RefusedError) and not self._ask({}).meta["size"]:
                 return End(memoryview(b""), 0, "")
-            raise NoRangesError(size) from err
+            self._sends_whole = True
+            raise NoRangesError from err
         size, version = meta["size"], _version(meta)
+        if known is not None and known.version == version:
+            return known
         return End(self.get(max(0, size - length), size, version), size, version)
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
@@ -229,11 +251,31 @@ class _StoredObject:
             raise changed(self._url)
         return memoryview(data).toreadonly()
 
-    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
         store, _ = open_store(self._url)
+        return self._pieces(store, self._begun(store, _from(start), version), start)
+
+    def whole(self) -> Whole:
+        store, _ = open_store(self._url)
+        return self._whole(store, self._begun(store, {}, None))
+
+    def newer(self, known: str) -> Whole | None:
+        store, _ = open_store(self._url)
+        found = self._begun(store, _unless(known), None)
+        is_same = found is None or (_is_strong(known) and _version(found.meta) == known)
+        return None if is_same else self._whole(store, found)
+
+    def _whole(self, store: Any, found: Any) -> Whole:
+        size = found.meta["size"]
+        if self._sends_whole and size:  # an empty object may be sent whole by any server
+            _no_suffixes.add(urlsplit(self._url).netloc)
+        return Whole(self._pieces(store, found, 0), size, _version(found.meta))
+
+    def _pieces(self, store: Any, found: Any, start: int) -> Iterator[memoryview]:
+        """The body of an answer. What breaks off is gone on with, as long as something comes."""
+        version = _version(found.meta)
         while True:
-            found = self._begun(store, {"range": {"offset": start}} if start else {}, version)
-            version, before = _version(found.meta), start
+            before = start
             try:
                 for piece in self._streamed(found):
                     start += len(piece)
@@ -242,16 +284,22 @@ class _StoredObject:
             except BrokenOffError:
                 if start == before:
                     raise
+            found = self._begun(store, _from(start), version)
 
     def _begun(self, store: Any, options: dict[str, Any], version: str | None) -> Any:
-        """An answer whose body has not been read; RecordingError if it is not of the version given."""
+        """An answer whose body has not been read, None if the options ask for none; RecordingError if it is not of
+        the version given."""
         from obstore.exceptions import NotSupportedError
 
-        if version and version.startswith('"'):  # servers match no weak tag (W/"…")
+        if _is_strong(version):
             options["if_match"] = version
         try:
-            found = asked(self._url, lambda: store.get(self._path, options=options))
+            found = self._ask(options, store)
         except RefusedError as err:
+            if version is None:
+                raise RecordingError(
+                    f"{shown(self._url)} cannot be read: its server refuses to send it; check the address"
+                ) from err
             raise changed(self._url) from err
         except NotSupportedError:
             raise BrokenOffError(
@@ -269,12 +317,36 @@ class _StoredObject:
         except RefusedError as err:
             raise changed(self._url) from err
 
-    def _ask(self, options: Any) -> Any:
-        return asked(self._url, lambda: self._store.get(self._path, options=options))
+    def _ask(self, options: Any, store: Any = None) -> Any:
+        """An answer whose body has not been read; None if the options ask for none of this version."""
+        from obstore.exceptions import NotModifiedError
+
+        try:
+            return asked(self._url, lambda: (store or self._store).get(self._path, options=options))
+        except NotModifiedError:
+            return None
 
 
 def _version(meta: Any) -> str:
     return meta["e_tag"] or f"{meta['last_modified']} {meta['size']}"
+
+
+def _is_strong(version: str | None) -> bool:
+    """Whether servers match a version: a tag that is not weak (W/"…")."""
+    return version is not None and version.startswith('"')
+
+
+def _from(start: int) -> dict[str, Any]:
+    return {"range": {"offset": start}} if start else {}
+
+
+def _unless(version: str) -> dict[str, Any]:
+    """The options that ask for an object unless it still has a version. A time tells that to the second."""
+    if _is_strong(version):
+        return {"if_none_match": version}
+    with contextlib.suppress(ValueError):  # a weak tag
+        return {"if_modified_since": datetime.fromisoformat(version.rpartition(" ")[0])}
+    return {}
 
 
 # ---- fsspec
@@ -299,8 +371,10 @@ class _FsspecObject:
         self._url = url
         self._system, self._path = _fsspec(url)
 
-    def tail(self, length: int) -> End:
+    def tail(self, length: int, known: End | None = None) -> End:
         size, version = self._now()
+        if known is not None and known.version == version and not version.startswith(" "):
+            return known
         if not size:
             return End(memoryview(b""), 0, "")
         data = self._asked(lambda: self._system.cat_file(self._path, start=max(0, size - length), end=size))
@@ -319,9 +393,17 @@ class _FsspecObject:
         tell(len(data))
         return data
 
-    def pieces(self, start: int = 0, version: str | None = None) -> Iterator[memoryview]:
+    def whole(self) -> Whole:
+        size, version = self._now()
+        return Whole(self.pieces(0, version), size, version)
+
+    def newer(self, known: str) -> Whole | None:
+        whole = self.whole()
+        return None if whole.version == known else whole
+
+    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
         size, found = self._now()
-        if version not in (None, found):
+        if version != found:
             raise changed(self._url)
         for at in range(start, size, _RANGE):
             yield self.get(at, min(at + _RANGE, size), found)

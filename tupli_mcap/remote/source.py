@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import tempfile
 import threading
 from collections import OrderedDict
@@ -16,7 +18,7 @@ from tupli_mcap.errors import FormatError, RecordingError, warn
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.kept import kept_blocks
 from tupli_mcap.remote.names import shown
-from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, check_process, find
+from tupli_mcap.remote.objects import End, NoRangesError, RemoteObject, Whole, check_process, find
 from tupli_mcap.remote.plan import Range, pieces_of
 
 BLOCK_BYTES: Final = 256 << 20  # of all files of this process
@@ -25,6 +27,8 @@ _TAIL = 128 << 10
 # Fetched together when any byte of it is read: holds what a recording says about its run and its environment.
 _HEAD = 16 << 10
 _AT_ONCE = 8
+_MOST_ENDS = 512
+_MOST_COPIES = 64
 
 
 class _Block(NamedTuple):
@@ -36,14 +40,28 @@ class _Block(NamedTuple):
 
 
 class _Blocks:
-    """The cache of this process: the blocks of remote files used last, by file and version."""
+    """The cache of this process: the blocks of remote files used last, by file and version, and by file what opening
+    it last has fetched."""
 
     def __init__(self, budget: int) -> None:
         self._budget = budget
         self._kept: OrderedDict[tuple[str, int, int], _Block] = OrderedDict()
         self._of: dict[str, dict[tuple[int, int], _Block]] = {}
+        self._ends: OrderedDict[str, End] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
+
+    def end_of(self, url: str) -> End | None:
+        """The end of a file when it was opened last. It may have another version by now."""
+        with self._lock:
+            return self._ends.get(url)
+
+    def keep_end(self, url: str, end: End) -> None:
+        with self._lock:
+            self._ends[url] = end
+            self._ends.move_to_end(url)
+            if len(self._ends) > _MOST_ENDS:
+                self._ends.popitem(last=False)
 
     def find(self, file: str, start: int, stop: int) -> _Block | None:
         """The block that holds a range."""
@@ -244,28 +262,58 @@ def _again(url: str, tail: bytes, size: int, version: str) -> RemoteSource:
 
 
 def open_url(url: str) -> RemoteSource | BinaryIO:
-    """Opens a file on a server. If the server sends whole files only, warns, and returns a temporary copy.
+    """Opens a file on a server. What this process fetched before is used again if the server says that the file is the
+    same. If the server sends whole files only, warns, and returns a temporary copy.
 
     Raises:
         RecordingError: the file does not exist, may not be read, or the server does not answer.
         MissingExtraError: the package that reads such URLs is not installed.
     """
-    remote = find(url)
-    try:
-        return RemoteSource(url, remote, remote.tail(_TAIL))
-    except NoRangesError as err:
-        size = err.size
+    remote, copy = find(url), _copies.get(url)
+    if copy is None:
+        with contextlib.suppress(NoRangesError):
+            end = remote.tail(_TAIL, _blocks.end_of(url))
+            _blocks.keep_end(url, end)
+            return RemoteSource(url, remote, end)
+        copy = _downloaded(url, remote.whole())
+    elif newer := remote.newer(copy.version):
+        copy = _downloaded(url, newer)
+    with _lock:
+        _copies[url] = copy
+        _copies.move_to_end(url)
+        if len(_copies) > _MOST_COPIES:
+            _copies.popitem(last=False)
+    return copy.opened()
+
+
+class _Copy:
+    """A copy of one version of a file: a file without a name, which is gone when nobody holds it any more."""
+
+    def __init__(self, file: IO[bytes], version: str) -> None:
+        self.version = version
+        self._fd = os.dup(file.fileno())
+
+    def opened(self) -> BinaryIO:
+        return os.fdopen(os.dup(self._fd), "rb")
+
+    def __del__(self) -> None:
+        os.close(self._fd)
+
+
+_copies: OrderedDict[str, _Copy] = OrderedDict()  # those used last, by URL
+_lock = threading.Lock()
+
+
+def _downloaded(url: str, whole: Whole) -> _Copy:
+    """A copy of a file that the server sends as a whole; warns of that, unless the file is empty: it has no ranges."""
+    if whole.size:
         warn(
             f"{shown(url)}: the server sends whole files only, so all of it is downloaded into a temporary file; "
             "a server that supports range requests avoids this"
         )
-    file = tempfile.TemporaryFile()  # noqa: SIM115 - the source closes it
-    try:
-        _download(url, remote, file, size)
-    except BaseException:
-        file.close()
-        raise
-    return file
+    with tempfile.TemporaryFile() as file:
+        _save(url, whole, file)
+        return _Copy(file, whole.version)
 
 
 @contextmanager
@@ -276,29 +324,25 @@ def copied(url: str) -> Iterator[Path]:
         RecordingError: the file cannot be read, or the disk is full.
         MissingExtraError: the package that reads such URLs is not installed.
     """
-    remote = find(url)
-    try:
-        size = remote.tail(1).size
-    except NoRangesError as err:
-        size = err.size
+    whole = find(url).whole()
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
         path = Path(folder) / (Path(urlsplit(url).path).name or "recording.mcap")
         with path.open("xb") as file:
-            _download(url, remote, file, size)
+            _save(url, whole, file)
         yield path
 
 
-def _download(url: str, remote: RemoteObject, file: IO[bytes], size: int) -> None:
-    """Copies a file with a progress bar; RecordingError if the connection breaks."""
+def _save(url: str, whole: Whole, file: IO[bytes]) -> None:
+    """Writes a file that comes from a server, with a progress bar; RecordingError if the connection breaks."""
     done = 0
     try:
-        with progress(size, f"downloading {shown(url)}", in_bytes=True) as bar:
-            for piece in remote.pieces():
+        with progress(whole.size, f"downloading {shown(url)}", in_bytes=True) as bar:
+            for piece in whole.pieces:
                 file.write(piece)
                 done += len(piece)
                 bar.advance(len(piece))
         file.flush()
     except OSError as err:
         raise RecordingError(f"{shown(url)} cannot be copied to {tempfile.gettempdir()}: {err}") from err
-    if done != size:
-        raise RecordingError(f"{shown(url)}: expected {size} bytes, found {done}; try again")
+    if done != whole.size:
+        raise RecordingError(f"{shown(url)}: expected {whole.size} bytes, found {done}; try again")
