@@ -184,7 +184,36 @@ def test_signatures_in_an_address_are_used_and_not_shown(server: WebServer) -> N
         Recording(address)
     server.failures = [500] * 50
     assert "SECRET" not in " ".join([*told, str(caught.value), str(refused.value)])
-    assert shown("GET https://me:pw@host/a?k=v (x)") == "GET https://host/a (x)"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("GET https://me:pw@host/a?k=v (x)", "GET https://host/a (x)"),
+        ("https://me:SEC@RE@T@host:80/x.mcap", "https://host:80/x.mcap"),
+        ("https://me:SE/CR@host/a@b.mcap", "https://host/a@b.mcap"),
+        ("https://me:SE?CR@host/x.mcap", "https://host/x.mcap"),
+        ("https://me:SE#CR@host/x.mcap", "https://host/x.mcap"),
+        ("https://me:SECRET@host?k=SEC@RET", "https://host"),
+        ("https://host:80?k=SEC@RET", "https://host:80"),
+        ("https://host?k=SEC@RET#SEC@RET", "https://host"),
+        ("s3://lab/run@2.mcap", "s3://lab/run@2.mcap"),
+        (
+            "http://[::1]:80/a@b.mcap, http://127.0.0.1:80/c@d",
+            "http://[::1]:80/a@b.mcap, http://127.0.0.1:80/c@d",
+        ),
+        ("https://a:SECRET@b/x,https://c:SECRET@d/y me@e", "https://b/x,https://d/y me@e"),
+    ],
+)
+def test_secrets_in_addresses_are_not_shown(text: str, expected: str) -> None:
+    assert shown(text) == expected
+
+
+def test_an_error_does_not_show_a_password(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "2")
+    with pytest.raises(RecordingError, match=r"^https://127\.0\.0\.1:1/x\.mcap cannot be read") as caught:
+        Recording("https://bob:SECR@ET@127.0.0.1:1/x.mcap")
+    assert "SECR" not in str(caught.value) and "ET@" not in str(caught.value)
 
 
 @pytest.mark.parametrize("conditions", [True, False], ids=["If-Match", "ignored"])

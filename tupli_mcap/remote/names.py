@@ -10,7 +10,9 @@ from urllib.parse import urlsplit
 from tupli_mcap.errors import RecordingError
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-_SECRET = re.compile(r"(://)[^/@\s]*@|[?#][^\s\"'<>)\]]*")
+# A password may have any "@", and where the port is no number, what ends a host, too.
+_USER = r"(://)(?:[^/?#\s]*@|[^/?#\s:\[]*:(?!\d*[/?#])\S*?@)"
+_SECRET = re.compile(_USER + r"|[?#][^\s\"'<>)\]]*")
 
 
 def is_url(name: str) -> bool:
