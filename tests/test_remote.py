@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import gzip
 import itertools
@@ -12,8 +13,10 @@ import os
 import pickle
 import pty
 import re
+import struct
 import subprocess
 import sys
+import termios
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -456,17 +459,25 @@ def test_episodes_are_run_again_from_the_copy_that_was_verified(server: WebServe
     assert result["reruns"][0]["agrees"] and server.sent < 2 * path.stat().st_size
 
 
-@pytest.mark.sampled(0, keep=["doctor-fetching-True", "verify-downloading-False"])
+@pytest.mark.sampled(0, keep=["fetching", "whole"])
 @pytest.mark.parametrize(
     ("command", "what", "ranges"),
-    [("doctor", b"fetching", True), ("verify", b"downloading", True), ("verify", b"downloading", False)],
+    [
+        ("doctor", rb"fetching", True),
+        ("verify", rb"downloading \xe2\x80\xa6\S*/campaign/r\.mcap", True),
+        ("verify", rb"downloading \xe2\x80\xa6\S*/campaign/r\.mcap", False),
+    ],
+    ids=["fetching", "ranges", "whole"],
 )
 def test_a_terminal_shows_the_bytes_that_come(
     server: WebServer, command: str, what: bytes, ranges: bool
 ) -> None:
     server.delay, server.ranges = 1.1, ranges
+    path = "/runs/of/a/long/campaign/r.mcap"
+    server.files[path] = server.files["/r.mcap"]
     ours, theirs = pty.openpty()
-    asked = [str(TOOL), command, server.url(), "--json"]
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    asked = [str(TOOL), command, server.url(path), "--json"]
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=theirs) as process:
         os.close(theirs)
         said, _ = process.communicate(timeout=120)
@@ -476,8 +487,10 @@ def test_a_terminal_shows_the_bytes_that_come(
             shown_there += part
     os.close(ours)
     assert f'"episodes": {EPISODES}' in said.decode()
-    assert re.search(what + rb".*[0-9.]+/[1-9][0-9.]* MB", shown_there)
-    assert shown_there.rindex(b"\x1b[?25h") > shown_there.rindex(what)  # it is gone, and the cursor is back
+    plain = re.sub(rb"\x1b\[[0-9;?]*[A-Za-z]", b"", shown_there)
+    assert re.search(what + rb" .*[0-9.]+/[1-9][0-9.]* MB ([0-9.]+ .B/s|\?) +[0-9:-]+", plain)
+    assert max(len(line.decode()) for line in re.split(rb"[\r\n]+", plain)) <= 80
+    assert shown_there.rindex(b"\x1b[?25h") > shown_there.rindex(b" MB")  # it is gone, and the cursor is back
 
 
 # ---- buckets

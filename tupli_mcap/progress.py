@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 _PATIENCE = 1.0  # seconds without a bar
+_BESIDE = 44  # columns of a terminal beside what is being done: the bar itself, sizes, speed and time
 _shown: list[object] = []  # the bar or other display that shows at the moment: at most one
 
 
@@ -74,12 +75,18 @@ class Progress:
         columns = [*Bar.get_default_columns()]
         if self._in_bytes:
             columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
+        console = Console(stderr=True)
         # The bar must not touch stdout.
-        self._bar = Bar(
-            *columns, console=Console(stderr=True), transient=True, auto_refresh=False, redirect_stdout=False
-        )
-        self._task = self._bar.add_task(self._what, total=self._total)
+        self._bar = Bar(*columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False)
+        self._task = self._bar.add_task(_within(self._what, console.width - _BESIDE), total=self._total)
         self._bar.start()
+
+
+def _within(what: str, width: int) -> str:
+    """A text of "downloading URL" or so within a width: the end of a longer one shows, which is the name of a file."""
+    doing, _, name = what.partition(" ")
+    room = max(width - len(doing) - 2, 1)
+    return what if len(what) <= width or not name else f"{doing} …{name[-room:]}"
 
 
 @contextmanager
