@@ -112,7 +112,7 @@ def test_an_episode_takes_its_chunks_and_no_more(server: WebServer, large: Path)
     row = expected.index[7]
     chunks = [span.chunk for span in store.spans(expected.file.steps[0], int(row["first_row"]), STEPS)]
     assert len(server.asked) <= 2
-    assert server.sent <= 1.2 * int(store.table["length"][chunks].sum())
+    assert server.sent <= 1.1 * int(store.table["length"][chunks].sum())
 
 
 def _ranges(server: WebServer) -> list[tuple[str | None, bool]]:
