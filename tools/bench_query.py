@@ -2,7 +2,7 @@
 memory.
 
 `python tools/bench_query.py` records CartPole on a server of its own. It queries as `POST /v1/query`, as datasets and
-as `pull` do. A proxy counts the bytes of all connections in both directions.
+as `pull` do. A proxy counts the bytes of all connections in both directions. Exits with 1 if a figure misses its limit.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ from tupli_mcap.schema import EpisodeMetadataCallback
 
 PASSWORD = "bench-password"
 PROGRAM = str(Path(sys.executable).with_name("tupli-mcap"))
+MOST_SENT = 0.02  # of the file
+MOST_MS = 100  # to the first byte, at best
+MOST_MEMORY = 10 << 20  # of the server, for each query at a time
 CHOSEN = F("metadata.chosen") == True  # noqa: E712 - an expression
 
 
@@ -120,8 +123,9 @@ def record(client: TupliAPIClient, episodes: int) -> tuple[str, int]:
     return uri.id if hasattr(uri, "id") else uri, client.open_recording(name).size
 
 
-def print_memory(server: psutil.Process, client: TupliAPIClient, place: Path, transfers: int) -> None:
-    """Prints how much more memory a server takes while it cuts a recording for many slow clients at once."""
+def measure_memory(server: psutil.Process, client: TupliAPIClient, place: Path, transfers: int) -> bool:
+    """Prints how much more memory a server takes while it cuts a recording for many slow clients at once; returns
+    whether that is within the limit."""
     random, steps = np.random.default_rng(0), 2000
     episodes = [
         EpisodeData(
@@ -151,8 +155,58 @@ def print_memory(server: psutil.Process, client: TupliAPIClient, place: Path, tr
     seconds = time.perf_counter() - began
     print(
         f"{transfers} queries at a time, each of {min(came):,} B: {(most - before) / 2**20:.0f} MiB above start, "
-        f"{sum(came) / seconds / 1e6:.0f} MB/s"
+        f"{sum(came) / seconds / 1e6:.0f} MB/s (must reach: at most {transfers * MOST_MEMORY >> 20} MiB)"
     )
+    return most - before <= transfers * MOST_MEMORY
+
+
+def measure_queries(client: TupliAPIClient, counter: Counter, place: Path, uri: str, size: int) -> bool:
+    """Prints what queries cost; returns whether that is within the limits."""
+    parts: list[float] = []
+    firsts: list[float] = []
+
+    def cost(what: str, act: Callable[[], Any]) -> Any:
+        source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+        before, began = counter.sent, time.perf_counter()
+        found = act()
+        seconds = time.perf_counter() - began
+        sent = counter.sent - before
+        parts.append(sent / size)
+        print(f"{what:36} {sent:10,} B {sent / size:7.2%} of the file  {seconds:6.3f} s")
+        return found
+
+    token = {"Authorization": f"Bearer {client._session._token()}"}
+    told = {"filter": CHOSEN.model_dump(mode="json")}
+
+    def query() -> bytes:
+        began = time.perf_counter()
+        with httpx.stream("POST", f"{counter.url}/v1/query", json=told, headers=token) as answer:
+            pieces = answer.iter_raw()
+            first = next(pieces)
+            firsts.append(1e3 * (time.perf_counter() - began))
+            return first + b"".join(pieces)
+
+    for _ in range(5):
+        (place / "cut.mcap").write_bytes(cost("POST /v1/query", query))
+    print(
+        f"first byte after {min(firsts):.1f} ms (must reach: at most {MOST_MS}), at worst {max(firsts):.1f} ms"
+    )
+    with Recording(place / "cut.mcap") as cut:
+        print(f"{len(cut)} episodes came, {cut.size / size:.2%} of the file")
+    dataset = TupliDataset(client).with_episode_filter(CHOSEN)
+    cost("TupliDataset(client) … .load()", dataset.load)
+    some = tupli_mcap.open(counter.url).filter("metadata.chosen")
+    cost("open(URL).filter(…).read()", some.read)
+    cost("… .save(), of what is open", lambda: some.save(place / "saved.mcap"))
+    again = tupli_mcap.open(counter.url).filter("metadata.chosen")
+    cost("open(URL).filter(…).save()", lambda: again.save(place / "again.mcap"))
+    chosen_of = ["--filter", "metadata.chosen", "--url", counter.url]
+    command = ["pull", uri, "--storage", str(place / "lab"), *chosen_of]
+    cost("tupli-mcap pull --filter", lambda: subprocess.run([PROGRAM, *command], check=True))
+    print(f"at most {max(parts):.2%} of the file (must reach: at most {MOST_SENT:.0%})")
+    good = max(parts) <= MOST_SENT and min(firsts) <= MOST_MS
+    cost("open(URL).read(), all of it", lambda: tupli_mcap.open(counter.url).read(["rewards"]))
+    return good
 
 
 def main() -> None:
@@ -173,42 +227,9 @@ def main() -> None:
             uri, size = record(client, chosen.episodes)
             print(f"{chosen.episodes:,} episodes in {size:,} B")
 
-            def cost(what: str, act: Callable[[], Any]) -> Any:
-                source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
-                before, began = counter.sent, time.perf_counter()
-                found = act()
-                seconds = time.perf_counter() - began
-                sent = counter.sent - before
-                print(f"{what:36} {sent:10,} B {sent / size:7.2%} of the file  {seconds:6.3f} s")
-                return found
-
-            token = {"Authorization": f"Bearer {client._session._token()}"}
-            told = {"filter": CHOSEN.model_dump(mode="json")}
-
-            def query() -> bytes:
-                began = time.perf_counter()
-                with httpx.stream("POST", f"{counter.url}/v1/query", json=told, headers=token) as answer:
-                    pieces = answer.iter_raw()
-                    first = next(pieces)
-                    print(f"first byte after {1e3 * (time.perf_counter() - began):.1f} ms")
-                    return first + b"".join(pieces)
-
-            for _ in range(3):
-                (place / "cut.mcap").write_bytes(cost("POST /v1/query", query))
-            with Recording(place / "cut.mcap") as cut:
-                print(f"{len(cut)} episodes came, {cut.size / size:.2%} of the file")
-            dataset = TupliDataset(client).with_episode_filter(CHOSEN)
-            cost("TupliDataset(client) … .load()", dataset.load)
-            some = tupli_mcap.open(counter.url).filter("metadata.chosen")
-            cost("open(URL).filter(…).read()", some.read)
-            cost("… .save(), of what is open", lambda: some.save(place / "saved.mcap"))
-            again = tupli_mcap.open(counter.url).filter("metadata.chosen")
-            cost("open(URL).filter(…).save()", lambda: again.save(place / "again.mcap"))
-            chosen_of = ["--filter", "metadata.chosen", "--url", counter.url]
-            command = ["pull", uri, "--storage", str(place / "lab"), *chosen_of]
-            cost("tupli-mcap pull --filter", lambda: subprocess.run([PROGRAM, *command], check=True))
-            cost("open(URL).read(), all of it", lambda: tupli_mcap.open(counter.url).read(["rewards"]))
-            print_memory(server, client, place, chosen.transfers)
+            good = measure_queries(client, counter, place, uri, size)
+            good &= measure_memory(server, client, place, chosen.transfers)
+    sys.exit(not good)
 
 
 if __name__ == "__main__":
