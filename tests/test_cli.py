@@ -795,7 +795,7 @@ class TestLook:
             1
         ]
         assert " ".join(told_row.split()) == f"r.mcap {row.format(size)}"
-        monkeypatch.setenv("COLUMNS", "60")
+        monkeypatch.setenv("COLUMNS", "76")
         assert ok("ls", "r.mcap").splitlines()[1].startswith("r.mcap ")  # the note is what is cut
         (listed,) = run("ls", "r.mcap", "--json").json
         for facts in (as_json, listed):
@@ -1702,6 +1702,30 @@ class TestProgram:
         assert "STARTED" in title
         for line, seed in zip(lines, (1, 2), strict=True):
             assert f"  ppo-seed{seed}  " in line and not line.endswith("…")
+
+    @pytest.mark.parametrize(
+        ("width", "columns", "state"),
+        [
+            (60, "RUN EPISODES STEPS RETURN STARTED", "complete"),
+            (80, "RECORDING RUN EPISODES STEPS RETURN SUCCESS STARTED", "complete"),
+            (80, "RUN EPISODES STEPS RETURN SUCCESS STARTED STATE", "incomplete"),
+            (100, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED", "complete"),
+            (130, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED SIZE STATE", "complete"),
+        ],
+    )
+    def test_runs_show_what_is_needed_most(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch, width: int, columns: str, state: str
+    ) -> None:
+        ok("record", "CartPole-v1", "-o", "runs/", "--name", "ppo-seed1")
+        (path,) = Path("runs").glob("*.mcap")
+        ok("tag", path, "--episodes", "0", "success=true")
+        if state == "incomplete":
+            path.write_bytes(path.read_bytes()[:-8])
+        monkeypatch.setenv("COLUMNS", str(width))
+        title, line = run("ls", "runs").out.splitlines()
+        assert title.split() == columns.split()
+        assert " ppo-seed1 " in f" {line}"
+        assert re.search(r" \d{4}-\d\d-\d\d \d\d:\d\d", line)
 
     @pytest.mark.parametrize("width", [100, 110, 130])
     def test_episodes_show_the_whole_names_of_their_runs(

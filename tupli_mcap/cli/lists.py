@@ -103,6 +103,13 @@ _COLUMNS = {
     "paths": _listed_by(attrgetter("paths"), Column("PATHS", shrink="end"), ", ".join),
 }
 _IN_TABLE: Final = [name for name in _COLUMNS if name not in ("split", "tags", "settings", "paths")]
+_BY_NEED: Final = (
+    "run", "episodes", "steps", "return", "started", "success", "state", "recording", "environment", "files", "size"
+)  # fmt: skip
+"""The columns in the order in which they get room."""
+_STARTED_IN_SHORT: Final = _listed_by(  # to the minute, in local time
+    attrgetter("started"), Column("STARTED"), lambda text: when(text)[:16]
+)
 _MEANT = {
     "date": "started",
     "time": "started",
@@ -116,6 +123,8 @@ _MEANT = {
 """Other names for columns, for a hint."""
 _SETTING = "run.metadata."
 _WHOLE_NAME: Final = 32  # characters of a run's name that are not cut where there is room
+_LEAST: Final = {"run": _WHOLE_NAME, "recording": 14, "environment": 16}
+"""To how many characters columns may shrink; the end of a recording's name is its time, if it was named after it."""
 
 
 def ls(
@@ -260,20 +269,19 @@ def _setting(path: Sequence[str], item: ListedRecording) -> Any:
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
-    roomy, wide = is_roomy(), is_wide()
-    paths = {item.path for item in items}
-    # whether the path of a run says which it is
-    by_path = len(paths) == len(items) and all(item.name in item.path for item in items)
+    wide = is_wide()
     shown = {
         "files": any(item.files > 1 for item in items),
-        "run": roomy or not by_path,
-        "environment": wide,
-        "success": any(item.success is not None for item in items),
-        "started": roomy,
-        "size": wide or (by_path and not roomy),
-        "state": wide or (by_path and not roomy) or any(item.state != "complete" for item in items),
+        "size": wide,
+        "state": wide or any(item.state != "complete" for item in items),
     }
-    return [_COLUMNS[name] for name in _IN_TABLE if shown.get(name, True)]
+    chosen = []
+    for name in _IN_TABLE:
+        if shown.get(name, True):
+            listed = _COLUMNS[name] if name != "started" or wide else _STARTED_IN_SHORT
+            column = listed.column._replace(least=_LEAST.get(name, 8), rank=_BY_NEED.index(name))
+            chosen.append(listed._replace(column=column))
+    return chosen
 
 
 def _json_of_runs(items: Sequence[ListedRecording], columns: str | None) -> list[dict[str, Any]]:
@@ -302,7 +310,7 @@ def _print_runs(items: Sequence[ListedRecording], names: str | None, empty: str)
     chosen = _chosen_columns(names, items)
     columns, cells = [one.column for one in chosen], [one.cells(items) for one in chosen]
     notes = [nan_text(r.return_nan, r.episodes) for r in items]
-    if any(notes) and _COLUMNS["return"] in chosen:
+    if any(notes) and any(column.title == "RETURN" for column in columns):
         columns.append(Column("NOTE ON RETURN", shrink="end"))
         cells.append(notes)
     print_table(columns, list(zip(*cells, strict=True)), empty=empty, named=names is not None)

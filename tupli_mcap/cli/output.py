@@ -26,12 +26,13 @@ _STORED = re.compile(r"\brecordings/(?:[0-9a-f]{64}|plain)/")
 
 class Column(NamedTuple):
     """A column of a table; `shrink` says which end of its values is cut if the terminal is too narrow, down to `least`
-    characters."""
+    characters. A column with a `rank` is left out if there is still no room, that of the highest rank first."""
 
     title: str
     align: Literal["left", "right"] = "left"
     shrink: Literal["start", "end"] | None = None
     least: int = 8
+    rank: int = 0
 
 
 def print_table(
@@ -45,13 +46,15 @@ def print_table(
     if not cells:
         say(empty)
         return
-    shown = [i for i in range(len(columns)) if named or any(row[i] for row in cells)]
-    columns = [columns[i] for i in shown]
-    cells = [[row[i] for i in shown] for row in cells]
     widths = [
         max(cell_len(text) for text in (column.title, *(row[i] for row in cells)))
         for i, column in enumerate(columns)
     ]
+    shown = _with_room(
+        columns, widths, [i for i in range(len(columns)) if named or any(row[i] for row in cells)]
+    )
+    columns, widths = [columns[i] for i in shown], [widths[i] for i in shown]
+    cells = [[row[i] for i in shown] for row in cells]
     _fit(columns, widths)
     lines = [_line(columns, widths, [column.title for column in columns])]
     lines += [_line(columns, widths, row) for row in cells]
@@ -267,6 +270,22 @@ def when(created_at: str) -> str:
     return created_at if found is None else time_of(found)
 
 
+def _least(column: Column, width: int) -> int:
+    """How narrow a column may become."""
+    return min(width, max(len(column.title), column.least)) if column.shrink else width
+
+
+def _with_room(columns: Sequence[Column], widths: Sequence[int], among: Sequence[int]) -> list[int]:
+    """The columns that are shown: those without a rank, and by their ranks, the others for which there is room."""
+    limit, kept, taken = terminal_width(), list[int](), -len(_GAP)
+    for i in sorted(among, key=lambda i: columns[i].rank):
+        needed = len(_GAP) + _least(columns[i], widths[i])
+        if limit is None or not columns[i].rank or taken + needed <= limit:
+            kept.append(i)
+            taken += needed
+    return sorted(kept)
+
+
 def _fit(columns: Sequence[Column], widths: list[int]) -> None:
     """Narrows the columns that may shrink, the widest first, until the table fits."""
     limit = terminal_width()
@@ -276,8 +295,7 @@ def _fit(columns: Sequence[Column], widths: list[int]) -> None:
     excess = sum(widths) + len(_GAP) * (len(widths) - 1) - limit
     while excess > 0 and shrinkable:
         widest = max(shrinkable, key=lambda i: widths[i])
-        least = max(len(columns[widest].title), columns[widest].least)
-        if widths[widest] <= least:
+        if widths[widest] <= _least(columns[widest], widths[widest]):
             shrinkable.remove(widest)
             continue
         widths[widest] -= 1
