@@ -112,8 +112,14 @@ def test_the_choice_is_of_each_recording_and_of_many_of_all(tmp_path: Path) -> N
     )
     assert two.scalars("/reward")[:, 0].tolist() == [0, 0, 1, 1]
     four = Rrd(viewer.save(paths, tmp_path / "four.rrd", note=notes.append))
-    assert notes[1].startswith("3 of 24 episodes: 5 (last), 0 (best), 0 (worst)")
+    assert notes[1].startswith(
+        "3 of 24 episodes: 5 of run d (last), 0 of run d (best), 0 of run a (worst). Others: "
+    )
     assert four.scalars("/reward")[:, 0].tolist() == [3, 3, 0]
+    # the returns are of all recordings, also of those without a chosen episode
+    assert four.scalars("/overview/return")[:, 0].tolist() == [float(i) for i in range(4) for _ in range(6)]
+    (marks,) = four.rows("/overview/shown", "BarChart:values")[0]
+    assert list(marks["buffer"]) == [3, 3, 0]
 
 
 def test_success_and_the_name_of_the_run_are_told(tmp_path: Path) -> None:

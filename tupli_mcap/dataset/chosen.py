@@ -191,8 +191,9 @@ def chosen_ids(
         return {item.recording.episodes[at].id for item in chosen for at in item.positions}
 
 
-def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
-    """The last, the best and the worst of some episodes, each with a caption: `199 (last, best)`."""
+def extremes(chosen: Sequence[Chosen], title_of: Callable[[Chosen], str]) -> tuple[list[Chosen], list[str]]:
+    """The last, the best and the worst of some episodes, each with a caption: `199 (last, best)`, or with a title,
+    if they are of several: `199 of ppo-seed3 (last, best)`."""
     returns = np.concatenate([item.recording.index["return"][list(item.positions)] for item in chosen])
     bounds = np.cumsum([0, *(len(item.positions) for item in chosen)])
     words: dict[int, list[str]] = {}
@@ -206,7 +207,8 @@ def extremes(chosen: Sequence[Chosen]) -> tuple[list[Chosen], list[str]]:
         recording, positions = chosen[which]
         position = positions[at - int(bounds[which])]
         found.setdefault(which, []).append(position)
-        told.append(f"{recording.index['episode'][position]} ({', '.join(said)})")
+        of = f" of {title_of(chosen[which])}" if len(chosen) > 1 else ""
+        told.append(f"{recording.index['episode'][position]}{of} ({', '.join(said)})")
     return [Chosen(chosen[which].recording, positions) for which, positions in found.items()], told
 
 

@@ -181,5 +181,5 @@ def _planned(
         some, choice = extremes_of(of_runs) if episodes is None else (of_runs, "")
         if choice and note is not None:
             note(choice)
-        plans = plans_of(some, form)
+        plans = plans_of(some, form, among=chosen)
         yield (plan._replace(shown=f"{plain(choice)}\n\n{plan.shown}") for plan in plans) if choice else plans

@@ -29,10 +29,15 @@ _MOST_CARDS, _MOST_UNSEEN = 5, 20
 
 
 def send_about(
-    stream: Any, recordings: Sequence[Recording], chosen: Sequence[Chosen], shown: str, unseen: Sequence[str]
+    stream: Any,
+    recordings: Sequence[Recording],
+    among: Sequence[Recording],
+    chosen: Sequence[Chosen],
+    shown: str,
+    unseen: Sequence[str],
 ) -> None:
-    """Sends `/card`, and `/overview/return` and `/overview/length` of all episodes, on the timeline `episode`. The bars
-    of the `chosen` ones are marked."""
+    """Sends `/card` about recordings, and `/overview/return` and `/overview/length` of all episodes of those `among`
+    which they are, on the timeline `episode`. The bars of the `chosen` ones are marked."""
     texts = [card(recording) for recording in recordings[:_MOST_CARDS]]
     if len(recordings) > _MOST_CARDS:
         texts.append(f"and {len(recordings) - _MOST_CARDS:,} more recordings")
@@ -43,14 +48,14 @@ def send_about(
     document = rr.TextDocument(f"{shown}\n\n" + "\n\n".join(texts) + notes, media_type=rr.MediaType.MARKDOWN)
     stream.log("/card", document, static=True)
     for name in ("return", "length"):
-        values = np.concatenate([recording.index[name] for recording in recordings]).astype(np.float64)
+        values = np.concatenate([recording.index[name] for recording in among]).astype(np.float64)
         number = rr.TimeColumn("episode", sequence=np.arange(len(values)))
         stream.send_columns(
             f"/overview/{name}", [number], [column_of(rr.Scalars.descriptor_scalars(), pa.array(values))]
         )
         stream.log(f"/overview/{name}", _bars(values), static=True)
     if chosen:
-        stream.log("/overview/shown", _marks(recordings, chosen), static=True)
+        stream.log("/overview/shown", _marks(among, chosen), static=True)
 
 
 def _marks(recordings: Sequence[Recording], chosen: Sequence[Chosen]) -> Any:

@@ -57,13 +57,15 @@ class ShownEpisodes(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """One Rerun recording: its name, its parts, its blueprint."""
+    """One Rerun recording: its name, its parts, its blueprint. The returns of all episodes are those of `among`, by
+    default of the recordings of its parts."""
 
     name: str
     identity: str
     parts: Sequence[ShownEpisodes]
     shown: str
     listed: bool = False  # it is one of several, so the viewer shows its list of recordings
+    among: Sequence[Recording] = ()
 
     @property
     def blueprint(self) -> Any:
@@ -72,7 +74,7 @@ class Plan(NamedTuple):
 
     @property
     def _shows_some_of_many(self) -> bool:
-        total = sum(len(recording.index) for recording in self.recordings)
+        total = sum(len(recording.index) for recording in self.among or self.recordings)
         return total > max(_FEW, sum(len(part.chosen.positions) for part in self.parts))
 
     @property
@@ -100,7 +102,8 @@ class Plan(NamedTuple):
         """Sends everything, a block of steps at a time."""
         stream.send_recording_name(self.name)
         chosen = [part.chosen for part in self.parts] if self._shows_some_of_many else []
-        send_about(stream, self.recordings, chosen, self.shown, self.parts[0].scene.unseen)
+        among = self.among or self.recordings
+        send_about(stream, self.recordings, among, chosen, self.shown, self.parts[0].scene.unseen)
         steps: dict[str, int] = {}
         for part in self.parts:
             steps[part.root] = steps.get(part.root, 0) + part.steps
@@ -154,7 +157,7 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
     some: list[Chosen] = []
     told: list[str] = []
     for group in groups:
-        found, words = extremes(group)
+        found, words = extremes(group, _title)
         some += found
         of = f" of {_title(group[0])}" if len(groups) > 1 else ""
         told.append(", ".join(words) + of)
@@ -163,8 +166,9 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
     return some, f"{number} of {total:,} episodes: {'; '.join(told)}. Others: {others}"
 
 
-def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
-    """The Rerun recordings that show the chosen episodes. RecordingError if there are too many for this form."""
+def plans_of(chosen: Sequence[Chosen], form: Form, among: Sequence[Chosen] = ()) -> Iterator[Plan]:
+    """The Rerun recordings that show the chosen episodes; together they show the returns of all recordings that they
+    were chosen from, as far as those have the same spaces. RecordingError if there are too many for this form."""
     total = sum(len(item.positions) for item in chosen)
     if form == "apart":
         if total > _MOST_APART:
@@ -178,13 +182,19 @@ def plans_of(chosen: Sequence[Chosen], form: Form) -> Iterator[Plan]:
             raise RecordingError(
                 f"expected at most {_MOST_COMPARED} episodes to compare, found {total}; choose some of them"
             )
-        yield _compared(chosen)
+        yield _compared(chosen)._replace(among=_alike(chosen[0], among))
     else:
         alike: dict[str, list[Chosen]] = {}
         for item in chosen:
             alike.setdefault(_spaces_of(item.recording), []).append(item)
         for group in alike.values():  # recordings of different spaces need different plots
-            yield _joined(group)._replace(listed=len(alike) > 1)
+            yield _joined(group)._replace(listed=len(alike) > 1, among=_alike(group[0], among))
+
+
+def _alike(chosen: Chosen, among: Sequence[Chosen]) -> list[Recording]:
+    """The recordings that have the same spaces, each once."""
+    spaces = _spaces_of(chosen.recording)
+    return [each for each in {item.recording: None for item in among} if _spaces_of(each) == spaces]
 
 
 def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
