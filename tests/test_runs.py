@@ -903,6 +903,19 @@ class TestCommands:
         ):
             done = CliRunner().invoke(app, ["ls", str(tmp_path), "--filter", text])
             assert done.stderr == f"warning: {kinds}\n"
+        for line in (
+            "ls -e best", "episodes -e best", "info", "info -e best", "doctor", "doctor -e best", "tag a=1",
+            "tag a=1 -e best", "delete", "verify --rerun", "plot -o x.png", "view --save x.rrd", "render -o x.gif",
+            "filter -o x.mcap", "filter -e best -o x.mcap", "trim --steps 1: -o x.mcap",
+            "trim -e best --steps 1: -o x.mcap",
+        ):  # fmt: skip
+            name, *words = line.split()
+            given = [name, str(tmp_path), *words, "--filter"]
+            done = CliRunner().invoke(app, [*given, "run.name = 'ppo-sed1'"])
+            hint = "warning: no run.name is 'ppo-sed1' (did you mean 'ppo-seed1'?)\n"
+            assert done.stderr.startswith(hint), line
+            done = CliRunner().invoke(app, [*given, "metadata.color = 1"])
+            assert (done.exit_code, done.stderr.count("no episode has metadata.color")) == (2, 1), line
         far = CliRunner().invoke(
             app, ["ls", str(tmp_path), "--filter", "run.name = 'sac' or run.name = 'ppo-seed1' and steps < 0"]
         )

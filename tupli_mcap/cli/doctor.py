@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of, pair_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, check_there, filter_of, hinting, pair_of
 from tupli_mcap.cli.output import Column, counted, number, print_json, print_rows, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
 from tupli_mcap.errors import RecordingError
@@ -78,6 +78,7 @@ def doctor(
     thresholds = _thresholds(settings or (), [*(check or ()), *(skip or ())])
     wanted, sources = filter_of(filter_text), paths or ["."]
     with (
+        hinting(sources, wanted),
         nullcontext(sources) if episodes is None else chosen_from(sources, episodes, wanted) as chosen,
         status("examining") as progress,
     ):
@@ -93,6 +94,8 @@ def doctor(
         raise RecordingError(
             "there is nothing to examine; give recordings (.mcap), directories or storages of them"
         )
+    if wanted is not None and not diagnosis.episodes:
+        check_there(sources, wanted)
     if as_json:
         print_json({key: value for key, value in diagnosis.to_dict().items() if key != "version"})
     else:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, Sources, dataset_of, filter_of
+from tupli_mcap.cli.options import (
+    Episodes,
+    FilterText,
+    Json,
+    Sources,
+    dataset_of,
+    filter_of,
+    hinting,
+    matching_in,
+)
 from tupli_mcap.cli.output import (
     Column,
     counted,
@@ -51,9 +60,10 @@ def _dataset(sources: Sequence[str], episodes: str | None, wanted: BaseFilter | 
             raise RecordingError(f"{source} is a directory; expected a recording (.mcap) in it, found none")
     dataset = dataset_of(sources)
     if episodes is not None:
-        ids = chosen_ids(sources, episodes, wanted)
+        with hinting(sources, wanted):
+            ids = chosen_ids(sources, episodes, wanted)
         return dataset[[header.id in ids for header in dataset.headers]]
-    return dataset if wanted is None else dataset.filter(wanted)
+    return dataset if wanted is None else matching_in(dataset, wanted)
 
 
 def _info_keys(dataset: Dataset) -> list[str]:
@@ -169,7 +179,8 @@ def info(
         positions = candidates(recording, wanted)  # without deleted episodes
         if episodes is not None or wanted is not None:
             which = "all" if episodes is None else episodes
-            positions = np.array(sorted(named_positions(recording, positions, which, wanted)))
+            with hinting(paths, wanted):
+                positions = np.array(sorted(named_positions(recording, positions, which, wanted)))
         description = describe(recording, positions)
         if not as_json:
             print_facts(_facts(description))

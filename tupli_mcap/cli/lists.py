@@ -23,6 +23,7 @@ from tupli_mcap.cli.options import (
     check_there,
     dataset_of,
     filter_of,
+    hinting,
     matching_in,
 )
 from tupli_mcap.cli.output import (
@@ -182,7 +183,8 @@ def _chosen_ids(sources: Sequence[str], which: str | None, wanted: BaseFilter | 
         return None
     from tupli_mcap.dataset.chosen import chosen_ids
 
-    return chosen_ids(sources, which, wanted)
+    with hinting(sources, wanted):
+        return chosen_ids(sources, which, wanted)
 
 
 def _listed(source: str, wanted: BaseFilter | None, ids: set[str] | None) -> Iterator[ListedRecording]:

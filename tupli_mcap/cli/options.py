@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.errors import Gathered, NotFoundError, RecordingError, StorageError, missing_extra, warn
+from tupli_mcap.errors import (
+    FilterError,
+    Gathered,
+    NotFoundError,
+    RecordingError,
+    StorageError,
+    TupliError,
+    missing_extra,
+    warn,
+)
 from tupli_mcap.remote import is_server, is_url, path_of, shown, shown_name
 
 if TYPE_CHECKING:
@@ -149,6 +158,25 @@ def check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
         matching_in(dataset_of(found), wanted)
 
 
+@contextmanager
+def hinting(sources: Sequence[str], wanted: BaseFilter | None) -> Iterator[None]:
+    """If the block fails because no episode matches the filter, says before its error what the filter may mean, or
+    raises a FilterError instead; see `check_there`."""
+    try:
+        yield
+    except FilterError:
+        raise
+    except TupliError as err:
+        if wanted is not None:
+            try:
+                check_there(sources, wanted)
+            except FilterError:
+                raise
+            except TupliError:  # what the block has met, too
+                raise err from None
+        raise
+
+
 def matching_in(dataset: Dataset, wanted: BaseFilter) -> Dataset:
     """The episodes that match. If there is none, a warning or a FilterError says what the filter may mean."""
     from tupli_mcap.dataset.keys import unlike_any
@@ -166,9 +194,11 @@ def chosen_in(
     if no episode has what the filter names."""
     from tupli_mcap.dataset.which import numbers_in
 
-    found = numbers_in(places, episodes, filter_of(filter_text), gathered)
+    wanted = filter_of(filter_text)
+    found = numbers_in(places, episodes, wanted, gathered)
     if not found:
-        gathered.raise_all()
+        with hinting(list(map(str, places)), wanted):
+            gathered.raise_all()
         raise none_in(list(map(str, places)), filter_text)
     return found
 

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, check_extras, filter_of
+from tupli_mcap.cli.options import (
+    Episodes,
+    FilterText,
+    Force,
+    Json,
+    Sources,
+    check_extras,
+    filter_of,
+    hinting,
+)
 from tupli_mcap.cli.output import counted, number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, bytes_of
@@ -83,9 +92,10 @@ def render(
 
     # nothing is shown on a screen: pygame must not look for one
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    wanted = "best" if episodes is None else episodes
+    wanted = filter_of(filter_text)
     with (
-        _chosen(source, wanted, filter_of(filter_text)) as (recording, chosen),
+        hinting([source], wanted),
+        _chosen(source, "best" if episodes is None else episodes, wanted) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         which = _which(recording, chosen)
@@ -240,7 +250,8 @@ def plot(
 
     goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")
     check_goal(goal, overwrite=force)
-    made = report(paths, episode=episode, episode_filter=filter_of(filter_text), x=x)
+    with hinting(paths, wanted := filter_of(filter_text)):
+        made = report(paths, episode=episode, episode_filter=wanted, x=x)
     made.save(goal, overwrite=force)
     size = goal.stat().st_size
     episodes, steps = (

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Json, filter_of
+from tupli_mcap.cli.options import Episodes, FilterText, Json, check_there, filter_of
 from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, TupliError
@@ -56,7 +56,8 @@ def verify(
     if an episode differs, or if none could be checked. --episodes and --filter choose the
     episodes; those that they depend on are run again too.
     """
-    reruns = _Reruns(trust, episodes, filter_of(filter_text)) if rerun else None
+    wanted = filter_of(filter_text)
+    reruns = _Reruns(trust, episodes, wanted) if rerun else None
     if reruns is None and (trust or episodes is not None or filter_text is not None):
         raise typer.BadParameter("--trust, --episodes and --filter go with --rerun")
     from tupli_mcap.storage.verify import verify_paths
@@ -70,6 +71,8 @@ def verify(
             reruns.add(report.path, path, quiet=as_json)
     if not reports:
         raise RecordingError("there is nothing to verify; give recordings (.mcap) or directories of them")
+    if wanted is not None and reruns is not None and not reruns.tried:
+        check_there(paths, wanted)
     damaged = sum(not report.ok for report in reports)
     if as_json:
         told: dict[str, Any] = {"ok": not damaged, "files": len(reports), "damaged": damaged}

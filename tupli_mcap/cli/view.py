@@ -4,14 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import Episodes, FilterText, Force, Json, Sources, check_extras, filter_of
+from tupli_mcap.cli.options import (
+    Episodes,
+    FilterText,
+    Force,
+    Json,
+    Sources,
+    check_extras,
+    filter_of,
+    hinting,
+)
 from tupli_mcap.cli.output import print_result
 from tupli_mcap.cli.terminal import flush
 from tupli_mcap.errors import bytes_of
+
+if TYPE_CHECKING:
+    from tupli_mcap import viewer
+    from tupli_mcap.schema import BaseFilter
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Apart = Annotated[
@@ -75,13 +88,30 @@ def view(
     if force and save is None:
         raise typer.BadParameter("--force goes with --save or --layout, whose file it replaces")
     check_extras(sources, rerun="rerun")
-    from tupli_mcap import viewer
     from tupli_mcap.viewer.sdk import import_quickly
 
     form: viewer.Form = "compare" if compare else "apart" if apart else "joined"
     import_quickly()
+    with hinting(sources, wanted := filter_of(filter_text)):
+        _show(sources, episode, wanted, form, save, web=web, connect=connect, force=force, as_json=as_json)
+
+
+def _show(
+    sources: list[str],
+    episode: str | None,
+    wanted: BaseFilter | None,
+    form: viewer.Form,
+    save: Path | None,
+    *,
+    web: bool,
+    connect: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    from tupli_mcap import viewer
+
     notes: list[str] = []
-    shown: dict[str, Any] = {"filter": filter_of(filter_text), "form": form, "note": notes.append}
+    shown: dict[str, Any] = {"filter": wanted, "form": form, "note": notes.append}
     if save is not None:
         commands: list[str] = []
         path = viewer.save(sources, save, episode, overwrite=force, tell=commands.append, **shown)

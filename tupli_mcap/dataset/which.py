@@ -70,7 +70,7 @@ def named_places(
 ) -> list[int]:
     """The places that a text names among the episodes of `name` with these numbers and returns, in its order, each
     once. Raises as `named_positions`."""
-    why = "" if filter is None else f" that matches {_text_of(filter)}"
+    why = "" if filter is None else f" that matches {text_of(filter)}"
     if not len(numbers):
         raise RecordingError(f"{name} has no episode{why}")
     chosen: dict[int, None] = {}
@@ -84,7 +84,7 @@ def named_places(
     return list(chosen)
 
 
-def _text_of(filter: BaseFilter) -> str:
+def text_of(filter: BaseFilter) -> str:
     """A filter as users write it in a text, or else as an expression."""
     try:
         return format_filter(filter)

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 
 from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
-from tupli_mcap.dataset.which import named_positions
+from tupli_mcap.dataset.which import named_positions, text_of
 from tupli_mcap.errors import RecordingError, asking, os_reason
 from tupli_mcap.files import write_bytes
 from tupli_mcap.plots import texts
@@ -84,7 +84,7 @@ def report(
         if episode_filter is not None:
             runs = [(subject, one) for subject, one in runs if len(one.rows)]
             if not runs:
-                raise RecordingError(f"no episode matches {episode_filter}; use another filter")
+                raise RecordingError(f"no episode matches {text_of(episode_filter)}; use another filter")
         measured = [one for _, one in runs]
         _shorten_names(measured)
         traces = _traces(runs, str(episode))

@@ -17,6 +17,7 @@ from tupli_mcap.cli.options import (
     Sources,
     dataset_of,
     filter_of,
+    hinting,
     none_in,
     recordings_of,
 )
@@ -117,22 +118,24 @@ def filter_(
 
     wanted, query = filter_of(filter_text), filter_text or ""
     if episodes is not None:
-        wanted = FilterIN(key="id", value=sorted(chosen_ids(sources, episodes, wanted)))
+        with hinting(sources, wanted):
+            wanted = FilterIN(key="id", value=sorted(chosen_ids(sources, episodes, wanted)))
         query = f"episodes {episodes}" if filter_text is None else f"{filter_text}, episodes {episodes}"
     if wanted is None:
         raise typer.BadParameter(
             "expected --filter or --episodes, found neither; to copy all episodes, merge them"
         )
-    report = filter_dataset(
-        dataset_of(sources),
-        output,
-        wanted,
-        query=query,
-        sort=sort,
-        limit=limit,
-        overwrite=force,
-        dry_run=dry_run,
-    )
+    with hinting(sources, wanted):
+        report = filter_dataset(
+            dataset_of(sources),
+            output,
+            wanted,
+            query=query,
+            sort=sort,
+            limit=limit,
+            overwrite=force,
+            dry_run=dry_run,
+        )
     _print_made(report, dry_run=dry_run, as_json=as_json)
 
 
@@ -169,7 +172,8 @@ def trim(
         raise typer.BadParameter(f"--steps: expected a slice such as 10:-5, 10: or :200, found {steps!r:.80}")
     dataset, wanted = dataset_of(sources), filter_of(filter_text)
     if episodes is not None:
-        ids = chosen_ids(sources, episodes, wanted)
+        with hinting(sources, wanted):
+            ids = chosen_ids(sources, episodes, wanted)
     else:
         ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
         if not ids:

@@ -16,6 +16,7 @@ from tupli_mcap.cli.options import (
     StoragePath,
     filter_of,
     full_id,
+    hinting,
     open_storage,
 )
 from tupli_mcap.cli.output import counted, number, print_facts, print_json, print_result
@@ -73,8 +74,9 @@ def bundle(
         ):
             bundle_recording(path, output, known, key)
     else:
-        with open_storage(storage_path) as storage:
-            storage.bundle(full_id(storage, source), output, filter_of(filter_text), sign=key)
+        wanted = filter_of(filter_text)
+        with open_storage(storage_path) as storage, hinting([str(storage_path)], wanted):
+            storage.bundle(full_id(storage, source), output, wanted, sign=key)
     _print_written(output, as_json)
 
 
@@ -99,8 +101,9 @@ def export(
     --filter 'benchmark_id = "..."'. Several recordings are merged, as merge does. Artifacts
     are left out; use bundle to include them.
     """
-    with open_storage(storage_path) as storage:
-        storage.export(output, filter_of(filter_text))
+    wanted = filter_of(filter_text)
+    with open_storage(storage_path) as storage, hinting([str(storage_path)], wanted):
+        storage.export(output, wanted)
     _print_written(output, as_json)
 
 
