@@ -14,6 +14,8 @@ import pytest
 from tupli_mcap import RecordEpisodes, viewer
 from tupli_mcap.cli import app
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.describe.description import describe
+from tupli_mcap.schema.times import local_text
 
 rr = pytest.importorskip("rerun")
 from rrd import Rrd, joined_rows, states_of  # noqa: E402
@@ -131,6 +133,7 @@ def test_success_and_the_name_of_the_run_are_told(tmp_path: Path) -> None:
     found = Rrd(viewer.save(path, tmp_path / "r.rrd"))
     card = found.rows("/card", "TextDocument:text")[0][0]
     assert "### ppo-seed3" in card and "| success | 50% |" in card
+    assert f"| recorded | {local_text(describe(Recording(path)).created_ns)} |" in card.replace("\\", "")
     assert "**Episode 0**: 1 step, return 0, terminal, success" in card
     assert "**Episode 1**: 1 step, return 0, terminal, no success" in card
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +13,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.run import name_after
 from tupli_mcap.recording.about.success import success_text
 from tupli_mcap.recording.describe.description import describe, nan_text
+from tupli_mcap.schema.times import local_text
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.names import plain, title_of
 from tupli_mcap.viewer.panels import PALETTE
@@ -101,7 +101,7 @@ def card(recording: Recording) -> str:
     rows += _leaf_rows(recording)
     rows += [
         ("benchmark", d.benchmark_id[:12] or "none"),
-        ("recorded", f"{datetime.fromtimestamp(d.created_ns // 10**9, UTC):%Y-%m-%d %H:%M} UTC"),
+        ("recorded", local_text(d.created_ns)),
         ("file", d.name),
     ]
     lines = [f"| {plain(name)} | {plain(value)} |" for name, value in rows]
