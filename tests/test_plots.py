@@ -619,10 +619,13 @@ def test_recordings_are_compared(tmp_path: Path) -> None:
     assert [one.name for one, _ in made.traces] == [best]
     check_formats(made, tmp_path, page=False)
     assert not [text for text in texts(made) if "lines are" in text]  # of so few episodes each is on them
-    with pytest.raises(
-        RecordingError, match="expected best, worst, first or last of 2 recordings, found '3'"
-    ):
-        report(tmp_path, episode=3)
+    numbered = report(tmp_path, episode="3,best").traces
+    assert {one.name for one, _ in numbered} == {"quick", "slow"}
+    assert [one.episode for _, one in numbered[:2]] == [3, 3]
+    with pytest.raises(RecordingError, match="the set of 2 recordings has no episode 999; choose from 0 to"):
+        report(tmp_path, episode=999)
+    with pytest.raises(RecordingError, match="expected at most 4 episodes to show in full, found 6"):
+        report(tmp_path, episode="0-2")
 
 
 def test_counts_of_compared_recordings(tmp_path: Path) -> None:
@@ -1212,7 +1215,7 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             "no episode matches n_tuples > 99999; use another filter",
         ),
         (["cartpole.mcap", "--filter", "n_tuples >"], 2, "error: "),
-        (["cartpole.mcap", "--x", "days"], 2, "'days' is not one of 'steps', 'episodes', 'time'"),
+        (["cartpole.mcap", "--x", "days"], 2, "for '--x': 'days' is not one of 'steps', 'episodes', 'time'"),
         (["cartpole.mcap", "--filter", "color = 3"], 2, "color"),
         ([], 2, "Missing argument"),
     ],

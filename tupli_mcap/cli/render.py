@@ -215,8 +215,9 @@ _Shown = Annotated[
     typer.Option(
         "--episodes",
         "--episode",
-        metavar="N|best|worst|...",
-        help="The episode whose steps are shown: a number, best, worst, first, last.",
+        "-e",
+        metavar="WHICH",
+        help="Up to four episodes whose steps are shown: numbers such as 3,7-9, or best, worst, first, last.",
     ),
 ]
 _Axis = Annotated[
@@ -239,7 +240,7 @@ def plot(
     """Draw a report of recordings as a picture or a page.
 
     It shows returns, lengths, success, numbers in infos and metadata, states, actions,
-    rewards, and one episode step by step. Several recordings are compared. Runs whose names
+    rewards, and one or more episodes step by step. Several recordings are compared. Runs whose names
     and settings differ only by their seeds are drawn as one: a thin line for each, and their
     mean with its 95% interval (percentile bootstrap) as far as all of them go. The extension
     of the output sets its format; an .html needs no network. Nothing in a file is executed.

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import numpy as np
 
 from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
-from tupli_mcap.dataset.which import named_positions, text_of
+from tupli_mcap.dataset.which import named_places, text_of
 from tupli_mcap.errors import RecordingError, asking, os_reason
 from tupli_mcap.files import write_bytes
 from tupli_mcap.plots import texts
@@ -53,8 +53,8 @@ def report(
         source: the path of a recording or of a directory (a storage, too), a URL, an open `Recording`, a
             `Dataset`, a `TupliDataset`, a storage, or several of those. Deleted episodes are left out, and so, with a
             warning, are those that another file of the same directory has.
-        episode: the episode whose steps are shown: a number, "best", "worst", "first" or "last"; for one recording
-            also several, such as "3,7".
+        episode: the episode whose steps are shown: a number, "best", "worst", "first" or "last"; also up to four, such
+            as "3,7" or "best,worst". Of several recordings, a number is that of each which has it.
         episode_filter: show only episodes that match it.
         x: the horizontal axis of returns, lengths and the like: "steps" of the run, "episodes" (their numbers), or
             "time" since its start; each at the end of an episode. By default, "episodes" for one recording, and "steps"
@@ -231,35 +231,23 @@ def _shorten_names(measured: Sequence[Measured]) -> None:
 
 
 def _traces(runs: Sequence[tuple[Subject, Measured]], episode: str) -> Traces:
-    """The chosen episodes, step by step."""
+    """The chosen episodes, step by step. Of several recordings, a number is that of each which has it."""
     filled = [(subject, one) for subject, one in runs if len(one.rows)]
     if not filled:
         return []
-    word, at = episode.strip().lower(), 0
-    several = len({id(subject) for subject, _ in filled}) > 1
-    if several and word not in ("best", "worst", "first", "last"):
-        raise RecordingError(
-            f"expected best, worst, first or last of {len(filled)} recordings, found {episode[:40]!r}; "
-            "give one recording to choose an episode by its number"
-        )
-    if word == "last":
-        at = len(filled) - 1
-    elif word in ("best", "worst"):
-        sign = 1 if word == "best" else -1
-        highest = [np.nan_to_num(sign * one.rows["return"], nan=-np.inf).max() for _, one in filled]
-        at = int(np.argmax(highest))
-    subject = filled[at][0]
-    run_of = {number: one for of, one in filled if of is subject for number in one.rows["episode"].tolist()}
-    with subject.open() as recording:
-        positions = named_positions(recording, subject.choose(recording), episode)
-        if len(positions) > _MOST_TRACES:
-            raise RecordingError(
-                f"expected at most {_MOST_TRACES} episodes to show in full, found {len(positions)}"
-            )
-        chosen = [
-            (run_of[int(recording.index["episode"][position])], int(position)) for position in positions
-        ]
-        return [(one, trace(recording, position, one)) for one, position in chosen]
+    rows = np.concatenate([one.rows for _, one in filled])
+    names = list(dict.fromkeys(subject.name for subject, _ in filled))
+    where = names[0] if len(names) == 1 else f"the set of {len(names)} recordings"
+    named = named_places(where, rows["episode"], rows["return"], episode)
+    if len(named) > _MOST_TRACES:
+        raise RecordingError(f"expected at most {_MOST_TRACES} episodes to show in full, found {len(named)}")
+    each = [(i, int(position)) for i, (_, one) in enumerate(filled) for position in one.positions]
+    traces: list[tuple[Measured, Trace]] = []
+    for i, position in map(each.__getitem__, named):
+        subject, one = filled[i]
+        with subject.open() as recording:
+            traces.append((one, trace(recording, position, one)))
+    return traces
 
 
 def _make_comparable(measured: Sequence[Measured]) -> list[str]:
