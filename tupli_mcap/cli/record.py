@@ -39,7 +39,9 @@ _Output = Annotated[
 _Steps = Annotated[
     int | None,
     typer.Option(
-        min=1, help="How many steps to record, in total; by default 1000 if --episodes is not given."
+        min=1,
+        help="How many steps to record, in all sub-environments together (up to --num-envs minus 1 more); "
+        "by default 1000 if --episodes is not given.",
     ),
 ]
 _Episodes = Annotated[
