@@ -295,6 +295,9 @@ def test_recording_to_an_unknown_benchmark_is_refused(storage: FileStorage) -> N
         TupliEnvWrapper.load(storage)
     with pytest.raises(StorageError, match="the other way round"):
         TupliEnvWrapper.load("0" * 64, storage)  # type: ignore[arg-type]
+    for ids in ((), ("0" * 64,)):
+        with pytest.raises(StorageError, match="there is no storage at 'typo'"):
+            TupliEnvWrapper.load("typo", *ids)
 
 
 def test_episodes_are_recorded_with_their_metadata(storage: FileStorage) -> None:

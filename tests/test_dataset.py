@@ -744,6 +744,9 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
         TupliDataset.from_files(tmp_path / "bad.mcap").preview()
     with pytest.raises(StorageError, match=r"expected the directory of a storage.*tupli_mcap.open"):
         TupliDataset("runs/*.mcap")
+    with pytest.raises(StorageError, match=r"there is no storage at '.*typo'"):
+        TupliDataset(tmp_path / "typo")
+    assert not (tmp_path / "typo").exists()
     assert TupliDataset(tmp_path).storage.root == tmp_path  # type: ignore[union-attr]
 
 

@@ -314,15 +314,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             NotFoundError: There is no such benchmark.
+            StorageError: There is no storage at the path.
             UntrustedError: It would run code that this user has not trusted, without `trust=True`.
         """
+        if isinstance(benchmark_id, TupliStorage):
+            raise StorageError("expected a storage and then a benchmark_id, found them the other way round")
+        opened = storage_at(storage, existing=True)
         if benchmark_id is None:
             raise NotFoundError(
                 "which benchmark? pass benchmark_id; list_benchmarks() (tupli-mcap list-benchmarks) names them all"
             )
-        if isinstance(benchmark_id, TupliStorage):
-            raise StorageError("expected a storage and then a benchmark_id, found them the other way round")
-        opened = storage_at(storage)
         benchmark = opened.load_benchmark(benchmark_id)
         env = cls.deserialize_env(benchmark.serialized, opened, trust=trust)
         loaded = cls(env, opened, benchmark_id, metadata_callback, rl_tuple_cls, **recording_options)

@@ -49,12 +49,15 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     Args:
         storage: where the episodes are: a storage, or the path of its directory.
         info: anything to keep with the dataset.
+
+    Raises:
+        StorageError: there is no storage at the path.
     """
 
     def __init__(
         self, storage: TupliStorage | str | os.PathLike[str], info: dict[str, Any] | None = None
     ) -> None:
-        self._setup(StorageSource(storage_at(storage)), info)
+        self._setup(StorageSource(storage_at(storage, existing=True)), info)
 
     @classmethod
     def from_files(

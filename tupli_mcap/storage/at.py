@@ -13,11 +13,12 @@ from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.files import FileStorage
 
 
-def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
-    """The storage at the address of a server, or in a directory, which need not exist; a storage is returned as it is.
+def storage_at(place: TupliStorage | str | os.PathLike[str], *, existing: bool = False) -> TupliStorage:
+    """The storage at the address of a server, or in a directory, which need not exist unless `existing`; a storage is
+    returned as it is.
 
     Raises:
-        StorageError: `place` is none of these, or is the path of recordings.
+        StorageError: `place` is none of these, is the path of recordings, or has to exist and does not.
     """
     if isinstance(place, TupliStorage):
         return place
@@ -32,4 +33,7 @@ def storage_at(place: TupliStorage | str | os.PathLike[str]) -> TupliStorage:
             f"expected the directory of a storage, found {shown(name)!r:.80}, which is no address of a server either; "
             "recordings are opened with tupli_mcap.open(...)"
         )
-    return FileStorage(Path(place).expanduser())
+    path = Path(place).expanduser()
+    if existing and not path.is_dir():
+        raise StorageError(f"there is no storage at {name!r:.200}; give the directory of one")
+    return FileStorage(path)
