@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -716,6 +717,16 @@ def test_artifacts_that_are_somebody_else_s_stay_as_they_are(admin: TupliAPIClie
     result = CliRunner().invoke(app, ["publish", uri])
     assert (result.exit_code, dry.stderr) == (0, result.stderr)
     assert "not published in global: 1 artifact of others that" in result.stderr
+    admin.unpublish_benchmark(uri, "global")
+    with httpx.Client(base_url=admin.url, headers={"Accept": "text/html"}, timeout=60) as browser:
+        browser.post("/sign-in", data={"username": "bob", "password": "bob's password", "next": "/"})
+        address = f"/share?dataset={uri}"
+        (code,) = set(re.findall('name="code" value="([^"]+)"', browser.get(address).text))
+        assert "1 artifact that it needs" not in browser.get(address).text
+        answer = browser.post("/share", data={"code": code, "dataset": uri, "group": "global"})
+        assert answer.status_code == 303, answer.text
+        assert "1 artifact that it needs" in browser.get(address).text
+    assert "global" in admin.load_benchmark(uri).published_in
     assert admin.load_benchmark(uri).published_in == ["bob", "robots", "global"]
     assert admin.list_artifacts()[0].published_in == ["admin", "robots"]
 

@@ -11,7 +11,15 @@ from sqlalchemy import Connection
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.page.answers import PageRoute, address
 from tupli_mcap.page.datasets import Dataset, find_dataset, of_dataset
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, FilterEQ, Right, parse_bound
+from tupli_mcap.schema import (
+    ArtifactMetadataItem,
+    BaseFilter,
+    EpisodeHeader,
+    FilterEQ,
+    FilterIN,
+    Right,
+    parse_bound,
+)
 from tupli_mcap.server.pages.session import Code, Member, Visit, tried
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import DeniedError
@@ -65,7 +73,8 @@ def change(
 def _turn_benchmark(
     connection: Connection, visit: Visit, dataset: Dataset, group: str, *, published: bool
 ) -> bool:
-    """Publishes a benchmark and its artifacts, or unpublishes the benchmark; returns whether it is the caller's."""
+    """Publishes a benchmark and the caller's own of its artifacts, or unpublishes the benchmark; returns whether it is
+    the caller's."""
     library, caller = visit.library, visit.caller
     if dataset.benchmark is None or dataset.benchmark.created_by != caller.name:
         return False
@@ -73,25 +82,54 @@ def _turn_benchmark(
         library.items.unpublish(connection, caller, "benchmark", dataset.benchmark_id, group)
         return True
     library.items.publish(connection, caller, "benchmark", dataset.benchmark_id, group)
-    found = library.items.load_benchmark(connection, caller, dataset.benchmark_id)
-    for artifact in artifacts_needed(found.serialized):
-        library.items.publish(connection, caller, "artifact", artifact, group)
+    _, artifacts = _needed(connection, visit, dataset.benchmark_id)
+    for artifact in artifacts:
+        if artifact.created_by == caller.name:
+            library.items.publish(connection, caller, "artifact", artifact.id, group)
     return True
+
+
+def _needed(
+    connection: Connection, visit: Visit, benchmark: str
+) -> tuple[set[str], list[ArtifactMetadataItem]]:
+    """The ids of the artifacts that a benchmark needs, and those of them that the user sees."""
+    items, caller = visit.library.items, visit.caller
+    ids = set(artifacts_needed(items.load_benchmark(connection, caller, benchmark).serialized))
+    return ids, items.list_artifacts(connection, caller, FilterIN(key="id", value=sorted(ids)))
+
+
+def _unseen(connection: Connection, visit: Visit, dataset: Dataset) -> int:
+    """How many artifacts of others, which the user's benchmark needs, a group that sees the benchmark cannot see."""
+    benchmark, me = dataset.benchmark, visit.caller.name
+    if benchmark is None or benchmark.created_by != me:
+        return 0
+    if not (groups := {*benchmark.published_in} - {me}):
+        return 0
+    ids, artifacts = _needed(connection, visit, dataset.benchmark_id)
+    seen = {
+        artifact.id
+        for artifact in artifacts
+        if artifact.created_by == me
+        or groups <= {*artifact.published_in}
+        or "global" in artifact.published_in
+    }
+    return len(ids - seen)
 
 
 def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200) -> Response:
     shelf = visit.shelf()
 
-    def ask(connection: Connection) -> tuple[Dataset, list[str]]:
-        return find_dataset(shelf, connection, key), _groups(connection, visit)
+    def ask(connection: Connection) -> tuple[Dataset, list[str], int]:
+        found = find_dataset(shelf, connection, key)
+        return found, _groups(connection, visit), _unseen(connection, visit, found)
 
-    dataset, groups = shelf.ask(ask)
+    dataset, groups, unseen = shelf.ask(ask)
     facts = {
         "dataset": dataset.key,
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
         "episodes": [part._asdict() for part in dataset.audiences],
     }
-    shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter}
+    shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter, "unseen": unseen}
     return visit.page("share.html", facts, wrong, status, **shown)
 
 
