@@ -149,6 +149,7 @@ def ls(
     episodes, steps, return, success, started, size, state, split, tags, settings, paths.
     RECORDING is the first file of the run, in a storage without its folders, which PATHS and
     --json show; FILES is how many there are, if a run has several.
+    A narrow terminal shows those that there is room for, RUN first, SIZE last.
     The last four appear only with --columns; settings are the metadata of the run, and
     `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
     ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
