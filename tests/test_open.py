@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.cli.app import app
+from tupli_mcap.dataset import open_columns
 from tupli_mcap.errors import MissingExtraError
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import EpisodeMetadataCallback
@@ -749,12 +750,34 @@ def test_a_recording_does_what_a_dataset_does(runs: Path) -> None:
         )
         assert np.array_equal(recording.transitions(2, 0.9)[4].states, dataset.transitions(2, 0.9)[4].states)
         assert recording.stats()["rewards"].count == dataset.n_steps
+        around = {"state": [-1, 0]}
+        assert np.array_equal(
+            recording.delta_windows(around)[5]["state"], dataset.delta_windows(around)[5]["state"]
+        )
+        assert recording.headers == dataset.headers
+        assert np.array_equal(recording.episode_values(F("steps")), dataset.lengths)
+        assert len(recording.with_cache(1 << 20).windows(5)) == len(dataset.windows(5))
         of_dataset = recording.dataset._repr_html_()
         assert recording._repr_html_() == of_dataset.replace("<p>Dataset of", "<p>Recording of") != of_dataset
     with (runs / "a.mcap").open("rb") as file, Recording(file) as recording:
         assert recording[3] == dataset[3] and "12 episodes" in recording._repr_html_()
         with pytest.raises(TupliError, match="open it by its path or URL"):
             recording.head(3)
+
+
+def test_a_recording_changes_as_a_dataset_does(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 0, 3)
+    with Recording(path) as recording:
+        recording.annotate(success=True, episodes=7)
+        assert all(episode.success and episode.metadata["episodes"] == 7 for episode in recording)
+        with pytest.raises(TupliError, match="expected values for the episodes"):
+            recording.annotate()
+        recording.save_columns(tmp_path / "columns")
+        assert len(open_columns(tmp_path / "columns").steps) == recording.n_steps
+        with pytest.raises(TupliError, match="all its episodes would be deleted"):
+            recording.delete()
+        assert recording.delete(force=True, dry_run=True) == 3
+    assert all(episode.success for episode in tupli_mcap.open(path))
 
 
 def test_the_episodes_of_two_datasets(runs: Path, tmp_path: Path) -> None:
@@ -794,7 +817,7 @@ def test_the_working_directory_may_change(tmp_path: Path, monkeypatch: pytest.Mo
     with Recording("r.mcap") as recording:
         expected = recording.read().states
         monkeypatch.chdir(two)
-        recording.annotate(None, {"good": True})
+        recording.annotate(good=True)
         assert recording.name == "r.mcap"
     for dataset in datasets:
         assert {header.recording for header in dataset.headers} == {"r.mcap"}

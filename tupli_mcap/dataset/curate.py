@@ -301,7 +301,7 @@ def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     numbers, recordings = numbers_by_recording(dataset.headers), _recordings_of(dataset)
 
     def change(name: str, dry: bool) -> None:
-        recordings[name].annotate(numbers[name], values, dry_run=dry)
+        recordings[name].annotate_numbers(numbers[name], values, dry_run=dry)
 
     change_all(recordings, change, dry_run=False)
     _read_metadata_again(dataset, recordings)

@@ -195,7 +195,7 @@ class Episode(GymnasiumNames):
         Values take precedence over the metadata that were recorded; None removes a key. `undo_annotation` takes them
         back. `Dataset.annotate` does this for many episodes at once.
         """
-        self._recording.annotate([self.number], values)
+        self._recording.annotate_numbers([self.number], values)
         self._read_metadata_again()
 
     def undo_annotation(self) -> Annotation:

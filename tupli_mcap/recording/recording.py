@@ -84,17 +84,22 @@ class Recording(DescribedRecording, DatasetVerbs):
         """The episodes of both, those of this recording first."""
         return self.dataset + other
 
-    def annotate(
-        self, episodes: Sequence[int] | None, values: Mapping[str, Any], *, dry_run: bool = False
-    ) -> None:
-        """Gives episodes (their numbers; None: all) metadata that take precedence over the recorded ones.
+    def annotate(self, /, **values: Any) -> None:
+        """Adds metadata to all episodes, in the file: `recording.annotate(success=True)`.
 
-        `dry_run` only raises the errors.
+        Values take precedence over the metadata that were recorded; None removes a key. `undo_annotation` takes them
+        back. `recording[3].annotate(...)` and `recording.filter("return > 100").annotate(...)` are for some episodes.
 
         Raises:
             RecordingError: the recording has no path, or another one is there now. Other errors are those of
                 `annotate_episodes`.
         """
+        self.annotate_numbers(None, values)
+
+    def annotate_numbers(
+        self, episodes: Sequence[int] | None, values: Mapping[str, Any], *, dry_run: bool = False
+    ) -> None:
+        """As `annotate`, for episodes by their numbers (None: all); `dry_run` only raises the errors."""
         from tupli_mcap.recording.edit.annotate import annotate_episodes
 
         self._annotated(lambda path: annotate_episodes(path, values, episodes, dry_run=dry_run), episodes)

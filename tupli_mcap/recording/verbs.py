@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tupli_mcap.arrays import Array
 from tupli_mcap.errors import SaysWhatIsMeant
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import pandas as pd
     import pyarrow as pa
 
@@ -20,8 +19,9 @@ if TYPE_CHECKING:
     from tupli_mcap.dataset.columns.statistics import FieldStatistics
     from tupli_mcap.dataset.columns.tables import Level
     from tupli_mcap.dataset.dataset import Test
-    from tupli_mcap.dataset.items import Transitions, Windows
+    from tupli_mcap.dataset.items import DeltaWindows, Transitions, Unit, Windows
     from tupli_mcap.recording.episode import Episode
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 
 
 class DatasetVerbs(SaysWhatIsMeant):
@@ -36,6 +36,11 @@ class DatasetVerbs(SaysWhatIsMeant):
     def keys(self) -> list[str]:
         """The keys that `filter`, `sort` and `split` understand."""
         return self.dataset.keys
+
+    @property
+    def headers(self) -> Sequence[EpisodeHeader]:
+        """The facts about the episodes, without their steps."""
+        return self.dataset.headers
 
     def filter(self, test: Test) -> Dataset:
         """The episodes that match a test: `recording.filter("return > 100")`."""
@@ -65,6 +70,16 @@ class DatasetVerbs(SaysWhatIsMeant):
         """Sub-trajectories of `length` steps. `chosen`: stride, pad, history, fields."""
         return self.dataset.windows(length, **chosen)
 
+    def delta_windows(
+        self,
+        deltas: Mapping[str, Iterable[float]],
+        unit: Unit = "steps",
+        *,
+        step_seconds: float | None = None,
+    ) -> DeltaWindows:
+        """The values around each step: `{"state": [-2, -1, 0], "action": range(16)}`, in steps or seconds."""
+        return self.dataset.delta_windows(deltas, unit, step_seconds=step_seconds)
+
     def transitions(self, n_step: int = 1, discount: float = 1.0, **chosen: Any) -> Transitions:
         """The transition (s, a, r, s') that starts at each step. `chosen`: fields."""
         return self.dataset.transitions(n_step, discount, **chosen)
@@ -72,6 +87,14 @@ class DatasetVerbs(SaysWhatIsMeant):
     def loader(self, length: int | None = None, **chosen: Any) -> Any:
         """A PyTorch `DataLoader` of windows of `length` steps, or of transitions."""
         return self.dataset.loader(length, **chosen)
+
+    def with_cache(self, cache_bytes: int, threads: int | None = None) -> Dataset:
+        """Its dataset, with another budget for what `windows`, `transitions` and `loader` keep decoded."""
+        return self.dataset.with_cache(cache_bytes, threads)
+
+    def episode_values(self, expression: F | BaseFilter) -> Array:
+        """The number of each episode at a key, such as `F("metadata.score")`: float64 (episodes,)."""
+        return self.dataset.episode_values(expression)
 
     def stats(self, fields: Sequence[str] | None = None) -> Mapping[str, FieldStatistics]:
         """Count, mean, std, min, max and quantiles of each leaf, or info: `stats(["states", "info.force"])`; of the
@@ -89,6 +112,10 @@ class DatasetVerbs(SaysWhatIsMeant):
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording."""
         return self.dataset.save(target, overwrite=overwrite)
+
+    def save_columns(self, directory: str | os.PathLike[str]) -> None:
+        """Writes the steps to an unused directory as plain `.npy` files."""
+        self.dataset.save_columns(directory)
 
     def map(
         self,
@@ -110,3 +137,7 @@ class DatasetVerbs(SaysWhatIsMeant):
     ) -> Path:
         """Writes the episodes to a new recording, each with only some consecutive steps."""
         return self.dataset.trim(steps, target, overwrite=overwrite)
+
+    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
+        """Deletes all episodes where they are stored, and with `force` the file; returns their number."""
+        return self.dataset.delete(force=force, dry_run=dry_run)
