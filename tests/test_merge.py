@@ -575,6 +575,9 @@ class TestFilter:
             dataset, tmp_path / "best.mcap", "n_tuples > 2", sort="-metadata.score", limit=4
         )
         kept = open_dataset(report.path)
+        assert kept.made_of[str(report.path)]["query"] == (
+            "n_tuples > 2; sort: metadata.score, descending; head: 4"
+        )
         assert (report.episodes, report.left_out) == (4, len(dataset) - 4)
         assert sorted(kept.returns) == sorted(best.returns)
         assert [e.end_time for e in kept] == sorted(e.end_time for e in best)

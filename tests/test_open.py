@@ -1136,7 +1136,11 @@ def test_what_chose_the_episodes_is_noted_where_they_were_listed_before(runs: Pa
     saved = dataset.filter("seed < 200").filter("return > 0").save(tmp_path / "s.mcap")
     made = Recording(saved).made_of
     assert made is not None
-    assert (made["how"], made["query"]) == ("filter", str((F("seed") < 200) & (F("return") > 0)))
+    assert (made["how"], made["query"]) == ("filter", "seed < 200; return > 0")
+
+
+def has_steps(episode: Episode) -> bool:
+    return len(episode) > 0
 
 
 @pytest.mark.parametrize("listed", [False, True])
@@ -1154,14 +1158,25 @@ def test_all_that_chose_the_episodes_is_noted_in_order(
         assert made is not None
         return made["how"], made.get("query")
 
-    narrowed = dataset.filter(first).sort("return").filter(second)
-    assert noted(narrowed.filter(lambda e: len(e) > 0).head(9)[:-1]) == ("filter", str(first & second))
-    assert noted(narrowed.sample(3, seed=0).filter(third)) == ("filter", str(first & second & third))
+    narrowed = dataset.filter(first).sort("return", descending=True).filter(second)
+    words = "steps > 0; sort: return, descending; return > 0"
+    assert noted(narrowed) == ("filter", words)
+    assert noted(narrowed.filter(has_steps).head(9)[:-1]) == (
+        "filter",
+        f"{words}; filter: {__name__}.has_steps; head: 9; index: [:-1]",
+    )
+    assert noted(narrowed.sample(3, seed=0).filter(third)) == (
+        "filter",
+        f"{words}; sample: 3, seed 0; episode >= 0",
+    )
     told = CliRunner().invoke(app, ["info", str(tmp_path / "s.mcap")]).output
-    assert f"by filter {first & second & third}" in " ".join(told.split())
+    assert f"by filter {words}; sample: 3, seed 0; episode >= 0" in " ".join(told.split())
+    assert noted(dataset[[1, 2]]) == ("filter", "index: [1, 2]")
+    assert noted(dataset.split(0.5, seed=3)[0]) == ("filter", "split: 0.5, seed 3, first part")
     either = dataset.filter(first).head(1) + dataset.filter(second)
-    assert noted(either) == ("filter", str(first | second))
-    assert noted(dataset.filter(first) + dataset) == ("filter" if one else "merge", None)
+    assert noted(either) == ("filter", "(steps > 0; head: 1) + (return > 0)")
+    assert noted(dataset.head(2) + dataset) == ("filter", "(head: 2) + (all)")
+    assert noted(dataset) == ("filter" if one else "merge", None)
 
 
 def test_two_continued_copies_are_told_apart(tmp_path: Path) -> None:

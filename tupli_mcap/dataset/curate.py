@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,9 @@ from tupli_mcap.storage.sidecar import Notes, Sidecar, storage_of
 if TYPE_CHECKING:
     from tupli_mcap.recording.about.annotations import Annotation
     from tupli_mcap.storage import FileStorage, TupliStorage
+
+
+_MAX_QUERY: Final = 10_000  # characters
 
 
 class FilterReport(NamedTuple):
@@ -162,10 +165,14 @@ def filter_dataset(
         RecordingError: it is true of no episode, or as `Dataset.save`.
         DatasetError: as `Dataset.save`.
     """
-    target, query, count = file_path(target), query or str(filter), len(dataset)
+    target, count = file_path(target), len(dataset)
     kept = dataset.filter(filter)
     if not len(kept):
-        raise RecordingError(f"expected an episode that matches {query}, found none among {count:,}")
+        raise RecordingError(
+            f"expected an episode that matches {query or str(filter)}, found none among {count:,}"
+        )
+    if query:
+        kept.chosen_by = (*dataset.chosen_by, query)
     if sort:
         kept = kept.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
     if limit is not None:
@@ -174,7 +181,7 @@ def filter_dataset(
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
         return report
-    return report._replace(size=save(kept, target, query, overwrite=overwrite).stat().st_size)
+    return report._replace(size=save(kept, target, overwrite=overwrite).stat().st_size)
 
 
 def trim(
@@ -263,9 +270,11 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
         )
 
 
-def save(dataset: Episodes, place: str | os.PathLike[str], query: str, *, overwrite: bool) -> Path:
-    """See `Dataset.save`. `query`: the text of the dataset's filter, if there is one."""
-    target = file_path(place)
+def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
+    """See `Dataset.save`."""
+    target, query = file_path(place), "; ".join(dataset.chosen_by)
+    if len(query) > _MAX_QUERY:
+        query = f"{query[:_MAX_QUERY]}…"
     _check_new(dataset, target, overwrite=overwrite)
     facts = {"query": query} if query else {}
     excerpts = _excerpts(dataset)

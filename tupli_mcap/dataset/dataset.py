@@ -48,6 +48,7 @@ from tupli_mcap.dataset.sources import (
     numbers_by_recording,
     place_of,
 )
+from tupli_mcap.dataset.which import text_of
 from tupli_mcap.errors import warn
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import (
@@ -60,6 +61,7 @@ from tupli_mcap.recording.columns.fields import (
     split_name,
     step_name,
 )
+from tupli_mcap.recording.edit.relabel import name_of
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
@@ -71,6 +73,8 @@ if TYPE_CHECKING:
 
     from tupli_mcap.dataset.columns.tables import Level
     from tupli_mcap.recording.about.annotations import Annotation
+
+_SHOWN = 100  # numbers of episodes, in a text
 
 Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
 
@@ -87,7 +91,9 @@ class Dataset(RandomAccess):
 
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source
-        self._filter: BaseFilter | None = None  # is true of the episodes; `save` notes it
+        self._filter: BaseFilter | None = None  # of the episodes that are not listed yet
+        self.chosen_by: tuple[str, ...] = ()
+        """How the episodes were chosen, in the order in which that was done; `save` notes it."""
         self._listed = None if headers is None else list(headers)
         self._selector: TupleSelector | None = None  # of steps
         self._known: Selected | None = None  # what it has found
@@ -149,8 +155,10 @@ class Dataset(RandomAccess):
                     raise IndexError(f"an empty dataset has no episode {chosen}") from err
                 raise IndexError(f"expected an episode from 0 to {len(headers) - 1}, found {chosen}") from err
         if isinstance(chosen, slice):
-            return self._of(headers[chosen])
-        return self._of([headers[i] for i in _places(chosen, len(headers))])
+            bounds = ["" if at is None else str(at) for at in (chosen.start, chosen.stop, chosen.step)]
+            return self._of(headers[chosen], f"index: [{':'.join(bounds[: 2 + bool(bounds[2])])}]")
+        places = _places(chosen, len(headers))
+        return self._of([headers[i] for i in places], f"index: [{_some(places)}]")
 
     def __iter__(self) -> Iterator[Episode]:
         for header in self.headers:
@@ -208,8 +216,9 @@ class Dataset(RandomAccess):
         """A recording with the dataset's episodes in it, or at least the `needed` ones."""
         return self._recordings.get(name, self._chosen[name], needed)
 
-    def _of(self, headers: Sequence[EpisodeHeader] | None) -> Dataset:
+    def _of(self, headers: Sequence[EpisodeHeader] | None, *chosen_by: str) -> Dataset:
         made = Dataset(self._source, headers)
+        made.chosen_by = (*self.chosen_by, *chosen_by)
         made._recordings = self._recordings
         made._filter, made._selector, made._cache = self._filter, self._selector, self._cache
         return made
@@ -241,8 +250,8 @@ class Dataset(RandomAccess):
             joined = JoinedSource([(self._source, self.headers), (other._source, more)])
             made = Dataset(joined, [*self.headers, *more])
             made._cache = self._cache
-        one, two = self._filter, other._filter
-        made._filter = None if one is None or two is None else one | two
+        by = ["; ".join(one.chosen_by) or "all" for one in (self, other)]
+        made.chosen_by = () if by == ["all", "all"] else (f"({by[0]}) + ({by[1]})",)
         return made
 
     # ---- narrowing
@@ -259,7 +268,8 @@ class Dataset(RandomAccess):
                 never have, or is neither a text, an expression nor a function.
         """
         if callable(test) and not isinstance(test, BaseFilter):
-            return self._of([header for header in self.headers if test(self._episode(header))])
+            matching_it = [header for header in self.headers if test(self._episode(header))]
+            return self._of(matching_it, f"filter: {name_of(test)}")
         wanted = parse_filter(test) if isinstance(test, str) else test
         check_keys(wanted, EpisodeHeader)
         found = None  # listed later, by this filter too
@@ -268,8 +278,8 @@ class Dataset(RandomAccess):
             found = [header for header in self._listed if matches(header)]
             if not found:
                 check_metadata(wanted, self._listed)
-        made = self._of(found)
-        made._filter = wanted if self._filter is None else self._filter & wanted  # what `save` notes
+        made = self._of(found, text_of(wanted))
+        made._filter = wanted if self._filter is None else self._filter & wanted
         return made
 
     def filter_steps(self, test: TupleFilter | str) -> Dataset:
@@ -325,17 +335,20 @@ class Dataset(RandomAccess):
         except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
         rest = sorted(set(range(len(values))) - set(places))
-        return self._of([self.headers[i] for i in [*ordered, *rest]])
+        by = f"{name_of(key) if callable(key) else key}{', descending' if descending else ''}"
+        return self._of([self.headers[i] for i in [*ordered, *rest]], f"sort: {by}")
 
     def head(self, n: int = 5) -> Dataset:
         """The first `n` episodes, or as many as there are."""
-        return self._of(self.headers[: checked_whole(n, 0, "a number of episodes")])
+        return self._of(self.headers[: checked_whole(n, 0, "a number of episodes")], f"head: {n}")
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
         """`n` different episodes (or as many as there are), drawn at random, in the order of drawing."""
         chosen = None if seed is None else checked_whole(seed, 0, "a seed")
         drawn = np.random.default_rng(chosen).permutation(len(self))
-        return self[drawn[: checked_whole(n, 0, "a number of episodes")]]
+        places = drawn[: checked_whole(n, 0, "a number of episodes")]
+        by = f"sample: {n}{'' if seed is None else f', seed {seed}'}"
+        return self._of([self.headers[i] for i in places], by)
 
     def split(self, fraction: float, *, seed: int = 0, by: str | None = None) -> tuple[Dataset, Dataset]:
         """Two datasets: about `fraction` of the episodes, and the others. No episode is in both.
@@ -365,7 +378,8 @@ class Dataset(RandomAccess):
             parts[int.from_bytes(digest[:8], "big") >= float(fraction) * 2**64].append(header)
         if by is not None and 0 < fraction < 1 and len(self) and not all(parts):
             warn(f"all episodes are on one side of split(by={by!r}): it has few values; try another seed")
-        return self._of(parts[0]), self._of(parts[1])
+        said = f"split: {fraction:g}{'' if by is None else f' by {by}'}, seed {seed}"
+        return self._of(parts[0], f"{said}, first part"), self._of(parts[1], f"{said}, second part")
 
     @property
     def keys(self) -> list[str]:
@@ -573,7 +587,8 @@ class Dataset(RandomAccess):
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording, with everything that belongs to them, in the order of their times.
 
-        Episodes of one recording keep their ids; episodes of several get new ones.
+        Episodes of one recording keep their ids; episodes of several get new ones. `Recording.made_of` of the new one
+        says how they were chosen: {"query": "return > 50; sample: 3, seed 0"}.
 
         Raises:
             DatasetError: there is no episode, one occurs twice, the target exists (without `overwrite`), or it is one
@@ -581,8 +596,7 @@ class Dataset(RandomAccess):
             RecordingError: it cannot be written.
             SpaceError: two recordings have different spaces.
         """
-        query = "" if self._filter is None else str(self._filter)
-        return curate.save(self._whole(), target, query, overwrite=overwrite)
+        return curate.save(self._whole(), target, overwrite=overwrite)
 
     def save_columns(self, directory: str | os.PathLike[str]) -> None:
         """Writes the steps to an unused directory as plain `.npy` files, which `tupli_mcap.dataset.open_columns` reads
@@ -755,6 +769,11 @@ def _places(chosen: Any, count: int) -> list[int]:
     if len(array) and not -count <= array.min() <= array.max() < count:
         raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")
     return [int(i) % count for i in array]
+
+
+def _some(places: Sequence[int]) -> str:
+    shown = ", ".join(map(str, places[:_SHOWN]))
+    return shown if len(places) <= _SHOWN else f"{shown}, … ({len(places):,} episodes)"
 
 
 def _mask_of_pandas(mask: Any) -> Array:

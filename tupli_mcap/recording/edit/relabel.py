@@ -57,17 +57,20 @@ def relabel_excerpts(
         StepError: a value of variable size does not fit its space.
     """
     fields = field_names(fields, _FIELDS)
-    name = (
-        f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', type(function).__name__)}"
-    )
     excerpts, _ = check_mergeable(excerpts)
     with replacing(target) as (fd, new), ExitStack() as opened:
         changed = []
         for i, excerpt in enumerate(excerpts):
             columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))
             changed.append(excerpt._replace(values=_new_values(excerpt, function, fields, columns)))
-        made = {"how": "map", "function": name, "fields": fields}
+        made = {"how": "map", "function": name_of(function), "fields": fields}
         merge_excerpts(changed, Container(fd, str(target), "zstd"), made=made)
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """`module.function`, or the module and the class of another object that can be called."""
+    name = getattr(function, "__qualname__", type(function).__name__)
+    return f"{getattr(function, '__module__', '')}.{name}"
 
 
 def _new_values(
