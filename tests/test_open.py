@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 import shutil
 import sys
 import warnings
@@ -763,6 +764,31 @@ def test_a_recording_does_what_a_dataset_does(runs: Path) -> None:
         assert recording[3] == dataset[3] and "12 episodes" in recording._repr_html_()
         with pytest.raises(TupliError, match="open it by its path or URL"):
             recording.head(3)
+
+
+def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
+    chosen = TupliDataset(runs).with_episode_filter("return > 20").with_tuple_filter("step >= 3")
+    made = tupli_mcap.open(chosen)
+    wanted = tupli_mcap.open(runs).filter("return > 20").filter_steps("step >= 3")
+    assert ids(made) == ids(wanted) and np.array_equal(made.read().states, wanted.read().states)
+    assert len(made.loader(3)) == len(wanted.loader(3))
+    saved = TupliDataset(runs).with_episode_filter("return > 20").dataset.save(tmp_path / "s.mcap")
+    assert Recording(saved).made_of["query"] == "return > 20"  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("of", "name", "hint"),
+    [
+        (tupli_mcap, "vecotr", "did you mean 'vector'?"),
+        (tupli_mcap, "opne", "did you mean 'open'?"),
+        (None, "runs", "each episode has its run: [episode.run for episode in dataset]"),
+        (TupliDataset, "loader", "its dataset has it: .dataset.loader"),
+    ],
+)
+def test_a_missing_name_says_what_to_take(of: Any, name: str, hint: str, runs: Path) -> None:
+    of = tupli_mcap.open(runs) if of is None else TupliDataset(runs) if of is TupliDataset else of
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}' \({re.escape(hint)}\)"):
+        getattr(of, name)
 
 
 def test_a_recording_changes_as_a_dataset_does(tmp_path: Path) -> None:

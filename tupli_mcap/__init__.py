@@ -124,7 +124,8 @@ def __getattr__(name: str) -> Any:
     else:
         from tupli_mcap.errors import did_you_mean
 
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, _HOME_OF)}")
+        meant = did_you_mean(name, [*_HOME_OF, *_MODULES])
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{meant}")
     globals()[name] = value
     return value
 

@@ -13,10 +13,10 @@ import itertools
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 __all__ = [
     "FilterError",
@@ -242,6 +242,9 @@ def _there_instead(path: Path) -> str:
 class SaysWhatIsMeant:
     """Suggests the name that may be meant when an attribute does not exist, in notebooks too."""
 
+    _elsewhere: ClassVar[Mapping[str, str]] = {}
+    """By names that may be expected here, where their values are."""
+
     if not TYPE_CHECKING:  # type checkers must still report unknown names
 
         def __getattr__(self, name: str) -> Any:
@@ -253,6 +256,8 @@ class SaysWhatIsMeant:
             if ours and "read" in known and not set(ours) & {*known}:
                 # columns exist only in the result of `read`
                 meant = f" (read() gives its columns: read().{ours[0]})"
+            if name in type(self)._elsewhere:
+                meant = f" ({type(self)._elsewhere[name]})"
             # without `obj=`: with it, Python would add a hint of its own
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}{meant}", name=name

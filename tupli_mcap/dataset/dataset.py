@@ -89,6 +89,10 @@ class Dataset(RandomAccess):
     Use `tupli_mcap.open` to make one.
     """
 
+    _elsewhere = dict.fromkeys(
+        ("run", "runs"), "each episode has its run: [episode.run for episode in dataset]"
+    )
+
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source
         self._filter: BaseFilter | None = None  # of the episodes that are not listed yet

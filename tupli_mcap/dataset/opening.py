@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, files_at, place_of
@@ -13,12 +13,16 @@ from tupli_mcap.remote import is_server, is_url, path_of
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import is_storage, recordings_at
 
-Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset"
+if TYPE_CHECKING:
+    from tupli_mcap.dataset.tupli import TupliDataset
+
+Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Dataset | TupliDataset"
 
 
 def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
-    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a URL of any of these (of
-    a server: "http://lab:8080"), or a list of them, without servers and datasets, which `+` joins.
+    """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a `TupliDataset`, a URL
+    of a file or directory, or of a server ("http://lab:8080"), or a list of them, without servers and datasets, which
+    `+` joins.
 
     An episode that is in two of the files counts once, with a warning: that of the file with more episodes, if they are
     copies of one recording that differ. A recording that was made of others has episodes of its own, which count beside
@@ -55,6 +59,10 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
 
             return Dataset(StorageSource(FileStorage(folder)))
         return Dataset(FilesSource(files, of_directory=True))
+    from tupli_mcap.dataset.tupli import TupliDataset
+
+    if isinstance(source, TupliDataset):  # before other iterables: it iterates over its steps
+        return source.dataset
     if not isinstance(source, Iterable):
         raise DatasetError(
             f"expected a path, a pattern, a URL, a storage, or a list of those, found {source!r:.80}"

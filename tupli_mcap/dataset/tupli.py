@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -15,10 +15,12 @@ from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
+from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
+from tupli_mcap.dataset.which import text_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
 from tupli_mcap.storage import TupliStorage, storage_at
@@ -54,6 +56,10 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         StorageError: there is no storage at the path.
     """
 
+    _elsewhere: ClassVar = {
+        name: f"its dataset has it: .dataset.{name}" for name in dir(Dataset) if not name.startswith("_")
+    }
+
     def __init__(
         self, storage: TupliStorage | str | os.PathLike[str], info: dict[str, Any] | None = None
     ) -> None:
@@ -87,6 +93,16 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         """The storage; None for a dataset of files."""
         source = self._query.source
         return source.storage if isinstance(source, StorageSource) else None
+
+    @property
+    def dataset(self) -> Dataset:
+        """Its episodes as a `Dataset`, as they are listed now, with the steps that the tuple filter chooses."""
+        source, headers = self._episodes(None)
+        made = Dataset(source, headers)
+        by = (self._query.benchmark_filter, self._query.episode_filter)
+        made.chosen_by = tuple(text_of(each) for each in by if each is not None)
+        made._selector, made._cache = self._query.tuple_filter, self._query.cache
+        return made
 
     # --- filters ---
 
