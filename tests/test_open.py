@@ -501,6 +501,10 @@ def test_gymnasiums_names(dataset: Dataset) -> None:
     assert (step.terminated, step.truncated) == (step.terminal, step.timeout) == (True, False)
     assert np.array_equal(step.observation, step.state)
     assert len(dataset.filter("truncated")) == 0 and len(dataset.filter("not truncated")) == len(dataset)
+    for ended in ("terminal", "terminations", "terminated"):
+        assert len(dataset.filter(ended)) == len(dataset)
+    for cut in ("timeout", "truncations", "timeouts = true"):
+        assert len(dataset.filter(cut)) == 0
     windows = dataset.windows(4, fields=["observations", "rewards"])
     assert windows[0].states.shape == (4, 4)
     for wrong in ("rewrads", "observatoins", "x"):
@@ -719,6 +723,15 @@ def test_what_is_shown_is_short(runs: Path) -> None:
     assert len(repr(dataset)) < 200 and "not listed yet" in repr(dataset)
     assert "36 episodes" in dataset._repr_html_()
     assert "36 episodes" in repr(dataset)
+
+
+def test_a_header_says_what_an_episode_says(dataset: Dataset) -> None:
+    header, episode = dataset.headers[3], dataset[3]
+    assert (header.steps, header.return_) == (episode.n_steps, episode.return_)
+    told = (
+        f"<EpisodeHeader 3 of {header.recording}: {header.steps} steps, return {header.return_:g}, terminal>"
+    )
+    assert repr(header) == str(header) == told
 
 
 def test_an_episode_gives_pytuplis_tuples(dataset: Dataset) -> None:

@@ -32,7 +32,11 @@ from tupli_mcap.schema.values import Scalar, classify
 _MEANT: Final[Mapping[str, str]] = {"ended": "created_at", "return": "episode_return", "steps": "n_tuples"}
 LISTED_AS: Final[Mapping[str, str]] = {field: key for key, field in _MEANT.items()}
 """By fields of an episode, the keys that lists name them by; filters and columns take both."""
-_OTHER_NAMES: Final = {**_MEANT, "truncated": "timeout"}
+_OTHER_NAMES: Final = {
+    **_MEANT,
+    **dict.fromkeys(("terminal", "terminals", "terminations"), "terminated"),
+    **dict.fromkeys(("truncated", "truncations", "timeouts"), "timeout"),
+}
 _LIKE: Final = {
     "length": "steps",
     "episode_length": "steps",

@@ -11,7 +11,7 @@ from typing import Any, Self
 from pydantic import BaseModel, Field, PrivateAttr
 
 from tupli_mcap.arrays import short_repr
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import StorageError, plural
 
 
 def _fresh(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -209,6 +209,25 @@ class EpisodeHeader(DBItem):
     episode: int = 0
     recording: str = ""
     run: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        """`n_tuples`."""
+        return self.n_tuples
+
+    @property
+    def return_(self) -> float | None:
+        """`episode_return`."""
+        return self.episode_return
+
+    def __repr__(self) -> str:
+        total = "" if self.episode_return is None else f", return {self.episode_return:g}"
+        of = f" of {self.recording}" if self.recording else ""
+        return (
+            f"<{type(self).__name__} {self.episode}{of}: {plural(self.n_tuples, 'step')}{total}, {self.end}>"
+        )
+
+    __str__ = __repr__
 
 
 _HEADER_FIELDS = set(EpisodeHeader.model_fields)
