@@ -149,6 +149,27 @@ def test_episodes_are_as_they_were_told(
     assert [file.name for file in tmp_path.iterdir()] == ["r.mcap"]
 
 
+def test_gymnasium_s_names_mean_the_same(tmp_path: Path) -> None:
+    states = np.arange(9, dtype=np.float32).reshape(3, 3) / 10
+    with EpisodeWriter(tmp_path / "r.mcap", BOX, ACTIONS) as writer:
+        for end in ({"terminated": True}, {"truncated": True}):
+            writer.begin()
+            writer.step(observation=states[0], action=1, reward=0.5, terminated=False, truncated=False)
+            writer.step(observation=states[1], action=2, reward=1.0, **end)
+            writer.end(final_observation=states[2])
+        writer.begin()
+        with pytest.raises(StepError, match="expected state or observation, which mean the same, found both"):
+            writer.step(states[0], 1, 0.0, observation=states[0])
+        with pytest.raises(StepError, match="expected terminal or terminated"):
+            writer.step(states[0], 1, 0.0, True, terminated=True)
+        with pytest.raises(StepError, match="state: expected .*found None"):
+            writer.step(action=1, reward=0.0)
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert [episode.end for episode in recording] == ["terminal", "timeout"]
+        for episode in recording:
+            assert np.array_equal(episode.all_states, states)
+
+
 def test_the_environment_has_a_name(tmp_path: Path) -> None:
     for name in ("arm", "legs"):
         for _ in range(2):

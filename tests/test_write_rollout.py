@@ -358,6 +358,10 @@ def test_infos_seeds_and_metadata_that_do_not_fit_are_refused(tmp_path: Path) ->
         write_rollout(tmp_path / "r.mcap", np.zeros((2, 2, 1)), *[np.zeros((2, 2))] * 2, seeds=3)
     with pytest.raises(StepError, match="seeds: expected a list of one for each of 1 episodes, found 3"):
         write_rollout(tmp_path / "r.mcap", *([array] for array in arrays), seeds=3)
+    with pytest.raises(
+        StepError, match="^episode_metadata: expected a dict, .*found .*; give the episodes as lists"
+    ):
+        write_rollout(tmp_path / "r.mcap", *arrays, episode_metadata=[{"task": 1}])
     with pytest.raises(RecordingError, match=r"metadata\['code'\] is a .*module, .*; convert it"):
         write_rollout(tmp_path / "r.mcap", *arrays, metadata={"code": np})
     assert not (tmp_path / "r.mcap").exists()

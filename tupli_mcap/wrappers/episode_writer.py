@@ -180,14 +180,17 @@ class EpisodeWriter(Recorder):
 
     def step(
         self,
-        state: Any,
-        action: Any,
-        reward: Any,
+        state: Any = None,
+        action: Any = None,
+        reward: Any = None,
         terminal: bool = False,
         timeout: bool = False,
         *,
         info: Mapping[str, Any] | None = None,
         env: int = 0,
+        observation: Any = None,
+        terminated: bool | None = None,
+        truncated: bool | None = None,
     ) -> None:
         """Records a step: the observation, the action that was chosen on it, and what came of it.
 
@@ -195,12 +198,19 @@ class EpisodeWriter(Recorder):
             terminal, timeout: the step ended the episode; pass the state after it to `end`.
             info: entries to record with it: numbers, texts, arrays, and lists and dicts of them.
             env: in which stream.
+            observation, terminated, truncated: Gymnasium's names of state, terminal, timeout.
 
         Raises:
             StepError: no episode is running, or a value cannot be stored exactly; nothing of this step is recorded, and
                 the episode goes on.
         """
         stream = self._ready(env)
+        if observation is not None:
+            state = one_of("state", state, "observation", observation)
+        if terminated is not None:
+            terminal = one_of("terminal", terminal or None, "terminated", terminated)
+        if truncated is not None:
+            timeout = one_of("timeout", timeout or None, "truncated", truncated)
         entries = entries_of(info, "info") if info else None
         work = self._work
         work.state = BEGUN
@@ -297,7 +307,12 @@ class EpisodeWriter(Recorder):
             self._writer.after_steps()
 
     def end(
-        self, final_state: Any = None, *, metadata: Mapping[str, Any] | None = None, env: int = 0
+        self,
+        final_state: Any = None,
+        *,
+        metadata: Mapping[str, Any] | None = None,
+        env: int = 0,
+        final_observation: Any = None,
     ) -> None:
         """Ends the running episode as the flags of its last step say, or as "interrupted" if neither is set. An episode
         without steps is not recorded.
@@ -306,11 +321,13 @@ class EpisodeWriter(Recorder):
             final_state: the observation after the last step; None: not known.
             metadata: added to that of `begin`.
             env: in which stream.
+            final_observation: Gymnasium's name of final_state.
 
         Raises:
             StepError: no episode is running, or the state cannot be stored exactly; the episode is still running then.
         """
         stream = self._running(env)
+        final_state = one_of("final_state", final_state, "final_observation", final_observation)
         entries = _metadata(metadata)
         with self._work:
             stream.end(final_state, entries)
@@ -374,6 +391,13 @@ class EpisodeWriter(Recorder):
 
 def _in(num_envs: int | None, env: int) -> str:
     return "" if num_envs is None else f" in stream {env}"
+
+
+def one_of(name: str, given: Any, other: str, value: Any) -> Any:
+    """The argument that was given under either of two names; StepError if both are given."""
+    if given is not None and value is not None:
+        raise StepError(f"expected {name} or {other}, which mean the same, found both")
+    return value if given is None else given
 
 
 def flags_of(given: Any, shape: tuple[int, ...], name: str) -> Array:

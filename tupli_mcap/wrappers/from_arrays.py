@@ -17,7 +17,7 @@ from tupli_mcap.errors import StepError
 from tupli_mcap.recording.write.options import Capture, Mode
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.exact import shorten
-from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of
+from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of, one_of
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
@@ -127,11 +127,11 @@ def write_rollout(
         RecordingError: the file exists, is being written, or cannot be written.
     """
     given = _Given(
-        _one_of("states", states, "observations", observations), actions, rewards,
-        _one_of("terminals", terminals, "terminations", terminations),
-        _one_of("timeouts", timeouts, "truncations", truncations),
-        _one_of("next_states", next_states, "next_observations", next_observations),
-        _one_of("final_states", final_states, "final_observations", final_observations),
+        one_of("states", states, "observations", observations), actions, rewards,
+        one_of("terminals", terminals, "terminations", terminations),
+        one_of("timeouts", timeouts, "truncations", truncations),
+        one_of("next_states", next_states, "next_observations", next_observations),
+        one_of("final_states", final_states, "final_observations", final_observations),
         infos, episode_metadata, seeds,
     )  # fmt: skip
     parts, first, lead, count = _rollout_of(given, autoreset, reward_space)
@@ -160,6 +160,11 @@ def _rollout_of(
             raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
     if isinstance(given.rewards, list | tuple) and given.rewards and _array(given.rewards[0]).ndim:
         return _episodes(given), _episode(given, 0), 1, None
+    if not isinstance(given.episode_metadata, Mapping | None):
+        raise StepError(
+            "episode_metadata: expected a dict, which is of every episode in the arrays, found "
+            f"{shorten(given.episode_metadata)}; give the episodes as lists of arrays for metadata of each"
+        )
     given = _Given._make(
         [*(map_arrays(one, _array) for one in given[:-2]), given.episode_metadata, given.seeds]
     )
@@ -398,13 +403,6 @@ def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> N
 
 
 # ---- trees of arrays
-
-
-def _one_of(name: str, given: Any, other: str, value: Any) -> Any:
-    """The argument that was given under either of two names."""
-    if given is not None and value is not None:
-        raise StepError(f"expected {name} or {other}, which mean the same, found both")
-    return value if given is None else given
 
 
 def _array(value: Any) -> Array:
