@@ -166,6 +166,8 @@ def _checked_tokens(text: str) -> list[_Token]:
         if token.kind not in _NEXT[expected] or token.kind == (")", "end")[parentheses > 0]:
             if expected in ("value", "item") and token.kind in ("key", "unknown"):
                 raise _unquoted(text, token)
+            if expected == "sign" and token.kind in ("key", "unknown") and tokens[-1:]:
+                raise _blank(text, tokens[-1], token)
             inside = expected == "more" and parentheses
             raise _error(text, "and, or, or ')'" if inside else _EXPECTED[expected], token)
         parentheses += {"(": 1, ")": -1}.get(token.kind, 0)
@@ -243,6 +245,15 @@ def _unquoted(text: str, token: _Token) -> FilterError:
     right = f"{before}{json.dumps(unquoted, ensure_ascii=False)}{after}"
     error = _error(text, _A_VALUE, token._replace(text=unquoted))
     return FilterError(f"{error}; put a text or a time in quotes, as in {right:.200}").at(token.position)
+
+
+def _blank(text: str, key: _Token, token: _Token) -> FilterError:
+    """The error for a word after a key: maybe the rest of a name with a blank, if the key names one in another."""
+    error, (first, dot, name) = _error(text, _EXPECTED["sign"], token), key.text.rpartition(".")
+    if not dot or name.endswith('"'):
+        return error
+    written = f"{first}.{json.dumps(f'{name} {token.text}', ensure_ascii=False)}"
+    return FilterError(f"{error}; a name with a blank is put in quotes: {written:.100}").at(token.position)
 
 
 def _error(text: str, expected: str, token: _Token) -> FilterError:

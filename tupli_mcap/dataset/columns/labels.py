@@ -9,10 +9,11 @@ import numpy as np
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIELD_OF, step_name
-from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, join_key
+from tupli_mcap.schema import BaseFilter, FilterIN, FilterType, format_key, join_key
 from tupli_mcap.schema.filters import COMBINING, path_of
 from tupli_mcap.spaces.labels import Labels
 
+_NAMED = 8  # most elements that an error names
 _EQUAL = (FilterType.EQ, FilterType.NE, FilterType.IN)
 
 
@@ -49,12 +50,28 @@ class StepLabels:
                     f"name one by its index: {', '.join(keys[:8])}"
                 )
             return self.applied(filter.model_copy(update={"key": keys[0]}))
+        self._check_named(filter, first, path)
         values = filter.value if filter.type is FilterType.IN else [filter.value]
         if path not in self._values or not any(isinstance(value, str) for value in values):
             return filter
         numbers = [one for value in values for one in self._numbers(filter, value, self._values[path])]
         found = FilterIN(key=filter.key, value=numbers)
         return ~found if filter.type is FilterType.NE else found
+
+    def _check_named(self, filter: BaseFilter, first: str, path: tuple[str, ...]) -> None:
+        """FilterError if a key names all elements of an array that has labels, or none of them."""
+        for leaf in (path, path[:-1]):
+            names = [
+                inside[-1]
+                for inside in self._elements
+                if inside[:-1] == leaf and self._elements[inside] != [()]
+            ]
+            if names and not (path != leaf and path[-1].isdigit()):
+                keys = [format_key((first, *leaf[1:], name)) for name in names]
+                raise FilterError(
+                    f"filter key {filter.key!r} names no element{did_you_mean(format_key((first, *path[1:])), keys)}: "
+                    f"name one of them: {', '.join(keys[:_NAMED])}, or by its index"
+                )
 
     @staticmethod
     def _numbers(filter: BaseFilter, value: Any, names: dict[str, list[int]]) -> list[Any]:
