@@ -725,6 +725,38 @@ def test_what_is_shown_is_short(runs: Path) -> None:
     assert "36 episodes" in repr(dataset)
 
 
+def test_lists_are_shown_by_their_first_entries(dataset: Dataset) -> None:
+    headers, tuples = dataset.headers, dataset[0].tuples
+    assert repr(headers) == f"[{', '.join(map(repr, list(headers[:3])))}, … (36 in all)]"
+    assert repr(tuples).endswith(f"… ({len(dataset[0])} in all)]") and len(repr(tuples)) < 1000
+    assert repr(headers[:2]) == repr(list(headers[:2])) and isinstance(headers, list)
+    assert repr(dataset[0].recording.file) == f"<OpenFile {str(dataset[0].recording.path)!r}: 5 channels>"
+
+
+def test_a_key_by_itself_is_a_flag(dataset: Dataset, runs: Path) -> None:
+    good = dataset.filter("metadata.success")
+    assert 0 < len(good) < len(dataset)
+    assert ids(dataset.filter(F("metadata.success"))) == ids(good)
+    assert dataset.filter_steps(F("terminal")).n_steps == len(dataset)
+    chosen = TupliDataset(runs).with_episode_filter(F("metadata.success"))
+    assert [header.id for header in chosen.preview()] == ids(good)
+
+
+@pytest.mark.parametrize(
+    ("test", "told"),
+    [
+        ("state > 1", 'names no element: name one of them: state."Cart Position", '),
+        ("state.Pole > 1", "names no element (did you mean 'state.\"Pole Angle\"'?): name one"),
+        ("observation.x > 1", 'name one of them: observation."Cart Position", '),
+        ("state.Pole Angle > 1", 'a name with a blank is put in quotes: state."Pole Angle"'),
+        ("state[9] > 1", "have state[0] to state[3]"),
+    ],
+)
+def test_a_key_of_no_element_names_those_there_are(dataset: Dataset, test: str, told: str) -> None:
+    with pytest.raises(FilterError, match=re.escape(told)):
+        dataset.filter_steps(test).read()
+
+
 def test_a_header_says_what_an_episode_says(dataset: Dataset) -> None:
     header, episode = dataset.headers[3], dataset[3]
     assert (header.steps, header.return_) == (episode.n_steps, episode.return_)

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 Array = np.ndarray[Any, Any]
 DType = np.dtype[Any]
+T = TypeVar("T")
 _SHOWN, _LONGEST = 20, 300  # numbers of an array, characters of a value, in a repr
+_FIRST = 3  # values of a list, in its repr
+
+
+class ShortList(list[T]):
+    """A list whose repr has its first values, and how many there are."""
+
+    def __repr__(self) -> str:
+        if len(self) <= _FIRST:
+            return super().__repr__()
+        return f"[{', '.join(map(repr, self[:_FIRST]))}, … ({len(self):,} in all)]"
 
 
 def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, ShortList
 from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
@@ -64,7 +64,7 @@ from tupli_mcap.recording.columns.fields import (
 from tupli_mcap.recording.edit.relabel import name_of
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, parse_filter
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
 from tupli_mcap.storage.base import uuid_of
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 _SHOWN = 100  # numbers of episodes, in a text
 
-Test: TypeAlias = "str | BaseFilter | Callable[[Episode], bool]"
+Test: TypeAlias = "str | F | BaseFilter | Callable[[Episode], bool]"
 
 
 class Dataset(RandomAccess):
@@ -98,7 +98,7 @@ class Dataset(RandomAccess):
         self._filter: BaseFilter | None = None  # of the episodes that are not listed yet
         self.chosen_by: tuple[str, ...] = ()
         """How the episodes were chosen, in the order in which that was done; `save` notes it."""
-        self._listed = None if headers is None else list(headers)
+        self._listed = None if headers is None else ShortList(headers)
         self._selector: TupleSelector | None = None  # of steps
         self._known: Selected | None = None  # what it has found
         self._recordings = OpenRecordings(source.open)
@@ -112,7 +112,7 @@ class Dataset(RandomAccess):
     def headers(self) -> Sequence[EpisodeHeader]:
         """The facts about the episodes, in their order, without their steps."""
         if self._listed is None:
-            self._listed = matching(self._filter, self._source.episodes)
+            self._listed = ShortList(matching(self._filter, self._source.episodes))
         return self._listed
 
     @property
@@ -264,8 +264,8 @@ class Dataset(RandomAccess):
         """The episodes that match a test, in the same order.
 
         Args:
-            test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`), or a function of an
-                `Episode`. Keys are those of `Dataset.keys`.
+            test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`; `F("metadata.good")`
+                is true where that is true), or a function of an `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
             FilterError: the test names an unknown key (also of metadata), compares a key with a value that it can
@@ -274,7 +274,7 @@ class Dataset(RandomAccess):
         if callable(test) and not isinstance(test, BaseFilter):
             matching_it = [header for header in self.headers if test(self._episode(header))]
             return self._of(matching_it, f"filter: {name_of(test)}")
-        wanted = parse_filter(test) if isinstance(test, str) else test
+        wanted = filter_of(test)
         check_keys(wanted, EpisodeHeader)
         found = None  # listed later, by this filter too
         if self._listed is not None:
@@ -286,7 +286,7 @@ class Dataset(RandomAccess):
         made._filter = wanted if self._filter is None else self._filter & wanted
         return made
 
-    def filter_steps(self, test: TupleFilter | str) -> Dataset:
+    def filter_steps(self, test: TupleFilter | F | str) -> Dataset:
         """The episodes with only those of their steps that match a test.
 
             dataset.filter_steps("reward > 0 and state[0] < 1").read()
@@ -307,7 +307,7 @@ class Dataset(RandomAccess):
         Raises:
             FilterError: it is neither, or names an unknown field.
         """
-        found = TupleSelector(parse_filter(test) if isinstance(test, str) else test)
+        found = TupleSelector(filter_of(test))
         made = self._of(self._listed)
         made._selector = found if self._selector is None else self._selector & found
         return made
@@ -754,6 +754,13 @@ class Dataset(RandomAccess):
         filters = {"steps": None if self._selector is None else self._selector.filters}
         steps = None if self._known is None else self._known.steps
         return display.Facts(repr(self._source), self._listed, steps, filters)
+
+
+def filter_of(test: Any) -> Any:
+    """What a text, or a key that is a flag (`F("metadata.good")`), says as a filter; all else as it is."""
+    if isinstance(test, F):
+        return test == True  # noqa: E712 - an expression
+    return parse_filter(test) if isinstance(test, str) else test
 
 
 def _places(chosen: Any, count: int) -> list[int]:

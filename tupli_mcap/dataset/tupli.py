@@ -15,14 +15,14 @@ from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
-from tupli_mcap.dataset.dataset import Dataset
+from tupli_mcap.dataset.dataset import Dataset, filter_of
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.dataset.which import text_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, RLTuple, parse_filter
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, F, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew
 
@@ -106,7 +106,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     # --- filters ---
 
-    def with_benchmark_filter(self, filter: BaseFilter | str | None) -> Self:
+    def with_benchmark_filter(self, filter: BaseFilter | F | str | None) -> Self:
         """The dataset with a further benchmark filter, over the fields of `BenchmarkHeader`; None removes all.
 
         Raises:
@@ -114,7 +114,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         """
         return self._with(benchmark_filter=filter)
 
-    def with_episode_filter(self, filter: BaseFilter | str | None) -> Self:
+    def with_episode_filter(self, filter: BaseFilter | F | str | None) -> Self:
         """The dataset with a further episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
         `n_tuples`, `end`, …); None removes all.
 
@@ -124,7 +124,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         """
         return self._with(episode_filter=filter)
 
-    def with_tuple_filter(self, filter_fcn: TupleFilter | str | None) -> Self:
+    def with_tuple_filter(self, filter_fcn: TupleFilter | F | str | None) -> Self:
         """The dataset with a further tuple filter, which chooses steps like `Dataset.filter_steps`; None removes all.
 
         Raises:
@@ -135,10 +135,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     def _with(self, **filters: Any) -> Self:
         made = type(self).__new__(type(self))
         made.__dict__.update(self.__dict__)
-        parsed = {
-            name: parse_filter(given) if isinstance(given, str) else given for name, given in filters.items()
-        }
-        made._query = self._query.narrowed(**parsed)
+        made._query = self._query.narrowed(**{name: filter_of(given) for name, given in filters.items()})
         made.set_seed(self._seed)
         return made
 

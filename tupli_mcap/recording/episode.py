@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, overload
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.arrays import short_repr
+from tupli_mcap.arrays import ShortList, short_repr
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.about.success import success_of
@@ -313,7 +313,7 @@ class Episode(GymnasiumNames):
     @property
     def tuples(self) -> list[RLTuple]:
         """The steps as PyTupli's tuples; the info is empty if none was recorded."""
-        return [RLTuple.from_env_step(*step[:5], step.info or {}) for step in self]
+        return ShortList(RLTuple.from_env_step(*step[:5], step.info or {}) for step in self)
 
     @property
     def position(self) -> int:

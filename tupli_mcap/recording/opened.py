@@ -13,7 +13,7 @@ import gymnasium as gym
 from mcap.records import Channel
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord, build, reasons_for_distrust
-from tupli_mcap.errors import FormatError, RecordingError, memory_for
+from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import (
     BODY,
@@ -81,6 +81,9 @@ class OpenFile(NamedTuple):
     topics: Mapping[str, int]
     steps: Sequence[int]
     cameras: Cameras
+
+    def __repr__(self) -> str:
+        return f"<OpenFile {self.source.name!r}: {plural(len(self.topics), 'channel')}>"
 
     @property
     def infos(self) -> InfoCodec | None:

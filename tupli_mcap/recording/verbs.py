@@ -46,7 +46,7 @@ class DatasetVerbs(SaysWhatIsMeant):
         """The episodes that match a test: `recording.filter("return > 100")`."""
         return self.dataset.filter(test)
 
-    def filter_steps(self, test: TupleFilter | str) -> Dataset:
+    def filter_steps(self, test: TupleFilter | F | str) -> Dataset:
         """The episodes with only the steps that match a test: `recording.filter_steps("reward > 0")`."""
         return self.dataset.filter_steps(test)
 
