@@ -252,11 +252,12 @@ class TestOrder:
     def mixed(self, any_catalog: Catalog | ServerCatalog) -> Catalog | ServerCatalog:
         rng = random.Random(0)
         values = [3, 3.5, -1, True, None, "a", "b", [1], math.nan, 2**70, "a\x00", 0]
+        flags = [True, False, 0, 1.0, 2, None, "yes"]
         for path in ("b.mcap", "a.mcap"):
             rows = [
                 row(
                     i,
-                    {"score": rng.choice(values)} if rng.random() < 0.8 else {},
+                    {"score": rng.choice(values), "success": rng.choice(flags)} if rng.random() < 0.8 else {},
                     episode_return=rng.choice([1.0, -2.0, math.inf, math.nan, None]),
                     n_tuples=rng.randrange(1, 4),
                     seed=rng.choice([None, 5, 2**127]),
@@ -271,7 +272,7 @@ class TestOrder:
     @pytest.mark.parametrize("text", ["", "steps > 1", "metadata.score != 3"])
     def test_pages_forth_and_back_are_the_whole(self, mixed: Catalog | ServerCatalog, text: str) -> None:
         wanted = parse_filter(text) if text else None
-        keys = ("return", "steps", "ended", "seed", "end", "recording", "metadata.score", "")
+        keys = ("return", "steps", "success", "ended", "seed", "end", "recording", "metadata.score", "")
         for key, descending in itertools.product(keys, (False, True)):
             self.check_pages(mixed, wanted, key, descending)
 

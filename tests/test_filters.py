@@ -7,6 +7,7 @@ import datetime
 import itertools
 import json
 import math
+import operator
 import re
 import time
 from collections.abc import Iterator
@@ -183,6 +184,7 @@ FACTS: dict[str, st.SearchStrategy[Any]] = {
     "seed": whole | st.none(),
     "episode_return": real | st.none(),
     **dict.fromkeys(("terminated", "timeout"), st.booleans()),
+    "success": st.booleans() | st.none(),
     **dict.fromkeys(("id", "created_by", "benchmark_id", "recording"), texts | own_texts),
     **dict.fromkeys(("created_at", "ended"), times),
     "end": ends,
@@ -212,7 +214,7 @@ def leaves(draw: st.DrawFn) -> BaseFilter:
     if kind is FilterIN:
         return FilterIN(key=key, value=draw(st.lists(given, max_size=20)))
     if kind not in (FilterEQ, FilterNE):
-        if key in ("terminated", "timeout", "end"):
+        if key in ("terminated", "timeout", "success", "end"):
             kind = FilterNE
         elif key in ("n_tuples", "env", "episode", "seed"):
             given = real
@@ -230,9 +232,13 @@ filters = st.recursive(
     ),
     max_leaves=6,
 )
+flags = st.dictionaries(
+    st.sampled_from(["success", "is_success"]),
+    st.sampled_from([True, False, 0, 1, 1.0, 2, "1", None, [True], math.nan]),
+)
 rows = st.fixed_dictionaries(
     {
-        "metadata": items,
+        "metadata": items | st.builds(operator.or_, items, flags),
         "n_tuples": st.integers(0, 3) | st.just(2**62),
         "env": st.integers(0, 2),
         "end": st.sampled_from(["terminal", "timeout", "interrupted"]),

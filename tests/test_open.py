@@ -254,7 +254,7 @@ def test_an_error_within_a_property_is_not_taken_for_a_wrong_name(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Dataset, "lengths", property(lambda ds: ds.headers.nothing))
-    with pytest.raises(AttributeError, match="'list' object has no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match="'ShortList' object has no attribute 'nothing'"):
         _ = dataset.lengths
 
 
@@ -731,6 +731,20 @@ def test_lists_are_shown_by_their_first_entries(dataset: Dataset) -> None:
     assert repr(tuples).endswith(f"… ({len(dataset[0])} in all)]") and len(repr(tuples)) < 1000
     assert repr(headers[:2]) == repr(list(headers[:2])) and isinstance(headers, list)
     assert repr(dataset[0].recording.file) == f"<OpenFile {str(dataset[0].recording.path)!r}: 5 channels>"
+
+
+def test_success_is_a_key(dataset: Dataset, runs: Path) -> None:
+    good = dataset.filter("metadata.success")
+    for test in ("success", "success == true", F("success"), "success != false"):
+        assert ids(dataset.filter(test)) == ids(good)
+        assert [header.id for header in TupliDataset(runs).with_episode_filter(test).preview()] == ids(good)
+    assert {episode.success for episode in dataset.sort("success", descending=True)[: len(good)]} == {True}
+    assert len(dataset.filter("success = null")) == 0 and "success" in dataset.keys
+    assert dataset.headers[0].success is dataset[0].success is True
+    with pytest.raises(
+        FilterError, match="'success' is true or false or null: expected such a value, found 'no'"
+    ):
+        dataset.filter("success = 'no'")
 
 
 def test_a_key_by_itself_is_a_flag(dataset: Dataset, runs: Path) -> None:

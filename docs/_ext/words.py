@@ -13,6 +13,7 @@ from typing import Any
 from tupli_mcap.doctor import CHECKS
 from tupli_mcap.recording import Run
 from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, facts
+from tupli_mcap.schema.models import DERIVED
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,6 +32,7 @@ _ABOUT = {  # the meaning of each key
     "run": "see below",
     "seed": "seed of its reset",
     "steps": "number of its steps; also `n_tuples`",
+    "success": "`success` or `is_success` of its metadata, if that is true, false, 0 or 1; else null",
     "terminated": "its last step was terminal",
     "timeout": "its last step was a timeout",
     "environment": "Gymnasium id, or the class",
@@ -55,10 +57,9 @@ _RUN = {
 
 def filter_keys_of(model: Any) -> dict[str, tuple[str, str]]:
     """Key -> its type, and its meaning."""
-    fields = model.model_fields
+    kinds = DERIVED | {name: field.annotation for name, field in model.model_fields.items()}
     return {
-        key: (_kind(fields[facts.path_in(key, model)[0]].annotation), _ABOUT[key])
-        for key in facts.filter_keys(model)
+        key: (_kind(kinds[facts.path_in(key, model)[0]]), _ABOUT[key]) for key in facts.filter_keys(model)
     }
 
 

@@ -1,6 +1,6 @@
 """Models of benchmarks, artifacts, episodes and people, and filters over them. No I/O.
 
-models, people               benchmarks, artifacts, episodes; users, groups, roles
+models, people, success      benchmarks, artifacts, episodes; users, groups, roles; whether an episode succeeded
 filters, field, parse        filters; built with `F`, read from text
 keys, values, times          keys, values and times in filters, and their comparison
 facts                        checks filters against a model

@@ -24,7 +24,7 @@ from tupli_mcap.schema.filters import (
     FilterType,
 )
 from tupli_mcap.schema.keys import join_key, split_key
-from tupli_mcap.schema.models import EpisodeHeader
+from tupli_mcap.schema.models import DERIVED, EpisodeHeader
 from tupli_mcap.schema.parse import key_positions, parse_filter
 from tupli_mcap.schema.times import EXPECTED, TIME_PATHS, TimeSpan, span_of
 from tupli_mcap.schema.values import Scalar, classify
@@ -78,7 +78,7 @@ def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
         return sorted(fields)
     if not issubclass(fields, EpisodeHeader):
         return sorted(fields.model_fields)
-    return sorted({*fields.model_fields, *_MEANT} - {*_MEANT.values()})
+    return sorted({*fields.model_fields, *_MEANT, *DERIVED} - {*_MEANT.values()})
 
 
 def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...]:
@@ -91,7 +91,8 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
     of_episodes = isinstance(fields, type) and issubclass(fields, EpisodeHeader)
     if of_episodes:
         name = _OTHER_NAMES.get(name, name)
-    if name not in (fields.model_fields if isinstance(fields, type) else fields):
+    own = fields.model_fields if isinstance(fields, type) else fields
+    if name not in own and not (of_episodes and name in DERIVED):
         known = filter_keys(fields)
         nested = [there for there in _INSIDE if there.split(".")[0] in known]
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
@@ -244,7 +245,7 @@ def _time(filter: BaseFilter, value: object, now: datetime.datetime) -> TimeSpan
 @lru_cache(maxsize=256)
 def _kinds_of(model: type[BaseModel], name: str) -> frozenset[str]:
     """The kinds of scalars that a field may hold, by itself or in a list; none if it holds mappings."""
-    annotation = model.model_fields[name].annotation
+    annotation = DERIVED[name] if name in DERIVED else model.model_fields[name].annotation
     if typing.get_origin(annotation) is list:
         annotation = typing.get_args(annotation)[0]
     several = typing.get_origin(annotation) in (types.UnionType, typing.Union)

@@ -6,12 +6,13 @@ import datetime
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from pydantic import BaseModel, Field, PrivateAttr
 
 from tupli_mcap.arrays import short_repr
 from tupli_mcap.errors import StorageError, plural
+from tupli_mcap.schema.success import success_of
 
 
 def _fresh(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -220,6 +221,12 @@ class EpisodeHeader(DBItem):
         """`episode_return`."""
         return self.episode_return
 
+    @property
+    def success(self) -> bool | None:
+        """Whether it succeeded: `success` or `is_success` of its metadata, if that is true, false, 0 or 1; else
+        None."""
+        return success_of(self.metadata)
+
     def __repr__(self) -> str:
         total = "" if self.episode_return is None else f", return {self.episode_return:g}"
         of = f" of {self.recording}" if self.recording else ""
@@ -229,6 +236,9 @@ class EpisodeHeader(DBItem):
 
     __str__ = __repr__
 
+
+DERIVED: Final[dict[str, Any]] = {"success": bool | None}
+"""The properties of an episode that filters name like its fields, and their types."""
 
 _HEADER_FIELDS = set(EpisodeHeader.model_fields)
 _NEW, _SET = EpisodeHeader.__new__, object.__setattr__

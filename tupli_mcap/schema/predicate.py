@@ -15,6 +15,7 @@ from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.schema.facts import bound
 from tupli_mcap.schema.filters import ORDERING, BaseFilter, FilterType, path_of
 from tupli_mcap.schema.keys import join_key
+from tupli_mcap.schema.models import DERIVED, EpisodeHeader
 from tupli_mcap.schema.parse import parse_filter
 from tupli_mcap.schema.times import TIME_PATHS, time_ns
 from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
@@ -104,7 +105,8 @@ def look_up(item: object, path: tuple[str, ...]) -> object:
     """The value at a path in nested mappings and models; `MISSING` if there is none."""
     for segment in path:
         if isinstance(item, BaseModel):
-            if segment not in type(item).model_fields:
+            derived = DERIVED if isinstance(item, EpisodeHeader) else ()
+            if segment not in type(item).model_fields and segment not in derived:
                 return MISSING
             item = getattr(item, segment)
         elif isinstance(item, Mapping) and segment in item and untag_float(item) is None:

@@ -6,30 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import plural, warn
-
-KEYS = ("is_success", "success")
-"""The keys that infos and metadata use."""
-
-
-def success_of(said: Any) -> bool | None:
-    """Whether the episode succeeded, from an info or from metadata; None if they have no success flag.
-
-    That is a bool, a number that is 0 or 1, or an array of one of these, as `success` or `is_success`.
-    """
-    if isinstance(said, dict) and said:
-        for key in KEYS:
-            value = said.get(key)
-            if isinstance(value, np.ndarray) and value.size == 1:
-                value = value.item()
-            if isinstance(value, bool | np.bool_) or (
-                isinstance(value, int | float | np.number) and value in (0, 1)
-            ):
-                return bool(value)
-    return None
+from tupli_mcap.schema.success import KEYS as KEYS, success_of as success_of
 
 
 def names_success(info: Any) -> bool:

@@ -68,6 +68,11 @@ _CHOICES: Final[Mapping[str, Mapping[Scalar, Condition]]] = {
         Scalar("bool", True): EPISODE.c.end == "timeout",
         Scalar("bool", False): EPISODE.c.end != "timeout",
     },
+    "success": {
+        Scalar("bool", True): and_(EPISODE.c.success.is_not(None), EPISODE.c.success == 1),
+        Scalar("bool", False): and_(EPISODE.c.success.is_not(None), EPISODE.c.success == 0),
+        Scalar("null", None): EPISODE.c.success.is_(None),
+    },
 }
 
 

@@ -29,7 +29,7 @@ _FACTS: Final = {
     name: EPISODE.c[name] for name in ("created_at", "n_tuples", "env", "episode", "end", "created_by")
 }
 _OF_RECORDING: Final = {"recording": RECORDING.c.path, "benchmark_id": RECORDING.c.benchmark_id}
-_MAYBE: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed")}
+_MAYBE: Final = {name: EPISODE.c[name] for name in ("episode_return", "seed", "success")}
 
 
 class After(NamedTuple):
@@ -177,8 +177,8 @@ def _of_key(sort: Sort, indexed: Mapping[tuple[str, ...], int]) -> list[Range]:
         ]
     if name != "metadata" or not inside or not can_search(inside):
         raise FilterError(
-            f"cannot sort by {join_key([name, *inside])!r}; sort by return, steps, ended, end, seed, env, episode, "
-            "recording, or a key of the metadata such as metadata.score"
+            f"cannot sort by {join_key([name, *inside])!r}; sort by return, steps, success, ended, end, seed, env, "
+            "episode, recording, or a key of the metadata such as metadata.score"
         )
     number, text = (case((EPISODE.c.readable, at(inside))) for at in (number_at, text_at))
     return [
