@@ -861,7 +861,7 @@ def test_a_recording_changes_as_a_dataset_does(tmp_path: Path) -> None:
         assert len(open_columns(tmp_path / "columns").steps) == recording.n_steps
         with pytest.raises(TupliError, match="all its episodes would be deleted"):
             recording.delete()
-        assert recording.delete(force=True, dry_run=True) == 3
+        assert recording.delete(dry_run=True) == 3
     assert all(episode.success for episode in tupli_mcap.open(path))
 
 

@@ -272,8 +272,8 @@ class Dataset(RandomAccess):
                 never have, or is neither a text, an expression nor a function.
         """
         if callable(test) and not isinstance(test, BaseFilter):
-            matching_it = [header for header in self.headers if test(self._episode(header))]
-            return self._of(matching_it, f"filter: {name_of(test)}")
+            passing = [header for header in self.headers if test(self._episode(header))]
+            return self._of(passing, f"filter: {name_of(test)}")
         wanted = filter_of(test)
         check_keys(wanted, EpisodeHeader)
         found = None  # listed later, by this filter too

@@ -138,6 +138,6 @@ class DatasetVerbs(SaysWhatIsMeant):
         """Writes the episodes to a new recording, each with only some consecutive steps."""
         return self.dataset.trim(steps, target, overwrite=overwrite)
 
-    def delete(self, *, force: bool = False, dry_run: bool = False) -> int:
-        """Deletes all episodes where they are stored, and with `force` the file; returns their number."""
-        return self.dataset.delete(force=force, dry_run=dry_run)
+    def delete(self, *, dry_run: bool = False) -> int:
+        """Deletes all episodes where they are stored; returns their number."""
+        return self.dataset.delete(dry_run=dry_run)
