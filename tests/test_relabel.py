@@ -86,7 +86,7 @@ def test_actions_and_rewards_of_some_episodes_of_several_recordings(tmp_path: Pa
     assert [episode.run.name for episode in after] == ["w0", "w0", "w1", "w1"]
     said = Recording(new).made_of
     assert said is not None
-    assert (said["how"], said["fields"]) == ("map", ["actions", "rewards"])
+    assert (said["how"], said["query"], said["fields"]) == ("map", "seed >= 2", ["actions", "rewards"])
     assert [Path(one["name"]).name for one in said["sources"]] == ["0.mcap", "1.mcap"]
     assert verify_recording(new).ok
 

@@ -139,6 +139,9 @@ def test_of_a_part_of_several_recordings(tmp_path: Path) -> None:
     jsonschema.validate(said, json.loads((ROOT / "schemas" / "made_of.schema.json").read_text()))
     assert [one["name"] for one in said["sources"]] == ["0.mcap", "1.mcap"]
     assert said["steps"] == {str(e.number): [3, len(e) + 3] for e in merged}
+    assert (said["how"], said["query"]) == ("trim", "seed == 1")
+    one = tupli_mcap.open(paths[0]).head(2).trim(slice(3, -3), tmp_path / "one.mcap")
+    assert Recording(one).made_of["query"] == "head: 2"  # type: ignore[index]
 
 
 def test_info_says_the_digests_of_the_sources_and_alike_trims_once(tmp_path: Path) -> None:

@@ -221,13 +221,16 @@ def trim(
     if len(excerpts) == 1:
         ((name, excerpt),) = zip(kept, excerpts, strict=True)
         numbers = excerpt.rows["episode"].tolist()
-        return trim_recording(excerpt.recording, target, kept[name], episodes=numbers, overwrite=True)
+        return trim_recording(
+            excerpt.recording, target, kept[name], episodes=numbers, overwrite=True, made=_chosen_by(dataset)
+        )
     trimmed = [
         excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
         for name, excerpt in zip(kept, excerpts, strict=True)
     ]
     with replacing(target) as (fd, _):
-        merge_excerpts(trimmed, Container(fd, str(target), "zstd"))
+        made = {"how": "merge", **_chosen_by(dataset)}
+        merge_excerpts(trimmed, Container(fd, str(target), "zstd"), made=made)
     return report._replace(size=target.stat().st_size)
 
 
@@ -238,6 +241,12 @@ def _excerpts(dataset: Episodes) -> list[Excerpt]:
         positions = positions_of(recording, ListedEpisodes.of(name, listed[name]))
         found.append(Excerpt(recording, recording.index[np.sort(positions)]))
     return found
+
+
+def _chosen_by(dataset: Episodes) -> dict[str, str]:
+    """How the episodes were chosen, for `made_of.json`; empty if they are all."""
+    query = "; ".join(dataset.chosen_by)
+    return {"query": query if len(query) <= _MAX_QUERY else f"{query[:_MAX_QUERY]}…"} if query else {}
 
 
 def file_path(place: str | os.PathLike[str]) -> Path:
@@ -272,11 +281,9 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
 
 def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """See `Dataset.save`."""
-    target, query = file_path(place), "; ".join(dataset.chosen_by)
-    if len(query) > _MAX_QUERY:
-        query = f"{query[:_MAX_QUERY]}…"
+    target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
-    facts = {"query": query} if query else {}
+    facts = _chosen_by(dataset)
     excerpts = _excerpts(dataset)
     if len(excerpts) == 1:
         ((source, rows, *_),) = excerpts
@@ -285,7 +292,7 @@ def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -
         if Notes.read(target).deleted:  # the episodes keep their ids, and were deleted in an earlier file
             restore_episodes(target)
         return target
-    made = {"how": "filter" if query else "merge", **facts}
+    made = {"how": "filter" if facts else "merge", **facts}
     with replacing(target) as (fd, _):
         merge_excerpts(excerpts, Container(fd, str(target), "zstd"), made=made)
     return target
@@ -301,7 +308,7 @@ def relabel(
 ) -> Path:
     """See `Dataset.map`."""
     _check_new(dataset, target, overwrite=overwrite)
-    relabel_excerpts(_excerpts(dataset), target, function, fields)
+    relabel_excerpts(_excerpts(dataset), target, function, fields, _chosen_by(dataset))
     return target
 
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -37,6 +38,7 @@ def relabel_excerpts(
     target: Path,
     function: Callable[[Episode], Any],
     fields: Sequence[str] = ("rewards",),
+    made: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Writes `target` (replaced in one rename) with new values of some fields.
 
@@ -50,6 +52,7 @@ def relabel_excerpts(
             has a value for each step, nested as the space is, which the recording's dtype holds exactly. A column of
             states has one more value if the final state is known, like `Episode.all_states`.
         fields: some of "rewards", "actions" and "states".
+        made: further facts for `made_of.json`.
 
     Raises:
         RecordingError: there is no such field, or the function returns something else.
@@ -63,7 +66,7 @@ def relabel_excerpts(
         for i, excerpt in enumerate(excerpts):
             columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))
             changed.append(excerpt._replace(values=_new_values(excerpt, function, fields, columns)))
-        made = {"how": "map", "function": name_of(function), "fields": fields}
+        made = {"how": "map", **made, "function": name_of(function), "fields": fields}
         merge_excerpts(changed, Container(fd, str(target), "zstd"), made=made)
 
 

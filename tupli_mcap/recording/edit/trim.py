@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,7 @@ def trim_recording(
     *,
     episodes: Sequence[int] | None = None,
     overwrite: bool = False,
+    made: Mapping[str, Any] = MappingProxyType({}),
 ) -> TrimReport:
     """Writes `target` with only some consecutive steps of some episodes.
 
@@ -50,6 +52,7 @@ def trim_recording(
         steps: by number of the episode, the steps that stay; other episodes stay whole.
         episodes: numbers of the episodes to keep (all by default).
         overwrite: replace a target that exists.
+        made: further facts for `made_of.json`.
 
     Raises:
         RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
@@ -67,7 +70,8 @@ def trim_recording(
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
     left_out = sum(lengths[number] - (trim.stop - trim.start) for number, trim in trims.items())
     report = TrimReport(target, len(rows), total - left_out, left_out)
-    said = say_made_of([source], "trim", steps={str(n): [trim.start, trim.stop] for n, trim in trims.items()})
+    kept = {str(n): [trim.start, trim.stop] for n, trim in trims.items()}
+    said = say_made_of([source], "trim", **made, steps=kept)
     with replacing(target) as (fd, _):
         container = Container(fd, str(target), "zstd")
         metadata = new_metadata(source)
