@@ -1255,7 +1255,7 @@ def test_all_that_chose_the_episodes_is_noted_in_order(
         f"{words}; sample: 3, seed 0; episode >= 0",
     )
     told = CliRunner().invoke(app, ["info", str(tmp_path / "s.mcap")]).output
-    assert f"by filter {words}; sample: 3, seed 0; episode >= 0" in " ".join(told.split())
+    assert f"by filter ({words}; sample: 3, seed 0; episode >= 0" in " ".join(told.split())
     assert noted(dataset[[1, 2]]) == ("filter", "index: [1, 2]")
     assert noted(dataset.split(0.5, seed=3)[0]) == ("filter", "split: 0.5, seed 3, first part")
     either = dataset.filter(first).head(1) + dataset.filter(second)

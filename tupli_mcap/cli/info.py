@@ -274,7 +274,8 @@ def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _made_of_text(made_of: dict[str, Any]) -> str:
-    facts = [f"{made_of.get(key)!s:.200}" for key in ("query", "function") if made_of.get(key)]
+    facts = [f"{made_of['function']!s:.200}"] if made_of.get("function") else []
+    facts += [f"({made_of['query']!s:.200})"] if made_of.get("query") else []
     if isinstance(steps := made_of.get("steps"), dict):  # of a trim
         facts.append(f"to steps {_trims_text(steps)}")
     names = [
