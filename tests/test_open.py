@@ -859,10 +859,10 @@ def test_a_recording_changes_as_a_dataset_does(tmp_path: Path) -> None:
             recording.annotate()
         recording.save_columns(tmp_path / "columns")
         assert len(open_columns(tmp_path / "columns").steps) == recording.n_steps
-        with pytest.raises(TupliError, match="all its episodes would be deleted"):
-            recording.delete()
         assert recording.delete(dry_run=True) == 3
-    assert all(episode.success for episode in tupli_mcap.open(path))
+        assert all(episode.success for episode in tupli_mcap.open(path))
+        assert recording.delete() == 3
+    assert len(tupli_mcap.open(path)) == 0
 
 
 def test_the_episodes_of_two_datasets(runs: Path, tmp_path: Path) -> None:
