@@ -65,7 +65,10 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def server(large: Path) -> Iterator[WebServer]:
+    # an earlier server may have had the same port
     source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+    source._copies.clear()
+    objects._no_suffixes.clear()
     with serving() as found:
         found.files["/r.mcap"] = large.read_bytes()
         yield found

@@ -28,7 +28,7 @@ _TAIL = 128 << 10
 _HEAD = 16 << 10
 _AT_ONCE = 8
 _MOST_ENDS = 512
-_MOST_COPIES = 64
+_MOST_COPIES = 16
 
 
 class _Block(NamedTuple):
