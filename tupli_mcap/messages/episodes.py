@@ -84,14 +84,17 @@ class EpisodeStart(NamedTuple):
         return cls._make([*START_FIELDS.unpack_from(body, 0), seed, options, reset_info])
 
 
-_PLAIN_START = _strings("", "", "{}")
+_PLAIN_START, _PLAIN_TEXTS = _strings("", "", "{}"), _strings("", "{}")
 
 
 def start_texts(seed: str, options: str, reset_info: str) -> bytes:
     """The end of an `EpisodeStart`'s CDR body, which follows its `START_FIELDS`."""
-    if seed == "" and options == "" and reset_info == "{}":
+    if options or reset_info != "{}":
+        return _strings(seed, options, reset_info)
+    if not seed:
         return _PLAIN_START
-    return _strings(seed, options, reset_info)
+    own = _strings(seed)
+    return own + bytes(-len(own) % 4) + _PLAIN_TEXTS
 
 
 class EpisodeEnd(NamedTuple):
