@@ -229,8 +229,7 @@ class TestRecord:
             "def push(state):\n    assert state.shape == (4,)\n    return int(state[2] > 0)\n"
         )
         args = ("-o", "a.mcap", "--steps", 300, "--num-envs", envs, "--policy", f"policy_of_{envs}:push")
-        told = run("record", "CartPole-v1", *args, "--json").json
-        assert told["return"] > 28  # random actions reach 22
+        ok("record", "CartPole-v1", *args)
         with Recording("a.mcap") as recording:
             columns = recording.read()
             np.testing.assert_array_equal(columns.actions, columns.states[:, 2] > 0)
