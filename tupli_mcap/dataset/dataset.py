@@ -48,7 +48,7 @@ from tupli_mcap.dataset.sources import (
     numbers_by_recording,
     place_of,
 )
-from tupli_mcap.dataset.which import text_of
+from tupli_mcap.dataset.which import as_filter, text_of
 from tupli_mcap.errors import warn
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import (
@@ -61,10 +61,10 @@ from tupli_mcap.recording.columns.fields import (
     split_name,
     step_name,
 )
-from tupli_mcap.recording.edit.relabel import name_of
+from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate, parse_filter
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
 from tupli_mcap.storage.base import uuid_of
 
 if TYPE_CHECKING:
@@ -273,8 +273,8 @@ class Dataset(RandomAccess):
         """
         if callable(test) and not isinstance(test, BaseFilter):
             passing = [header for header in self.headers if test(self._episode(header))]
-            return self._of(passing, f"filter: {name_of(test)}")
-        wanted = filter_of(test)
+            return self._of(passing, f"filter: {function_name(test)}")
+        wanted = as_filter(test)
         check_keys(wanted, EpisodeHeader)
         found = None  # listed later, by this filter too
         if self._listed is not None:
@@ -307,7 +307,7 @@ class Dataset(RandomAccess):
         Raises:
             FilterError: it is neither, or names an unknown field.
         """
-        found = TupleSelector(filter_of(test))
+        found = TupleSelector(as_filter(test))
         made = self._of(self._listed)
         made._selector = found if self._selector is None else self._selector & found
         return made
@@ -339,7 +339,7 @@ class Dataset(RandomAccess):
         except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
         rest = sorted(set(range(len(values))) - set(places))
-        by = f"{name_of(key) if callable(key) else key}{', descending' if descending else ''}"
+        by = f"{function_name(key) if callable(key) else key}{', descending' if descending else ''}"
         return self._of([self.headers[i] for i in [*ordered, *rest]], f"sort: {by}")
 
     def head(self, n: int = 5) -> Dataset:
@@ -754,13 +754,6 @@ class Dataset(RandomAccess):
         filters = {"steps": None if self._selector is None else self._selector.filters}
         steps = None if self._known is None else self._known.steps
         return display.Facts(repr(self._source), self._listed, steps, filters)
-
-
-def filter_of(test: Any) -> Any:
-    """What a text, or a key that is a flag (`F("metadata.good")`), says as a filter; all else as it is."""
-    if isinstance(test, F):
-        return test == True  # noqa: E712 - an expression
-    return parse_filter(test) if isinstance(test, str) else test
 
 
 def _places(chosen: Any, count: int) -> list[int]:

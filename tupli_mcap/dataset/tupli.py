@@ -15,12 +15,12 @@ from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
-from tupli_mcap.dataset.dataset import Dataset, filter_of
+from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
-from tupli_mcap.dataset.which import text_of
+from tupli_mcap.dataset.which import as_filter, text_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, F, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
@@ -135,7 +135,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     def _with(self, **filters: Any) -> Self:
         made = type(self).__new__(type(self))
         made.__dict__.update(self.__dict__)
-        made._query = self._query.narrowed(**{name: filter_of(given) for name, given in filters.items()})
+        made._query = self._query.narrowed(**{name: as_filter(given) for name, given in filters.items()})
         made.set_seed(self._seed)
         return made
 

@@ -11,7 +11,16 @@ import numpy as np
 from tupli_mcap.dataset.sources import deleted_of, episode_headers
 from tupli_mcap.errors import FilterError, Gathered, RecordingError
 from tupli_mcap.recording import Recording
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, compile_predicate, format_filter
+from tupli_mcap.schema import (
+    BaseFilter,
+    EpisodeHeader,
+    F,
+    FilterEQ,
+    check_keys,
+    compile_predicate,
+    format_filter,
+    parse_filter,
+)
 from tupli_mcap.storage.listing import recordings_at
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
@@ -82,6 +91,13 @@ def named_places(
             )
         chosen.update(dict.fromkeys(places))
     return list(chosen)
+
+
+def as_filter(test: Any) -> Any:
+    """What a text, or a key that is a flag (`F("metadata.good")`), says as a filter; all else as it is."""
+    if isinstance(test, F):
+        return FilterEQ(key=test.key, value=True)
+    return parse_filter(test) if isinstance(test, str) else test
 
 
 def text_of(filter: BaseFilter) -> str:

@@ -71,14 +71,10 @@ class DatasetVerbs(SaysWhatIsMeant):
         return self.dataset.windows(length, **chosen)
 
     def delta_windows(
-        self,
-        deltas: Mapping[str, Iterable[float]],
-        unit: Unit = "steps",
-        *,
-        step_seconds: float | None = None,
+        self, deltas: Mapping[str, Iterable[float]], unit: Unit = "steps", **chosen: Any
     ) -> DeltaWindows:
-        """The values around each step: `{"state": [-2, -1, 0], "action": range(16)}`, in steps or seconds."""
-        return self.dataset.delta_windows(deltas, unit, step_seconds=step_seconds)
+        """The values around each step: `{"state": [-2, -1, 0], "action": range(16)}`. `chosen`: step_seconds."""
+        return self.dataset.delta_windows(deltas, unit, **chosen)
 
     def transitions(self, n_step: int = 1, discount: float = 1.0, **chosen: Any) -> Transitions:
         """The transition (s, a, r, s') that starts at each step. `chosen`: fields."""

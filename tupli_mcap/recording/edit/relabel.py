@@ -66,11 +66,11 @@ def relabel_excerpts(
         for i, excerpt in enumerate(excerpts):
             columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))
             changed.append(excerpt._replace(values=_new_values(excerpt, function, fields, columns)))
-        made = {"how": "map", **made, "function": name_of(function), "fields": fields}
+        made = {"how": "map", **made, "function": function_name(function), "fields": fields}
         merge_excerpts(changed, Container(fd, str(target), "zstd"), made=made)
 
 
-def name_of(function: Callable[..., Any]) -> str:
+def function_name(function: Callable[..., Any]) -> str:
     """`module.function`, or the module and the class of another object that can be called."""
     name = getattr(function, "__qualname__", type(function).__name__)
     return f"{getattr(function, '__module__', '')}.{name}"
