@@ -166,7 +166,7 @@ def measure_queries(client: TupliAPIClient, counter: Counter, place: Path, uri: 
     firsts: list[float] = []
 
     def cost(what: str, act: Callable[[], Any]) -> Any:
-        source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+        source._blocks = source._Blocks(source.BLOCK_BYTES)
         before, began = counter.sent, time.perf_counter()
         found = act()
         seconds = time.perf_counter() - began

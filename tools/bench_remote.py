@@ -148,7 +148,7 @@ class Reader:
 
 def forget() -> None:
     """Empties the cache of this process."""
-    source._blocks.__init__(source.BLOCK_BYTES)  # type: ignore[misc]
+    source._blocks = source._Blocks(source.BLOCK_BYTES)
 
 
 def read_each(reader: Reader, url: str, local: Recording, draws: int) -> None:
