@@ -20,11 +20,12 @@ from mcap_ros2.decoder import DecoderFactory
 from PIL import Image
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import RecordEpisodes, Recording, recover_recording, verify_recording
 from tupli_mcap.benchmark import TupliEnvWrapper
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError
+from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, TupliError
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.messages.images.pictures import decode_picture, encode_picture
 from tupli_mcap.recording import rewrite_recording
@@ -283,6 +284,18 @@ class TestReading:
                 RecordingError, match="expected one of its cameras, found 'front'; it has render"
             ):
                 recording.frames(0, "front")
+
+    def test_tables_have_a_column_of_them_if_asked(self, tmp_path: Path) -> None:
+        record(tmp_path / "r.mcap", [6])
+        dataset = tupli_mcap.open(tmp_path)
+        shown = dataset.read(["frames"]).frames
+        assert "frames" not in dataset.to_pandas()
+        np.testing.assert_array_equal(np.stack(list(dataset.to_pandas(frames=True)["frames"])), shown)
+        np.testing.assert_array_equal(dataset.to_arrow(frames=True)["frames"].to_pylist(), shown)
+        with Recording(tmp_path / "r.mcap") as recording:
+            assert len(recording.to_pandas(frames=True)["frames"][0].shape) == 3
+        with pytest.raises(TupliError, match="expected the level 'steps' for frames"):
+            dataset.to_pandas("episodes", frames=True)
 
     def test_one_frame_decodes_one_chunk(self, tmp_path: Path) -> None:
         record(tmp_path / "r.mcap", [6] * 10, chunk_size=500)

@@ -566,7 +566,7 @@ class Dataset(RandomAccess):
 
     # ---- out
 
-    def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
+    def to_pandas(self, level: Level = "steps", *, frames: bool = False) -> pd.DataFrame:
         """One row per step or per episode, one column per dimension, with its label if the recordings agree on one.
 
         Infos and metadata have a column for each key: `info.x`, `metadata.score`. Metadata in dicts have one for each
@@ -574,19 +574,24 @@ class Dataset(RandomAccess):
         those and of numbers, has one for each number: `info.contact.left[0]`. An image, or an array of more than 500
         numbers, is one column, with an array in each cell. Times are in UTC, with their zone.
 
+        Args:
+            level: "steps" or "episodes".
+            frames: a column `frames` with the recorded picture of each step, as `read` gives it: uint8 (height, width,
+                3). All of them are in memory then.
+
         Raises:
             MissingExtraError: pandas is not installed.
         """
-        return tables.dataframe(self, level)
+        return tables.dataframe(self, level, frames=frames)
 
-    def to_arrow(self, level: Level = "steps") -> pa.Table:
+    def to_arrow(self, level: Level = "steps", *, frames: bool = False) -> pa.Table:
         """The same as an Arrow table, in which null is what is missing. Where Arrow has no type for all values of a
         column, they are texts of JSON.
 
         Raises:
             MissingExtraError: pandas or pyarrow is not installed.
         """
-        return tables.arrow(self, level)
+        return tables.arrow(self, level, frames=frames)
 
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording, with everything that belongs to them, in the order of their times.

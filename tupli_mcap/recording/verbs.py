@@ -97,13 +97,13 @@ class DatasetVerbs(SaysWhatIsMeant):
         channels of an image that is named: `stats(["state.camera"])`."""
         return self.dataset.stats(fields)
 
-    def to_pandas(self, level: Level = "steps") -> pd.DataFrame:
+    def to_pandas(self, level: Level = "steps", *, frames: bool = False) -> pd.DataFrame:
         """A table with a row for each step, or for each episode."""
-        return self.dataset.to_pandas(level)
+        return self.dataset.to_pandas(level, frames=frames)
 
-    def to_arrow(self, level: Level = "steps") -> pa.Table:
+    def to_arrow(self, level: Level = "steps", *, frames: bool = False) -> pa.Table:
         """The same as an Arrow table."""
-        return self.dataset.to_arrow(level)
+        return self.dataset.to_arrow(level, frames=frames)
 
     def save(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Writes the episodes to a new recording."""

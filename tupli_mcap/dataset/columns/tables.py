@@ -31,29 +31,32 @@ _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is
 _REAL = (int, float, np.integer, np.floating)
 
 
-def dataframe(dataset: Episodes, level: Level) -> pd.DataFrame:
+def dataframe(dataset: Episodes, level: Level, *, frames: bool) -> pd.DataFrame:
     """See `Dataset.to_pandas`."""
-    return import_pandas().DataFrame(_columns(dataset, level))
+    return import_pandas().DataFrame(_columns(dataset, level, frames=frames))
 
 
-def _columns(dataset: Episodes, level: Level) -> dict[str, Any]:
+def _columns(dataset: Episodes, level: Level, *, frames: bool) -> dict[str, Any]:
     """Columns that pandas takes; lists and masked arrays say what is missing, where a DataFrame has NaN."""
     pandas = import_pandas()
     if level == "episodes":
+        if frames:
+            raise DatasetError("expected the level 'steps' for frames, found 'episodes'")
         return _episode_columns(dataset.headers)
     if level != "steps":
         raise DatasetError(f"expected the level 'steps' or 'episodes', found {level!r:.80}")
-    return _step_columns(dataset, pandas)
+    columns = _step_columns(dataset, pandas)
+    return {**columns, "frames": list(dataset.read(("frames",)).frames)} if frames else columns
 
 
-def arrow(dataset: Episodes, level: Level) -> pa.Table:
+def arrow(dataset: Episodes, level: Level, *, frames: bool) -> pa.Table:
     """See `Dataset.to_arrow`."""
     try:
         import pandas
         import pyarrow
     except ImportError as err:
         raise missing_extra("an Arrow table needs pandas and pyarrow", "arrow") from err
-    columns = _columns(dataset, level)
+    columns = _columns(dataset, level, frames=frames)
     frame = pandas.DataFrame(columns)
     typed = {}
     for name, column in columns.items():
