@@ -234,7 +234,7 @@ def _there_instead(path: Path) -> str:
     files = [name for name in names if name.endswith(".mcap")]
     if not files or rest:
         return ""
-    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    more = f" and {len(files) - 3:,} more" if len(files) > 3 else ""
     where = "here" if folder == Path() else f"in {folder}"
     return f" ({where}: {', '.join(files[:3])}{more})"
 

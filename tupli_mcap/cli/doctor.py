@@ -169,7 +169,7 @@ def _print_group(group: Sequence[Finding], *, several: bool) -> None:
     others = list(dict.fromkeys(finding.path for finding in group if finding.path != first.path))
     if others:
         names = ", ".join(short_ids(path) for path in others[:_OTHERS])
-        more = f", and {len(others) - _OTHERS} more" if len(others) > _OTHERS else ""
+        more = f", and {len(others) - _OTHERS:,} more" if len(others) > _OTHERS else ""
         _print_wrapped(f"also in {names}{more}")
     _print_wrapped(f"→ {first.suggestion}", hang=2)
 

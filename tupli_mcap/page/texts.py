@@ -33,7 +33,7 @@ def names(given: Sequence[str]) -> str:
     """`ann, bob, cid`; of more than four, the first three: `ann, bob, cid and 7 more`."""
     if len(given) <= 4:
         return ", ".join(given)
-    return f"{', '.join(given[:3])} and {len(given) - 3} more"
+    return f"{', '.join(given[:3])} and {len(given) - 3:,} more"
 
 
 def percent(part: int, known: int, of: int) -> str:

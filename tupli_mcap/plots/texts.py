@@ -151,7 +151,7 @@ def add_facts(page: Page, title: str, facts: Sequence[tuple[str, str]], *, sever
     """The title and the facts: of one recording in two columns, of several a line in the colour of each group."""
     shades = style.colours(len(facts)) if several else []
     if several and len(facts) > _MOST_LISTED:
-        facts = [*facts[:_MOST_LISTED], ("…", f"and {len(facts) - _MOST_LISTED} more")]
+        facts = [*facts[:_MOST_LISTED], ("…", f"and {len(facts) - _MOST_LISTED:,} more")]
     lines = len(facts) if several else -(-len(facts) // 2)
     height = _HEAD + _LINE * lines
 
