@@ -156,6 +156,7 @@ class TestRows:
             ("{", "expected JSON"),
             ('{"a": NaN}', "expected strict JSON, found NaN"),
             ('{"a": {"$b": 1}}', "expected one known tag"),
+            ('{"a": ' + "[" * 64 + "]" * 64 + "}", "levels of nesting"),
             ('{"a": ' + "[" * 5000 + "]" * 5000 + "}", "levels of nesting"),
         ],
     )

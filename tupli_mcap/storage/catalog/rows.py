@@ -210,11 +210,12 @@ def load_metadata(text: str) -> Any:
 def _searchable(text: str) -> str:
     """Metadata as a database can hold them, with keys that it reads as Python does.
     FormatError if the text is not a strict JSON object."""
-    if "\\" not in text and '"$' not in text and (text.isascii() or not _SURROGATE.search(text)):
+    plain = "\\" not in text and '"$' not in text and (text.isascii() or not _SURROGATE.search(text))
+    if plain and text.count("[") + text.count("{") <= jsonvalue.MAX_DEPTH:
         try:
             if isinstance(_STRICT.decode(text), dict):
                 return text
-        except (ValueError, RecursionError):
+        except ValueError:
             pass  # a defect, or a key that occurs twice: the slow way below decides
     value = jsonvalue.loads(text)
     if not isinstance(value, dict):
