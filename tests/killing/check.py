@@ -53,7 +53,10 @@ class _Told:
     @property
     def metadata(self) -> dict[str, Any]:
         """The callback's metadata after all steps."""
-        return {"steps": len(self.steps), "total": sum(step[2] for step in self.steps)}
+        total = 0.0
+        for step in self.steps:  # `sum` of Python 3.12 rounds otherwise
+            total += float(step[2])
+        return {"steps": len(self.steps), "total": total}
 
 
 def _told_episodes(reports: Sequence[tuple[str, Any]]) -> dict[int, list[_Told]]:

@@ -171,7 +171,11 @@ class _Instructions:
         self._codes: dict[CodeType, tuple[bool, bool]] = {}
 
     def set(self) -> None:
-        """Starts to count, also in threads made from now on."""
+        """Starts to count, also in threads made from now on.
+
+        Python 3.12 tells of instructions if a frame asks for them by then, and 3.13 from the second call on that asks.
+        """
+        sys._getframe().f_trace_opcodes = self._event == "opcode"
         threading.settrace(self._called)
         sys.settrace(self._called)
 
@@ -191,9 +195,9 @@ class _Instructions:
             if self._left == 0:
                 self._root = frame
                 self._active = not self._after
+        frame.f_trace_opcodes = self._event == "opcode"
         if not self._active and frame is not self._root:
             return None
-        frame.f_trace_opcodes = self._event == "opcode" and self._active
         return self._traced
 
     def _traced(self, frame: FrameType, event: str, arg: Any) -> Any:
