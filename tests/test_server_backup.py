@@ -160,3 +160,19 @@ def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
         data[100] ^= 1
         damaged.write_bytes(data)
         assert back_up(settings, tmp_path / "backup").recordings  # goes on in what the failed one has left
+
+
+def test_the_data_of_a_server_is_neither_replaced_nor_taken_for_a_backup(tmp_path: Path) -> None:
+    settings, other = Settings(tmp_path / "served"), Settings(tmp_path / "other")
+    with signed_in(settings) as admin, signed_in(other) as other_admin:
+        fill(admin)
+        other_admin.create_group(Group(name="kept"))
+        for inside in (settings.directory, settings.directory / "backup"):
+            with pytest.raises(StorageError, match="expected a directory outside of"):
+                back_up(settings, inside)
+        with pytest.raises(StorageError, match="found the data of a server, or a backup that was served"):
+            back_up(settings, other.directory)
+        with pytest.raises(StorageError, match="found the data of a server that runs or was killed"):
+            restore(settings.directory, Settings(tmp_path / "new"))
+    with signed_in(other) as other_admin:
+        assert [group.name for group in other_admin.list_groups()] == ["kept"]

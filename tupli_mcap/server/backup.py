@@ -55,7 +55,8 @@ def back_up(settings: Settings, target: Path) -> Copied:
     interruption, call it again.
 
     Raises:
-        StorageError: there is no data of a server, the directory holds something else, or a file cannot be read.
+        StorageError: there is no data of a server, the directory holds something else, such as the data of a server, or
+            a file cannot be read.
         FormatError: a file does not have the SHA-256 in the database.
     """
     source_blobs, target_blobs = blobs_of(settings), blobs_of(Settings(target))
@@ -63,6 +64,16 @@ def back_up(settings: Settings, target: Path) -> Copied:
     if not settings.database and not _sqlite_of(settings.directory).exists():
         raise StorageError(
             f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
+        )
+    if settings.directory.resolve() in (target.resolve(), *target.resolve().parents):
+        raise StorageError(
+            f"expected a directory outside of {str(settings.directory)!r} for the backup, found {str(target)!r}; "
+            "choose another one"
+        )
+    if Settings(target).secret.exists():
+        raise StorageError(
+            f"expected a backup or nothing in {str(target)!r}, found the data of a server, or a backup that was "
+            "served; choose another directory"
         )
     new = sqlite.with_name("server.sqlite.new")  # also what an interrupted backup has left
     if target.exists() and any(target.iterdir()) and not (sqlite.exists() or new.exists()):
@@ -93,11 +104,17 @@ def back_up(settings: Settings, target: Path) -> Copied:
 
 
 def restore(backup: Path, settings: Settings) -> Copied:
-    """Restores a backup into empty places. After an interruption, call it again. StorageError if there is no backup, or
-    the target holds data already; FormatError if a file of the backup is damaged."""
+    """Restores a backup into empty places. After an interruption, call it again. StorageError if there is no backup, a
+    server is running on it, or the target holds data already; FormatError if a file of the backup is damaged."""
     source_blobs, target_blobs = blobs_of(Settings(backup)), blobs_of(settings)
     if not _sqlite_of(backup).exists():
         raise StorageError(f"expected the backup of a server in {str(backup)!r}, found none; check the path")
+    newest = _sqlite_of(backup).with_name("server.sqlite-wal")  # changes that a copy of the other file lacks
+    if newest.exists() and newest.stat().st_size:
+        raise StorageError(
+            f"expected a backup in {str(backup)!r}, found the data of a server that runs or was killed; "
+            "back that up, and restore the backup"
+        )
     settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))

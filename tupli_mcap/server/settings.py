@@ -58,6 +58,11 @@ class Settings:
         return self.directory / "server"
 
     @property
+    def secret(self) -> Path:
+        """The file of the key that signs tokens; it is there from the server's first start on, and in no backup."""
+        return self.own / "secret"
+
+    @property
     def database_url(self) -> str:
         """The SQLAlchemy URL of the database."""
         return self.database or f"sqlite:///{self.own / 'server.sqlite'}"

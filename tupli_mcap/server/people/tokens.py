@@ -43,7 +43,7 @@ class Tokens:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._secret = _secret(settings.own / "secret")
+        self._secret = _secret(settings.secret)
 
     def pair(self, connection: Connection, user: str, family: str = "") -> dict[str, Any]:
         """An access token and the refresh token for the next, as OAuth 2 names them."""
