@@ -26,7 +26,7 @@ from serving import ENGINES, PASSWORD, serving, settings_of
 from test_storage import episode, query
 
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
-from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR
+from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR, Group
 from tupli_mcap.server.database import Database, TooLongError
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
@@ -290,6 +290,23 @@ def test_an_upload_that_fills_the_disk_is_deleted(small_disk: Path, tmp_path: Pa
         assert [path.stat().st_size for path in (small_disk / "server/uploads").iterdir()] == [0]
         admin.record_episodes([episode(benchmark)])
         assert len(admin.list_episodes()) == 1
+
+
+def test_a_full_disk_is_named_and_keeps_nobody_from_reading(small_disk: Path) -> None:
+    ballast = small_disk / "ballast"
+    with server_with(small_disk) as admin:
+        admin.record_episodes([episode(admin.store_benchmark(query()).id)])
+        with pytest.raises(OSError, match="No space left"), ballast.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        with pytest.raises(
+            StorageError, match=r"^the server's disk is full; try again when there is room \("
+        ):
+            for i in range(1000):
+                admin.create_group(Group(name=f"group{i}"))
+        assert len(admin.list_episodes()) == 1
+        ballast.unlink()
+        admin.create_group(Group(name="later"))
 
 
 # --- users ---

@@ -32,6 +32,7 @@ from tupli_mcap.storage.texts import escape_text, unescape_text
 _POSTGRESQL = re.compile("^postgres(ql)?://")  # as psql has it, without the driver that is installed with us
 _STEPS = 20_000  # instructions of SQLite between two looks at the clock
 _CANCELED = "57014"  # PostgreSQL's code for a statement that took too long
+_FULL = "53100"  # and for a full disk
 # What is set for each connection to PostgreSQL, as setting it for each transaction takes longer than some queries.
 # Compiling a statement (JIT), or starting processes that share it, takes longer than running it.
 _READS = (
@@ -48,6 +49,10 @@ _MOST_GROUPS_BYTES = 2000  # PostgreSQL cannot index longer texts
 
 class UnavailableError(StorageError):
     """The database or the bucket does not answer, or is busy. A later attempt may succeed."""
+
+
+class DiskFullError(UnavailableError):
+    """The disk of the database is full."""
 
 
 class TooLongError(StorageError):
@@ -209,6 +214,9 @@ def _translated() -> Iterator[None]:
             raise TooLongError(
                 "the query takes too long; narrow the filter, or declare its keys with `declare_key`"
             ) from err
+        code = getattr(err.orig, "sqlstate", None) or getattr(err.orig, "sqlite_errorname", "")
+        if code in (_FULL, "SQLITE_FULL"):
+            raise DiskFullError("the server's disk is full; try again when there is room") from err
         raise UnavailableError(f"the server's database cannot be used: {err.orig}") from err
     except PoolTimeoutError as err:
         raise UnavailableError(

@@ -29,7 +29,7 @@ from tupli_mcap.page.answers import error_page, wants_page
 from tupli_mcap.recording.edit.merge import UnmergeableError
 from tupli_mcap.schema import ArtifactMetadata, BaseFilter, parse_filter
 from tupli_mcap.server.blobs import LostError
-from tupli_mcap.server.database import TooLongError, UnavailableError
+from tupli_mcap.server.database import DiskFullError, TooLongError, UnavailableError
 from tupli_mcap.server.people.access import DeniedError
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import FullError, TooManyError
@@ -60,6 +60,7 @@ _STATUS: Final[dict[type[TupliError], int]] = {
     UnmergeableError: 400,
     RecordingError: 503,  # a stored file cannot be opened
     FullError: 507,
+    DiskFullError: 507,
     LostError: 500,
     FilterError: 400,
     SpaceError: 400,
