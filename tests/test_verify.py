@@ -226,7 +226,9 @@ def test_a_truncated_recording(share: float, tmp_path: Path) -> None:
 def test_what_is_no_recording(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
-    assert not verify_recording(path).ok
+    report = verify_recording(path)
+    assert not report.ok
+    assert not any("append to it" in problem.advice for problem in report.problems)
     with pytest.raises(RecordingError, match="does not exist"):
         verify_recording(tmp_path / "none.mcap")
 

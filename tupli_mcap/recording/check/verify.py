@@ -98,12 +98,14 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unr
         findings.note("file", "its writer did not finish it", "nothing to be done")
         findings.error("journal", f"{lost}: {STEPS_IN_JOURNAL}", advice=KEEP_JOURNAL)
         return
+    if lost and not structure.channels:  # no writer has begun a recording in it
+        return
     findings.note(
         "file",
         f"its writer did not finish it{'' if lost else _UNVERIFIED}",
         "append to it, or write a finished copy with tupli-mcap recover",
     )
-    if lost and structure.channels:  # a journal is made before the channels
+    if lost:
         findings.note(
             "journal",
             f"{lost}: steps that were not yet in a chunk are missing",
