@@ -652,8 +652,8 @@ def test_a_directory_is_not_recovered(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is a directory; give one file"):
         recover_recording(tmp_path)
     result = CliRunner().invoke(app, ["recover", str(tmp_path)])
-    loop = f'for file in {tmp_path}/*.mcap; do tupli-mcap recover --in-place "$file"; done'
-    found = f"{tmp_path} is a directory; give one recording (.mcap), or finish each with: {loop}"
+    each = f"find {tmp_path} -name '*.mcap' -exec tupli-mcap recover --in-place {{}} ';'"
+    found = f"{tmp_path} is a directory; give one recording (.mcap), or finish each with: {each}"
     assert (result.exit_code, " ".join(result.stderr.split())) == (1, f"error: {found}")
 
 

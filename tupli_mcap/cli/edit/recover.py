@@ -66,7 +66,7 @@ def recover(
     if in_place and (output is not None or force):
         raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")
     if file.is_dir():
-        each = f'for file in {shlex.quote(str(file))}/*.mcap; do tupli-mcap recover --in-place "$file"; done'
+        each = f"find {shlex.quote(str(file))} -name '*.mcap' -exec tupli-mcap recover --in-place {{}} ';'"
         raise RecordingError(
             f"{file} is a directory; give one recording (.mcap), or finish each with: {each}"
         )
