@@ -155,7 +155,9 @@ def check_there(sources: Sequence[str], wanted: BaseFilter) -> None:
     if len(sources) > 1 and any(map(is_server, sources)):  # no dataset has all of them
         return
     if found := sources if is_server(sources[0]) else recordings_of(sources):
-        matching_in(dataset_of(found), wanted)
+        there = dataset_of(found)
+        len(there)  # lists it once: the filter and what it may mean are then looked up in the list
+        matching_in(there, wanted)
 
 
 @contextmanager
