@@ -1156,6 +1156,9 @@ def test_fields_of_items_have_gymnasium_s_names_too(dataset: Dataset) -> None:
     assert list(around.values) == ["observations", "action", "truncations"]
     assert np.array_equal(around["observations"], states)
     assert np.array_equal(dataset.delta_windows({"observation": [0]})[0]["observation"], states[:1])
+    assert np.array_equal(dataset.delta_windows({"state": [0]})[0]["observations"], states[:1])
+    with pytest.raises(KeyError, match="expected one of observations, action, truncations, found 'reward'"):
+        around["reward"]
     assert "rewards: 1.0; " in repr(transition) and "terminals: False" in repr(transition)
     assert "states: float32 (3, 4)" in repr(dataset.windows(3)[0]) and len(repr(around)) < 500
 

@@ -16,7 +16,14 @@ from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, Steps, steps_a
 from tupli_mcap.dataset.items.windows import shaped_rows
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.messages.shared_dtypes import field_leaves
-from tupli_mcap.recording.columns.fields import FIELD_OF, Parts, fields_and_parts, split_name, step_name
+from tupli_mcap.recording.columns.fields import (
+    FIELD_OF,
+    ColumnDict,
+    Parts,
+    fields_and_parts,
+    split_name,
+    step_name,
+)
 from tupli_mcap.spaces.leaves import keys_to
 
 Unit = Literal["steps", "seconds", "clock"]
@@ -46,7 +53,7 @@ class DeltaWindow(Parts):
     episodes: Any
 
     def __getitem__(self, key: str) -> Any:
-        return self.values[key]
+        return ColumnDict(self.values)[key]
 
 
 class DeltaWindows(StepItems[DeltaWindow]):
