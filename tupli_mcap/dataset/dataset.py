@@ -402,6 +402,8 @@ class Dataset(RandomAccess):
                 "info.contact.left" is a value in a dict.
                 "state.arm" or "action.grip", a part of a Dict, leaves the others out of `states` and `next_states`, or
                 of `actions`; images that are left out are not read.
+                If an episode's final state is not known, `next_states` repeats its last state; `transitions` leaves
+                that step out, or masks it.
 
         Raises:
             DatasetError: a field is unknown.
