@@ -215,6 +215,7 @@ def test_states_with_the_final_one(tmp_path: Path) -> None:
     [
         (lambda episode: episode.rewards[1:], ["rewards"]),
         (lambda episode: ["a"] * len(episode), ["rewards"]),
+        (lambda episode: {"actions": episode.actions}, ["actions"]),
         (lambda episode: np.full(len(episode), 0.5), ["actions"]),
         (lambda episode: episode.states, ["states"]),
         (lambda episode: episode.rewards, ["rewards", "actions"]),
@@ -225,6 +226,12 @@ def test_refuses_what_does_not_fit(function: Any, fields: list[str], tmp_path: P
     with pytest.raises(RecordingError):
         tupli_mcap.open(source).map(function, tmp_path / "n.mcap", fields=fields)
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
+
+
+def test_rewards_may_be_named(tmp_path: Path) -> None:
+    ds = tupli_mcap.open(record(tmp_path / "r.mcap"))
+    new = ds.map(lambda episode: {"rewards": episode.rewards * 2}, tmp_path / "n.mcap")
+    np.testing.assert_array_equal(tupli_mcap.open(new).read().rewards, 2 * ds.read().rewards)
 
 
 def test_replaces_nothing_by_itself(tmp_path: Path) -> None:

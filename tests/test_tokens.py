@@ -80,6 +80,11 @@ def test_a_token_in_the_environment_comes_first(url: str, monkeypatch: pytest.Mo
         client.login("admin", PASSWORD)
         monkeypatch.setenv("TUPLI_MCAP_TOKEN", token.token)
         assert client.username == "ann"
+        with pytest.warns(UserWarning, match="still those of the token in TUPLI_MCAP_TOKEN"):
+            client.login("admin", PASSWORD)
+        with pytest.warns(UserWarning, match="still those of the token in TUPLI_MCAP_TOKEN"):
+            client.logout()
+        assert client.username == "ann"
         monkeypatch.delenv("TUPLI_MCAP_TOKEN")
         client.login("ann", "ann-password")
         client.delete_token(token.id)

@@ -84,12 +84,15 @@ def _new_values(
     for place, row in zip(places.tolist(), excerpt.rows, strict=True):
         episode = source.episodes[place]
         made = function(episode)
-        if isinstance(made, Mapping) and fields == ["rewards"] and set(made) <= {*_FIELDS, *OTHER_NAMES}:
+        is_named = (
+            isinstance(made, Mapping) and fields == ["rewards"] and set(made) <= {*_FIELDS, *OTHER_NAMES}
+        )
+        if is_named and field_names(list(made), _FIELDS) != fields:
             raise RecordingError(
                 f"expected rewards of episode {episode.number}, found a dict of {', '.join(made)}; "
                 f"pass fields={list(made)}"
             )
-        by_field: Any = {fields[0]: made} if len(fields) == 1 else made
+        by_field: Any = {fields[0]: made} if len(fields) == 1 and not is_named else made
         if isinstance(by_field, Mapping):
             by_field = dict(zip(field_names(list(by_field), _FIELDS), by_field.values(), strict=True))
         if not isinstance(by_field, Mapping) or set(by_field) != set(fields):
@@ -196,7 +199,9 @@ def _checked(made: Any, leaf: Leaf, layout: StepLayout, count: int, where: str) 
     try:
         return exact_array(given, dtype, shape, where)
     except StepError as err:
-        found = f"{np.asarray(given).dtype} of shape {np.shape(given)}"
+        found = (
+            "a dict" if isinstance(given, dict) else f"{np.asarray(given).dtype} of shape {np.shape(given)}"
+        )
         raise RecordingError(
             f"expected {where} of shape {shape} that {dtype} holds exactly, found {found}"
             + ("; cast them" if np.shape(given) == shape else _hint(where))

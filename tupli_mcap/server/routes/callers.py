@@ -77,7 +77,7 @@ async def _writer(caller: AnyCaller) -> Caller:
     if caller.is_guest:
         raise SignInError("guests may change nothing")
     if not caller.may_write:
-        raise DeniedError("this token may only read; make one with the scope 'write'")
+        raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
     return caller
 
 

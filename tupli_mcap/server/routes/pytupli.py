@@ -59,7 +59,7 @@ _Filter = Annotated[dict[str, Any] | None, Body()]
 
 async def _changing(caller: Reader) -> Caller:
     if not caller.is_guest and not caller.may_write:
-        raise DeniedError("this token may only read; make one with the scope 'write'")
+        raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
     return caller
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 from urllib.parse import urlsplit
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra
+from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra, warn
 from tupli_mcap.remote import AUTHORITY, shown
 from tupli_mcap.storage.api.answers import (
     LATER,
@@ -115,6 +115,7 @@ class Session:
         """Gets tokens for a user, and stores them."""
         pair = self.ask("POST", "/v1/tokens", {"username": username, "password": password}, anonymous=True)
         self.tokens.put(self.url, username, as_told(TokenPair, pair).model_dump())
+        _warn_of_variable()
 
     def sign_out(self) -> None:
         """Ends the sign-in, here and on the server."""
@@ -122,6 +123,7 @@ class Session:
         self.tokens.forget(self.url)
         if refresh:
             self.ask("POST", "/v1/tokens/end", {"refresh_token": refresh}, anonymous=True)
+        _warn_of_variable()
 
     def _renew(self, used: str) -> bool:
         """Exchanges the refresh token, unless another process has just done so; False if there is none."""
@@ -317,6 +319,11 @@ class Session:
                 f"or go on as a guest: tupli-mcap logout --url {url}"
             )
         return token
+
+
+def _warn_of_variable() -> None:
+    if os.environ.get(_TOKEN_VARIABLE):
+        warn(f"requests are still those of the token in {_TOKEN_VARIABLE}; unset it to use your own sign-in")
 
 
 class _NoTickets(logging.Filter):
