@@ -76,29 +76,23 @@ def blocks(
     recording: Recording,
     positions: Array,
     *,
-    images: bool = True,
-    finals: bool = True,
     steps: int | None = None,
 ) -> Iterator[Block]:
-    """The steps of the episodes at some positions, in this order, at most `steps` (about `BLOCK_BYTES`) at a time.
-
-    Without `images`, no image of a step is read, and the columns of image leaves are empty; without `finals`, no
-    final state.
-    """
+    """The steps of the episodes at some positions, in this order, at most `steps` (about `BLOCK_BYTES`) at a time."""
     if not len(positions):
         return
-    limit = steps or max(1, BLOCK_BYTES // step_bytes(recording.layout, images=images))
+    limit = steps or max(1, BLOCK_BYTES // step_bytes(recording.layout))
     lengths = recording.index["length"][positions].astype(np.int64)
     for some in whole_episodes(lengths, limit):
         length = int(lengths[some].sum())
         if length <= limit:
-            columns = recording.read(episodes=positions[some], fields=_FIELDS, images=images)
-            yield _block(recording, positions[some], columns, 0, True, finals)
+            columns = recording.read(episodes=positions[some], fields=_FIELDS)
+            yield _block(recording, positions[some], columns, 0, True)
             continue
         for first in range(0, length, limit):  # a single one
             stop = min(length, first + limit)
-            columns = recording.read_steps(int(positions[some][0]), first, stop, _FIELDS, images=images)
-            yield _block(recording, positions[some], columns, first, stop == length, finals)
+            columns = recording.read_steps(int(positions[some][0]), first, stop, _FIELDS)
+            yield _block(recording, positions[some], columns, first, stop == length)
 
 
 def whole_episodes(lengths: Array, limit: int) -> Iterator[slice]:
@@ -112,11 +106,9 @@ def whole_episodes(lengths: Array, limit: int) -> Iterator[slice]:
         start = stop
 
 
-def _block(
-    recording: Recording, positions: Array, columns: Columns, first: int, whole: bool, finals: bool
-) -> Block:
+def _block(recording: Recording, positions: Array, columns: Columns, first: int, whole: bool) -> Block:
     rows = recording.index[positions]
-    known = np.flatnonzero(rows["final_row"] >= 0) if whole and finals else np.empty(0, np.int64)
+    known = np.flatnonzero(rows["final_row"] >= 0) if whole else np.empty(0, np.int64)
     found: dict[str, Any] = {}
     if len(known):
         nested = recording.final_states(positions[known])
