@@ -128,7 +128,9 @@ class Journal:
         self.path = path
         self.areas = {area.name: area for area in areas}
         self.info = dict(info)
-        text = json.dumps({"info": self.info, "areas": [_described(area) for area in areas]}).encode()
+        kinds = {RowArea: "rows", LogArea: "log"}
+        described = [{"kind": kinds[type(area)], **area._asdict()} for area in areas]
+        text = json.dumps({"info": self.info, "areas": described}).encode()
         header = _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text
         self.offsets, size = _place(areas, len(header))
         self._temporary = temporary = path.with_name(path.name + ".tmp")
@@ -332,13 +334,11 @@ def journal_info(path: Path) -> dict[str, Any]:
         return _read_header(path, file)[0]
 
 
-def owner_among(path: Path, uuids: Collection[str]) -> str:
-    """Which of the recordings `uuids` the journal at a path belongs to; empty if none, or if it cannot be read."""
-    try:
-        found = str(journal_info(path).get("uuid"))
-    except (OSError, FormatError):
-        return ""
-    return found if found in uuids and _UUID.fullmatch(found) else ""
+def is_journal_of(path: Path, uuid: str) -> bool:
+    """Whether there is a journal at a path that can be read, and belongs to the recording `uuid`."""
+    with contextlib.suppress(OSError, FormatError):
+        return journal_info(path).get("uuid") == uuid and bool(_UUID.fullmatch(uuid))
+    return False
 
 
 def _open(path: Path) -> BinaryIO:
@@ -369,10 +369,6 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area]
             left = max(0, size - offsets[area.name])
             raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {left}")
     return info, areas, length
-
-
-def _described(area: Area) -> dict[str, Any]:
-    return {"kind": "rows" if isinstance(area, RowArea) else "log", **area._asdict()}
 
 
 def _area(entry: Mapping[str, Any]) -> Area:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
-from tupli_mcap.journal.file import journal_aside, journal_in, journal_info, journal_path, owner_among
+from tupli_mcap.journal.file import is_journal_of, journal_aside, journal_in, journal_info, journal_path
 from tupli_mcap.recording.recover.evidence import metadata_at
 
 
@@ -47,7 +47,7 @@ class RecordingPlace:
         self.replaces = there.get("uuid", "")
         self._remove_left(there.get("replaced", ""))
         self._remove_unstarted(self.replaces)
-        if any(owner_among(place, [self.replaces]) for place in self._beside(self.replaces)):
+        if any(is_journal_of(place, self.replaces) for place in self._beside(self.replaces)):
             self.replaced = self.replaces
 
     def go_on(self) -> None:
@@ -98,7 +98,7 @@ class RecordingPlace:
 
 def _remove_of(place: Path, uuid: str) -> None:
     with contextlib.suppress(OSError):
-        if owner_among(place, [uuid]):
+        if is_journal_of(place, uuid):
             place.unlink()
 
 
