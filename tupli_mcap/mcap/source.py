@@ -11,7 +11,6 @@ import resource
 import stat
 import threading
 import weakref
-from abc import ABC, abstractmethod
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -92,11 +91,8 @@ def _lent_buffer(length: int) -> memoryview:
     return buffer[:length]
 
 
-class _Checked(ABC):
+class _Checked(Source):
     """A source whose `_read` may return fewer bytes, or raise OSError."""
-
-    name: str
-    size: int
 
     def read(self, offset: int, length: int) -> bytes:
         self._check(offset, length)
@@ -125,8 +121,8 @@ class _Checked(ABC):
             f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
         )
 
-    @abstractmethod
-    def _read(self, offset: int, length: int) -> bytes: ...
+    def _read(self, offset: int, length: int) -> bytes:
+        raise NotImplementedError
 
 
 class PathSource(_Checked):
@@ -233,7 +229,7 @@ class FileSource(_Checked):
     """An open, seekable binary file; `close` closes it only if it is `owned`."""
 
     def __init__(self, file: BinaryIO, name: str, *, owned: bool) -> None:
-        self.path: Path | None = None
+        self.path = None
         self.name = name
         self._file = file
         self._owned = owned

@@ -15,7 +15,7 @@ from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import Rows
+from tupli_mcap.mcap.container import Encoder, Rows
 from tupli_mcap.mcap.records import BODY, CDR_HEADER, MAX_CHUNK, RECORD_HEADER, iter_records
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame, encode_frame
 from tupli_mcap.messages.images.pictures import decode_pixels, encode_pixels
@@ -30,12 +30,9 @@ _HEIGHT_WIDTH = struct.Struct("<II")
 _COUNT = struct.Struct("<I")
 
 
-class ImageCodec(Protocol):
-    """Encodes and decodes the chunks of one image channel. Thread-safe."""
-
-    def encode(self, rows: Rows) -> Rows:
-        """Encodes the rows of a chunk; rows that are encoded already (a killed writer's) stay as they are."""
-        ...
+class ImageCodec(Encoder, Protocol):
+    """Encodes and decodes the chunks of one image channel; rows that are encoded already (a killed writer's) stay as
+    they are. Thread-safe."""
 
     def decode(self, data: Any, count: int) -> Any:
         """The `count` rows of constant size of a chunk; raises FormatError if `data` does not hold them."""
