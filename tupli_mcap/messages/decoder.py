@@ -16,6 +16,7 @@ from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import headers_at
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.spaces.leaves import Leaf
 
@@ -36,7 +37,7 @@ class MessageDecoder:
         if max(body[position], body[position + 1]) > 1:
             raise FormatError(f"expected flags of 0 or 1, found {bytes(body[position:])!r}")
         values["terminal"], values["timeout"] = bool(body[position]), bool(body[position + 1])
-        values["episode"], values["step"] = _pair(body)
+        values["episode"], values["step"] = NUMBERS.unpack_from(body)
         return values
 
     def state(self, body: memoryview) -> int:
@@ -49,7 +50,7 @@ class MessageDecoder:
         values, position = self._leaves(body, self._final)
         if position != len(body):
             raise FormatError(f"expected a final state of {position} bytes, found {len(body)}")
-        return _pair(body)[0], values
+        return NUMBERS.unpack_from(body)[0], values
 
     def _leaves(self, body: memoryview, leaves: list[Leaf]) -> tuple[dict[str, Any], int]:
         values: dict[str, Any] = {}
@@ -71,10 +72,6 @@ class MessageDecoder:
             values[leaf.name] = value[()] if leaf.is_scalar else value
             position += size
         return values, position
-
-
-def _pair(body: memoryview) -> tuple[int, int]:
-    return int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
 
 
 Decode = Callable[[Any, Array, Collection[str]], dict[str, Any]]  # `steps` or `finals` of a `BatchDecoder`

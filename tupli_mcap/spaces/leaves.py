@@ -22,7 +22,7 @@ from tupli_mcap.arrays import DType
 from tupli_mcap.errors import SpaceError, did_you_mean
 from tupli_mcap.schema.keys import name_within
 
-# float16 has no ROS type: its bit pattern is stored, and the channel's metadata says so.
+# The ros2msg primitive of each dtype. float16 has none: its bit pattern is stored, and the channel's metadata says so.
 ROS_TYPES: dict[str, str] = {
     "bool": "bool",
     "int8": "int8",
@@ -38,7 +38,7 @@ ROS_TYPES: dict[str, str] = {
     "float64": "float64",
 }
 
-_CONSTANT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+CONSTANT = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _VARIABLE = (spaces.Text, spaces.Sequence, spaces.Graph, spaces.OneOf)
 MAX_DEPTH = 64  # of nested spaces
 _MOST_SHOWN = 12  # parts of a value, in a message
@@ -131,11 +131,6 @@ def camel(name: str) -> str:
     return "".join(part.capitalize() for part in name.split("_"))
 
 
-def ros_type(dtype: DType) -> str:
-    """The ros2msg primitive that stores `dtype`."""
-    return ROS_TYPES[dtype.name]
-
-
 def flatten_space(
     space: gym.Space[Any], root: str, names: NameRegistry, *, images: bool = False
 ) -> list[Leaf]:
@@ -154,7 +149,7 @@ def flatten_space(
                 yield from walk(sub, (*keys, key), f"{name}_{key}")
         elif type(space) in _VARIABLE:
             yield Leaf(keys, root, names.take(name), space, "variable", None, ())
-        elif type(space) in _CONSTANT:
+        elif type(space) in CONSTANT:
             yield _constant_leaf(space, keys, root, names.take(name), images)
         else:
             raise SpaceError(

@@ -50,9 +50,8 @@ from tupli_mcap.messages.variable.nested_codecs import (
 )
 from tupli_mcap.messages.variable.widening import EDGE_LINKS
 from tupli_mcap.schema.keys import name_within
-from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES, NameRegistry, camel, subspaces
+from tupli_mcap.spaces.leaves import CONSTANT, MAX_DEPTH, ROS_TYPES, NameRegistry, camel, subspaces
 
-_NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 _DUMMY = "structure_needs_at_least_one_member"  # ROS 2's own name for this field
 
 
@@ -131,7 +130,7 @@ class _Builder:
     def single(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """One value of a space."""
         _check_depth(path, depth)
-        if type(space) in _NUMERIC:
+        if type(space) in CONSTANT:
             return numeric(self._leaf(space, path))
         if type(space) is spaces.Text:
             return text()
@@ -154,7 +153,7 @@ class _Builder:
 
     def _items(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """A tuple of values: a Sequence without `stack`."""
-        if type(space) in _NUMERIC and 0 not in (space.shape or ()):
+        if type(space) in CONSTANT and 0 not in (space.shape or ()):
             return numeric_items(self._leaf(space, path))
         codec = self.single(space, f"{type_name}Item", path, depth)
         if codec.kind not in ("message", "string"):
@@ -163,7 +162,7 @@ class _Builder:
 
     def _stacked(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """A batch of values, as `gymnasium.vector.utils.concatenate` makes it."""
-        if type(space) in _NUMERIC:
+        if type(space) in CONSTANT:
             leaf = self._leaf(space, path)
             return numeric_batch(leaf) if leaf.count else empty_batch(leaf)
         if type(space) is spaces.Dict or type(space) is spaces.Tuple:

@@ -16,7 +16,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.exact import exact_array, shorten
-from tupli_mcap.spaces.leaves import ROS_TYPES, ros_type
+from tupli_mcap.spaces.leaves import ROS_TYPES
 
 Encode = Callable[[Any, bytearray, int], None]
 Decode = Callable[[memoryview, int, int], tuple[Any, int]]
@@ -98,7 +98,7 @@ def numeric(leaf: Leaf) -> Codec:
 
     if count == 0:
         return Codec("", "nothing", encode, decode)
-    ros = ros_type(dtype) if leaf.shape == () else f"{ros_type(dtype)}[{count}]"
+    ros = ROS_TYPES[dtype.name] + ("" if leaf.shape == () else f"[{count}]")
     return Codec(ros, "fixed", encode, decode, count)
 
 
@@ -123,7 +123,7 @@ def numeric_items(leaf: Leaf) -> Codec:
         array, offset = cdr.read_array(data, offset, origin, dtype, number * count)
         return leaf.split(array, number), offset
 
-    return Codec(f"{ros_type(dtype)}[]", "array", encode, decode)
+    return Codec(f"{ROS_TYPES[dtype.name]}[]", "array", encode, decode)
 
 
 def numeric_batch(leaf: Leaf) -> Codec:
@@ -145,7 +145,7 @@ def numeric_batch(leaf: Leaf) -> Codec:
         array, offset = cdr.read_array(data, offset, origin, dtype, number * count)
         return array.reshape(number, *shape), offset
 
-    return Codec(f"{ros_type(dtype)}[]", "array", encode, decode)
+    return Codec(f"{ROS_TYPES[dtype.name]}[]", "array", encode, decode)
 
 
 def empty_batch(leaf: Leaf) -> Codec:

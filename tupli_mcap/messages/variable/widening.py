@@ -15,10 +15,9 @@ from gymnasium import spaces
 
 from tupli_mcap.arrays import DType
 from tupli_mcap.spaces.exact import decide_dtype
-from tupli_mcap.spaces.leaves import Leaf
+from tupli_mcap.spaces.leaves import CONSTANT, Leaf
 
 EDGE_LINKS = np.dtype(np.int32)  # of Gymnasium's samples; a Graph space declares none
-_NUMERIC = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 def variable_dtypes(space: gym.Space[Any], values: Sequence[Any], path: str) -> dict[str, str]:
@@ -47,7 +46,7 @@ Numbers = Iterator[tuple[str, DType, Any]]
 
 def _numbers(space: gym.Space[Any], value: Any, path: str) -> Numbers:
     """Every array or scalar in one value of a space, with its path and its declared dtype."""
-    if type(space) in _NUMERIC:
+    if type(space) in CONSTANT:
         yield path, np.dtype(space.dtype), value
     elif type(space) is spaces.Dict or type(space) is spaces.Tuple:
         for key, sub, item in _entries(space, value):
@@ -56,7 +55,10 @@ def _numbers(space: gym.Space[Any], value: Any, path: str) -> Numbers:
         many = _stacked if space.stack else _items
         yield from many(space.feature_space, value, f"{path}[]")
     elif type(space) is spaces.OneOf:
-        yield from _chosen(space, value, path)
+        if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], int | np.integer):
+            index, chosen = value
+            if 0 <= index < len(space.spaces):
+                yield from _numbers(space.spaces[index], chosen, f"{path}[{index}]")
     elif type(space) is spaces.Graph and isinstance(value, spaces.GraphInstance):
         yield from _stacked(space.node_space, value.nodes, f"{path}.nodes")
         if space.edge_space is not None and value.edges is not None:
@@ -65,20 +67,13 @@ def _numbers(space: gym.Space[Any], value: Any, path: str) -> Numbers:
             yield f"{path}.edge_links", EDGE_LINKS, value.edge_links
 
 
-def _chosen(space: Any, value: Any, path: str) -> Numbers:
-    if isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], int | np.integer):
-        index, chosen = value
-        if 0 <= index < len(space.spaces):
-            yield from _numbers(space.spaces[index], chosen, f"{path}[{index}]")
-
-
 def _items(space: gym.Space[Any], value: Any, path: str) -> Numbers:
     for item in value if isinstance(value, tuple) else ():
         yield from _numbers(space, item, path)
 
 
 def _stacked(space: gym.Space[Any], value: Any, path: str) -> Numbers:
-    if type(space) in _NUMERIC:
+    if type(space) in CONSTANT:
         yield path, np.dtype(space.dtype), value
     elif type(space) is spaces.Dict or type(space) is spaces.Tuple:
         for key, sub, item in _entries(space, value):
