@@ -18,7 +18,7 @@ from tupli_mcap.schema.keys import join_key
 from tupli_mcap.schema.models import DERIVED, EpisodeHeader
 from tupli_mcap.schema.parse import parse_filter
 from tupli_mcap.schema.times import TIME_PATHS, time_ns
-from tupli_mcap.schema.values import Scalar, against_floats, classify, compare, untag_float
+from tupli_mcap.schema.values import OPERATORS, Scalar, against_floats, classify, compare, untag_float
 
 Item: TypeAlias = Mapping[str, Any] | BaseModel
 Predicate: TypeAlias = Callable[[Item], bool]
@@ -265,11 +265,4 @@ def _compare_floats(operation: str, array: Array, number: float) -> Mask:
 
 
 def _apply(operation: str, array: Array, value: Any) -> Mask:
-    functions: dict[str, Callable[[Any, Any], Any]] = {
-        "EQ": np.equal,
-        "GT": np.greater,
-        "GEQ": np.greater_equal,
-        "LT": np.less,
-        "LEQ": np.less_equal,
-    }
-    return np.asarray(functions[operation](array, value), np.bool_)
+    return np.asarray(OPERATORS[operation](array, value), np.bool_)

@@ -16,7 +16,8 @@ FLOAT_TAG: Final = "$float"
 _TAGGED: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _TAGS: Final = {math.inf: "inf", -math.inf: "-inf"}
 
-_ORDER: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
+OPERATORS: Final[Mapping[str, Callable[[Any, Any], Any]]] = {
+    "EQ": operator.eq,
     "GT": operator.gt,
     "GEQ": operator.ge,
     "LT": operator.lt,
@@ -78,7 +79,8 @@ def compare(operation: str, found: Scalar, wanted: Scalar) -> bool:
     if operation in ("EQ", "NE"):
         equal = same_kind and found.kind not in ("nan", "other") and bool(found.value == wanted.value)
         return equal == (operation == "EQ")
-    return same_kind and found.kind in ("number", "text") and _ORDER[operation](found.value, wanted.value)
+    ordered = same_kind and found.kind in ("number", "text")
+    return ordered and bool(OPERATORS[operation](found.value, wanted.value))
 
 
 def against_floats(operation: str, number: float) -> tuple[str, float] | None:
