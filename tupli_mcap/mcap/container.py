@@ -20,7 +20,6 @@ from typing import Any, NamedTuple, Protocol
 import lz4.frame
 import numpy as np
 import zstandard
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -37,7 +36,15 @@ from mcap.records import (
 )
 
 from tupli_mcap.errors import RecordingError, os_reason
-from tupli_mcap.mcap.records import CHUNK_HEAD, MAGIC, MESSAGE_INDEX, PROFILE, built, crc32, with_crc
+from tupli_mcap.mcap.records import (
+    CHUNK_HEAD,
+    MAGIC,
+    MESSAGE_INDEX,
+    PROFILE,
+    crc32,
+    with_crc,
+    written_records,
+)
 
 REPEATED = ".repeated"
 """End of the name of metadata that are repeated at the end of a file: viewers warn of two records of one name."""
@@ -160,22 +167,16 @@ class Container:
 
     def start(self) -> None:
         """Magic and header."""
-        builder = RecordBuilder()
-        Header(PROFILE, library()).write(builder)
-        self.write(MAGIC + built(builder))
+        self.write(MAGIC + written_records(Header(PROFILE, library())))
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.metadata[name] = values
-        builder = RecordBuilder()
-        Metadata(name, with_crc(values)).write(builder)
-        data = built(builder)
+        data = written_records(Metadata(name, with_crc(values)))
         self.metadata_indexes.append(MetadataIndex(self.position, len(data), name))
         self.write(data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        builder = RecordBuilder()
-        Attachment(time_ns, time_ns, name, media_type, data).write(builder)
-        record = built(builder)
+        record = written_records(Attachment(time_ns, time_ns, name, media_type, data))
         offset = self.position
         self.write(record)
         self.attachment_indexes.append(
@@ -208,10 +209,8 @@ class Container:
         record = self.channels[channel]
         known = self._definitions.get(channel)
         if known is None or known[0] is not record:
-            builder = RecordBuilder()
-            self.schemas[record.schema_id].write(builder)
-            record.write(builder)
-            self._definitions[channel] = known = record, built(builder)
+            known = record, written_records(self.schemas[record.schema_id], record)
+            self._definitions[channel] = known
         return known[1]
 
     def add_chunk(self, rows: Rows) -> None:
@@ -325,9 +324,7 @@ class Container:
         """Repeats the metadata; then writes DataEnd, summary, footer and magic in one write."""
         for name, values in list(self.metadata.items()):
             self.add_metadata(name + REPEATED, values)
-        builder = RecordBuilder()
-        DataEnd(0).write(builder)
-        data_end = built(builder)
+        data_end = written_records(DataEnd(0))
         summary_start = self.position + len(data_end)
         groups: list[tuple[Opcode, list[Any]]] = [
             (Opcode.SCHEMA, list(self.schemas.values())),
@@ -337,21 +334,16 @@ class Container:
             (Opcode.ATTACHMENT_INDEX, list(self.attachment_indexes)),
             (Opcode.METADATA_INDEX, list(self.metadata_indexes)),
         ]
-        offsets = []
+        summary, offsets = bytearray(), []
         for opcode, records in groups:
-            start = builder.count
-            for record in records:
-                builder.write(record) if isinstance(record, bytes) else record.write(builder)
+            start = len(summary)
+            summary += b"".join(records) if opcode == Opcode.CHUNK_INDEX else written_records(*records)
             if records:
-                offsets.append(SummaryOffset(opcode, summary_start + start, builder.count - start))
-        offset_start = summary_start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        summary = built(builder)
-        Footer(summary_start, offset_start, 0).write(builder)
-        crc = zlib.crc32(built(builder)[:-4], zlib.crc32(summary))
-        Footer(summary_start, offset_start, crc).write(builder)
-        self.write(data_end + summary + built(builder) + MAGIC)
+                offsets.append(SummaryOffset(opcode, summary_start + start, len(summary) - start))
+        offset_start = summary_start + len(summary)
+        summary += written_records(*offsets)
+        crc = zlib.crc32(written_records(Footer(summary_start, offset_start, 0))[:-4], zlib.crc32(summary))
+        self.write(data_end, summary, written_records(Footer(summary_start, offset_start, crc)), MAGIC)
 
     def _statistics(self) -> Statistics:
         return Statistics(

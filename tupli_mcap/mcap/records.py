@@ -104,23 +104,25 @@ def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
     """
     if opcode not in _PARSERS:
         raise FormatError(f"{name}: expected another record at offset {offset}, found opcode {opcode}")
-    builder = RecordBuilder()
     damaged = (
         f"{name}: the record with opcode {opcode} at offset {offset} is damaged: expected fields that fill its "
         f"{len(body)} bytes, found others"
     )
     try:
         parsed = _PARSERS[opcode].read(ReadDataStream(io.BytesIO(body)))
-        parsed.write(builder)
+        written = written_records(parsed)
     except (McapError, struct.error, ValueError, MemoryError, OverflowError) as err:
         raise FormatError(f"{damaged} ({err})") from err
-    if memoryview(built(builder))[RECORD.size :] != body:
+    if memoryview(written)[RECORD.size :] != body:
         raise FormatError(damaged)
     return parsed
 
 
-def built(builder: RecordBuilder) -> bytes:
-    """The records that were written to a builder, which is empty afterwards."""
+def written_records(*records: Any) -> bytes:
+    """Records of the `mcap` package as a file has them."""
+    builder = RecordBuilder()
+    for each in records:
+        each.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
 
