@@ -18,7 +18,7 @@ import psycopg
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.server.database import Database
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.storage.catalog.entries import Entry
 
 _NAMES = itertools.count()
 _EMPTY = "template0 LOCALE_PROVIDER icu ICU_LOCALE 'en'"
@@ -115,9 +115,9 @@ class ServerCatalog:
 
         self._read = self._database.reading
 
-    def put_recording(self, relpath: str, stamp: RecordingStamp, *, runs: str = "[{}]", **told: Any) -> None:
+    def put_recording(self, relpath: str, entry: Entry) -> None:
         with self._database.writing() as connection:
-            queries.put_recording(connection, relpath, stamp, runs=runs, **told)
+            queries.put_recording(connection, relpath, entry)
 
     def remove_recording(self, relpath: str) -> None:
         with self._database.writing() as connection:

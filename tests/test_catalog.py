@@ -37,6 +37,7 @@ from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog import pages, place
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.database import CatalogDamagedError
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import count_episodes, declared_keys, find_episodes
@@ -75,7 +76,7 @@ def put(
     benchmark_id: str = "b",
     runs: str = "[{}]",
 ) -> None:
-    catalog.put_recording(path, STAMP, uuid=uuid, benchmark_id=benchmark_id, rows=rows, runs=runs)
+    catalog.put_recording(path, Entry(STAMP, uuid, benchmark_id, rows, runs))
 
 
 @pytest.fixture
@@ -445,14 +446,8 @@ class TestTallies:
             row(2, {"success": "yes"}, episode_return=math.nan),
             row(3, published_in='["me", "all"]', episode_return=None),
         ]
-        catalog.put_recording(
-            "a.mcap",
-            STAMP,
-            uuid="u",
-            benchmark_id="",
-            rows=rows,
-            runs='[{"name": "r", "environment": "Cart-v1"}]',
-        )
+        runs = '[{"name": "r", "environment": "Cart-v1"}]'
+        catalog.put_recording("a.mcap", Entry(STAMP, "u", "", rows, runs))
         put(catalog, "empty.mcap")
         with catalog._read() as connection:
             (told,) = tallies(connection)
@@ -871,6 +866,7 @@ WORKER = """
 import sys
 from pathlib import Path
 from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
@@ -879,7 +875,7 @@ sys.stdin.readline()
 with Catalog(path) as catalog:
     for n in range(10):
         rows = [EpisodeRow(i, 0, 1, "terminal", 1.0, None, 0, "", "[]", '{"a": %d}' % i) for i in range(20)]
-        catalog.put_recording(f"{name}-{n}", RecordingStamp(1, 2, 3), uuid=name, benchmark_id="b", rows=rows)
+        catalog.put_recording(f"{name}-{n}", Entry(RecordingStamp(1, 2, 3), name, "b", rows))
         catalog.declare_key(f"metadata.score{n % 3}")
         assert len(catalog.episodes()) >= 20
 """

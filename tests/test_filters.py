@@ -47,6 +47,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.schema.times import local_text, span_of, time_ns
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.catalog import Catalog
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.catalog.tables import EPISODE
 from tupli_mcap.storage.listing import RecordingStamp
@@ -279,7 +280,7 @@ def fill(catalog: Catalog | ServerCatalog, headers: list[EpisodeHeader]) -> None
         )
         for h in headers
     ]
-    catalog.put_recording("r.mcap", STAMP, uuid=UUID, benchmark_id="bench", rows=rows)
+    catalog.put_recording("r.mcap", Entry(STAMP, UUID, "bench", rows))
 
 
 KEYS = ("metadata.a", "metadata.a.b", 'metadata."a.b"', "metadata.0", "n_tuples", "episode_return", "end")

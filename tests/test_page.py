@@ -33,6 +33,7 @@ from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -155,9 +156,7 @@ class TestDatasets:
         runs = dumps_plain([{"environment": name}])
         row = EpisodeRow(0, 0, 1, "terminal", 1.0, 7, 1, "me", '["me"]', "{}")
         stamp = RecordingStamp(1, 2, 3)
-        shelf._catalog.put_recording(
-            "gone.mcap", stamp, uuid="u", benchmark_id=benchmark_id, rows=[row], runs=runs
-        )
+        shelf._catalog.put_recording("gone.mcap", Entry(stamp, "u", benchmark_id, [row], runs))
         with serving_app(create_app(shelf)) as address, httpx.Client(base_url=address) as client:
             (link,) = set(re.findall(r'href="(/dataset/[^"]*)"', client.get("/").text))
             answer = client.get(html.unescape(link))

@@ -36,6 +36,7 @@ from tupli_mcap.server.uploads import GoneError, Upload
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.storage.api.upload import send_file
 from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
@@ -183,11 +184,10 @@ def test_questions_that_take_too_long_are_given_up(of: str, tmp_path: Path, requ
         rows = [
             EpisodeRow(i, 0, i, "terminal", 1.0, None, 0, "me", '["me"]', '{"x": 1}') for i in range(50_000)
         ]
-        told: dict[str, Any] = {"uuid": "u", "benchmark_id": "", "rows": rows, "runs": "[{}]"}
         unlikely = [F("metadata.x") == i for i in range(10, 510)]  # which takes seconds
         with contextlib.closing(Database(url, 0.5)) as database:
             with database.writing() as connection:  # may take longer
-                queries.put_recording(connection, "a.mcap", RecordingStamp(1, 2, 3), **told)
+                queries.put_recording(connection, "a.mcap", Entry(RecordingStamp(1, 2, 3), "u", "", rows))
             for asked in (F("metadata.x") > 5, F("metadata.x") != 5, FilterNOT(filters=[F("steps") < 0])):
                 with pytest.raises((TooLongError, FilterError), match="takes too long; narrow the filter"):
                     with database.reading() as connection:

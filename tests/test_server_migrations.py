@@ -20,6 +20,7 @@ from tupli_mcap.server import migrations, tables
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.people import accounts
 from tupli_mcap.storage.catalog import queries, tables as catalog
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
@@ -76,9 +77,7 @@ def test_rows_of_the_first_version_stay(url: str) -> None:
         with database.writing() as connection:
             row = EpisodeRow(0, 0, 3, "terminal", 1.0, 2**70, 0, "admin", '["admin"]', "{}")
             stamp = RecordingStamp(1, 2, 3)
-            queries.put_recording(
-                connection, "x.mcap", stamp, uuid="u", benchmark_id="", rows=[row], runs="[{}]"
-            )
+            queries.put_recording(connection, "x.mcap", Entry(stamp, "u", "", [row]))
             assert queries.count_episodes(connection, None) == 3
         database.close()
 

@@ -42,6 +42,7 @@ from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog import queries
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
@@ -103,9 +104,8 @@ def put(connection: Connection, number: int, rng: random.Random) -> None:
         "environment": "Hopper-v5",
         "metadata": {"lr": 10.0 ** -(number % 7)},
     }
-    queries.put_recording(
-        connection, name, RecordingStamp(1, 2, 3), uuid=uuid, benchmark_id=benchmark, rows=rows, runs=json.dumps([run])
-    )  # fmt: skip
+    entry = Entry(RecordingStamp(1, 2, 3), uuid, benchmark, rows, json.dumps([run]))
+    queries.put_recording(connection, name, entry)
     file = {"path": name, "place": name, "created_by": owner, "uuid": uuid, "deleted": "[]"}
     connection.execute(FILE.insert().values(**file, digest="0" * 64, size=1, episodes=EACH))
 

@@ -17,7 +17,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import Catalog
-from tupli_mcap.storage.catalog.entries import entry_of, put_entry
+from tupli_mcap.storage.catalog.entries import entry_of
 from tupli_mcap.storage.listing import RecordingStamp, stamp_of
 
 T = TypeVar("T")
@@ -144,7 +144,7 @@ class FileShelf(_OpenToAll):
         if self._known is not None and self._known == _stamp(self._path.parent, name):
             return
         with entry_of(self._path.parent, name) as entry:
-            put_entry(self._catalog, name, entry)
+            self._catalog.put_recording(name, entry)
         self._known = entry.stamp
 
     def open(self, recording: str, *, of: int = 1) -> Recording:

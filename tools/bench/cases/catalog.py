@@ -20,6 +20,7 @@ def filter_catalog(run: Run) -> Iterator[Target]:
     """A range of a declared metadata key that matches 1,000 of all catalogued episodes."""
     from tupli_mcap.schema import FilterGEQ
     from tupli_mcap.storage.catalog.catalog import Catalog
+    from tupli_mcap.storage.catalog.entries import Entry
     from tupli_mcap.storage.catalog.rows import EpisodeRow
     from tupli_mcap.storage.listing import RecordingStamp
 
@@ -46,7 +47,7 @@ def filter_catalog(run: Run) -> Iterator[Target]:
         ]
         name = uuid.UUID(int=number).hex
         stamp = RecordingStamp(size=1, mtime_ns=1, mixed=0)
-        catalog.put_recording(f"{name}.mcap", stamp, uuid=name, benchmark_id="bench", rows=rows)
+        catalog.put_recording(f"{name}.mcap", Entry(stamp, name, "bench", rows))
     query = FilterGEQ(key="metadata.score", value=total - matches)
     found = catalog.episodes(query)
     check(

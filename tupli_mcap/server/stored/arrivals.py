@@ -28,7 +28,7 @@ from tupli_mcap.server.tables import CLAIM, FILE, ITEM
 from tupli_mcap.server.uploads import TooLargeError
 from tupli_mcap.storage.base import new_name, no_such
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.entries import rows_of, runs_of
+from tupli_mcap.storage.catalog.entries import Entry, rows_of, runs_of
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.sidecar import Sidecar
@@ -158,7 +158,11 @@ def register(
         return name, [*gone, place]
     recording.name = name  # a run without a name is named after its file
     settle(connection, place)
-    _put(connection, caller, recording, name, sidecar)
+    audience(connection, [caller.name])
+    rows = rows_of(recording, sidecar, created_by=caller.name)
+    stamp = RecordingStamp(recording.size, 0, 0)
+    entry = Entry(stamp, recording.uuid, recording.benchmark_id, rows, runs_of(recording))
+    queries.put_recording(connection, name, entry)
     told = {"path": escape_text(name), "place": escape_text(place), "created_by": caller.name}
     told |= {"uuid": recording.uuid, "digest": digest, "deleted": json.dumps(sorted(sidecar.deleted))}
     counts = {
@@ -212,17 +216,3 @@ def _rank(connection: Connection, caller: Caller, uuid: str) -> int:
         row = {"uuid": uuid, "created_by": caller.name, "rank": ranks[caller.name]}
         connection.execute(insert(CLAIM).values(**row))
     return ranks[caller.name]
-
-
-def _put(connection: Connection, caller: Caller, recording: Recording, name: str, sidecar: Sidecar) -> None:
-    """Lists a recording in the catalog."""
-    audience(connection, [caller.name])
-    queries.put_recording(
-        connection,
-        name,
-        RecordingStamp(recording.size, 0, 0),
-        uuid=recording.uuid,
-        benchmark_id=recording.benchmark_id,
-        rows=rows_of(recording, sidecar, created_by=caller.name),
-        runs=runs_of(recording),
-    )

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import itertools
 import weakref
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from sqlalchemy import Connection, func, select
 
 from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.database import Database, MemoryDatabase
-from tupli_mcap.storage.catalog.rows import EpisodeRow
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-_ROWS_AT_ONCE: Final = 20_000
 _T = TypeVar("_T")
 
 
@@ -104,31 +103,15 @@ class Catalog:
                 self.remove_recording(path)
         return bool(changed)
 
-    def put_recording(
-        self,
-        relpath: str,
-        stamp: RecordingStamp,
-        *,
-        uuid: str,
-        benchmark_id: str,
-        rows: Iterable[EpisodeRow],
-        runs: str = "[{}]",
-    ) -> None:
-        """Catalogue a recording, see `queries.put_recording`. `rows` is consumed a chunk at a time while the catalog is
-        locked for other writers.
+    def put_recording(self, relpath: str, entry: Entry) -> None:
+        """Catalogue a recording, see `queries.put_recording`. Its rows are consumed a chunk at a time while the catalog
+        is locked for other writers.
         StorageError if two rows have one episode number, or SQLite refuses."""
-        remaining = iter(rows)
-        first = list(itertools.islice(remaining, _ROWS_AT_ONCE))  # read before the lock is taken
+        remaining = iter(entry.rows)
+        first = list(itertools.islice(remaining, queries.ROWS_AT_ONCE))  # read before the lock is taken
         with self._write() as connection:
-            queries.put_recording(
-                connection,
-                relpath,
-                stamp,
-                uuid=uuid,
-                benchmark_id=benchmark_id,
-                rows=itertools.chain(first, remaining),
-                runs=runs,
-            )
+            rows = itertools.chain(first, remaining)
+            queries.put_recording(connection, relpath, entry._replace(rows=rows))
 
     def remove_recording(self, relpath: str) -> None:
         """See `queries.remove_recording`."""

@@ -13,7 +13,6 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Recording
 from tupli_mcap.storage.base import LOCAL_USER
-from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import LIVE, RecordingStamp, running, stamp_of
 from tupli_mcap.storage.sidecar import Notes, Sidecar
@@ -24,16 +23,17 @@ class Entry(NamedTuple):
 
     Attributes:
         stamp: of the file, taken before it was read; while somebody writes to it, it says that it must be read again.
-        runs: JSON of a list.
+        rows: of its episodes, which are read as they are needed.
+        runs: those of its episodes, as JSON of a list.
         numbers: of all its episodes, deleted ones too.
     """
 
     stamp: RecordingStamp
     uuid: str
     benchmark_id: str
-    runs: str
-    numbers: Sequence[int]
     rows: Iterable[EpisodeRow]
+    runs: str = "[{}]"
+    numbers: Sequence[int] = ()
 
 
 @contextlib.contextmanager
@@ -47,19 +47,7 @@ def entry_of(root: Path, relative: str) -> Iterator[Entry]:
         numbers = recording.index["episode"].tolist()
         rows = rows_of(recording, notes.about(recording.metadata), live=live)
         stamp = stamp._replace(mixed=LIVE) if live else stamp
-        yield Entry(stamp, recording.uuid, recording.benchmark_id, runs_of(recording), numbers, rows)
-
-
-def put_entry(catalog: Catalog, relative: str, entry: Entry) -> None:
-    """Catalogues a recording."""
-    catalog.put_recording(
-        relative,
-        entry.stamp,
-        uuid=entry.uuid,
-        benchmark_id=entry.benchmark_id,
-        runs=entry.runs,
-        rows=entry.rows,
-    )
+        yield Entry(stamp, recording.uuid, recording.benchmark_id, rows, runs_of(recording), numbers)
 
 
 def runs_of(recording: Recording) -> str:

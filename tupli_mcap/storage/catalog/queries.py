@@ -39,12 +39,12 @@ from tupli_mcap.schema.facts import comparisons, path_in
 from tupli_mcap.schema.filters import path_of
 from tupli_mcap.schema.predicate import bound_predicate
 from tupli_mcap.storage.catalog.compare_sql import Condition, Narrowed
+from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.filter_sql import merged, narrowed
 from tupli_mcap.storage.catalog.metadata_sql import among
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.pages import Asked, Told, candidates
 from tupli_mcap.storage.catalog.rows import (
-    EpisodeRow,
     StoredRow,
     flag_bits,
     header,
@@ -63,10 +63,10 @@ from tupli_mcap.storage.catalog.tables import (
     of_one_recording,
 )
 from tupli_mcap.storage.catalog.tallies import tally
-from tupli_mcap.storage.listing import RecordingStamp
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
-_ROWS_AT_ONCE: Final = 20_000
+ROWS_AT_ONCE: Final = 20_000
+"""How many rows of episodes are in memory while they are written."""
 _MOST_NEAR: Final = 200  # episodes of a page, and those before it
 _GROWTH: Final = 8  # how many times as many episodes are looked at next, where none has matched
 _MARGIN: Final = 1.5  # how many times as many are looked at as are likely to have the missing ones
@@ -76,24 +76,24 @@ _STREAMED: Final = {"yield_per": _ROWS_OF_ANSWER}
 _COLUMNS: Final = tuple(EPISODE.c[name] for name in StoredRow._fields)
 
 
-def put_recording(
-    connection: Connection,
-    relpath: str,
-    stamp: RecordingStamp,
-    *,
-    uuid: str,
-    benchmark_id: str,
-    rows: Iterable[EpisodeRow],
-    runs: str,
-) -> None:
-    """Adds a recording, or replaces its entry. `runs` is JSON: a list of its episodes' runs.
-    FormatError if a row's metadata is not a strict JSON object."""
-    number = _add_recording(connection, relpath, stamp, uuid, benchmark_id, runs)
+def put_recording(connection: Connection, relpath: str, entry: Entry) -> None:
+    """Adds a recording, or replaces its entry. FormatError if a row's metadata is not a strict JSON object."""
+    remove_recording(connection, relpath)
+    values = {
+        "path": escape_text(relpath),
+        "uuid": entry.uuid,
+        "benchmark_id": escape_text(entry.benchmark_id),
+        "environment": escape_text(_environment(entry.runs)),
+        "runs": entry.runs,
+    }
+    added = connection.execute(insert(RECORDING).values(**values, **entry.stamp._asdict()))
+    number = int((added.inserted_primary_key or (0,))[0])
     indexed = _indexed(connection)
-    remaining = iter(rows)
-    while chunk := [store_row(number, row) for row in itertools.islice(remaining, _ROWS_AT_ONCE)]:
+    remaining = iter(entry.rows)
+    while chunk := [store_row(number, row) for row in itertools.islice(remaining, ROWS_AT_ONCE)]:
         insert_all(connection, EPISODE, StoredRow._fields, chunk)
-        _index(connection, chunk, indexed)
+        if indexed:
+            _insert_values(connection, [value for row in chunk for value in indexed_values(row, indexed)])
     tally(connection, number)
 
 
@@ -127,7 +127,7 @@ def find_episodes(
         return _all_of_them(connection, asked, None, offset)
     wanted = offset + limit
     in_file_order = filter is None and asked.sort is None
-    if wanted <= (_ROWS_AT_ONCE if in_file_order else _MOST_NEAR):
+    if wanted <= (ROWS_AT_ONCE if in_file_order else _MOST_NEAR):
         for ids, left in candidates(connection, asked, wanted):
             if in_file_order:
                 return _looked_at(connection, asked, itertools.islice(ids, offset, None), wanted)
@@ -199,9 +199,7 @@ def declare_key(connection: Connection, key: str) -> None:
     if is_indexed(path):
         indexed = _indexed(connection)
         all_rows = select(*_COLUMNS).order_by(EPISODE.c.id)
-        for chunk in connection.execute(
-            all_rows, execution_options={"yield_per": _ROWS_AT_ONCE}
-        ).partitions():
+        for chunk in connection.execute(all_rows, execution_options={"yield_per": ROWS_AT_ONCE}).partitions():
             _index_anew(connection, [StoredRow(*row) for row in chunk], indexed, number)
 
 
@@ -364,12 +362,6 @@ def _indexed(connection: Connection) -> dict[tuple[str, ...], int]:
     return {path: number for path, number in paths.items() if is_indexed(path)}
 
 
-def _index(connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int]) -> None:
-    """Puts the values of rows at declared keys into `VALUE`."""
-    if indexed:
-        _insert_values(connection, [value for row in rows for value in indexed_values(row, indexed)])
-
-
 def _index_anew(
     connection: Connection, rows: Sequence[StoredRow], indexed: Mapping[tuple[str, ...], int], key: int
 ) -> None:
@@ -388,23 +380,6 @@ def _index_anew(
 def _insert_values(connection: Connection, values: Sequence[tuple[Any, ...]]) -> None:
     if values:
         insert_all(connection, VALUE, ("episode_id", "key", "number", "text", "flags"), values)
-
-
-def _add_recording(
-    connection: Connection, relpath: str, stamp: RecordingStamp, uuid: str, benchmark_id: str, runs: str
-) -> int:
-    """Adds a recording without episodes, or replaces its entry; returns its id."""
-    remove_recording(connection, relpath)
-    values = {
-        "path": escape_text(relpath),
-        "uuid": uuid,
-        "benchmark_id": escape_text(benchmark_id),
-        "environment": escape_text(_environment(runs)),
-        "runs": runs,
-    }
-    added = connection.execute(insert(RECORDING).values(**values, **stamp._asdict()))
-    (number,) = added.inserted_primary_key or (0,)
-    return int(number)
 
 
 def _environment(runs: str) -> str:

@@ -19,7 +19,7 @@ from tupli_mcap.schema import BaseFilter, EpisodeHeader
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.database import CatalogDamagedError, CatalogMovedError, CatalogUnusableError
-from tupli_mcap.storage.catalog.entries import Entry, entry_of, put_entry
+from tupli_mcap.storage.catalog.entries import Entry, entry_of
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.listing import RecordingStamp, scan, stamp_of
@@ -235,13 +235,13 @@ class SyncedCatalog:
         listed = self._catalog.listed_elsewhere(relative, entry.uuid)
         again = listed.keys() & set(entry.numbers)
         if not again:
-            put_entry(self._catalog, relative, entry)
+            self._catalog.put_recording(relative, entry)
             return len(entry.numbers)
         others = set(entry.numbers) - again
         rows = [row for row in entry.rows if row.episode in others] if others else []
         told = f"{self._root / relative} holds episodes of {listed[min(again)]} again"
         if rows:
-            put_entry(self._catalog, relative, entry._replace(rows=rows))
+            self._catalog.put_recording(relative, entry._replace(rows=rows))
             warn(f"{told}; they are listed once, and the {len(rows)} others too")
         else:
             self._catalog.remove_recording(relative)
