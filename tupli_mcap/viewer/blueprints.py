@@ -25,7 +25,7 @@ def blueprint_of(
 ) -> Any:
     """The blueprint of a scene whose panels are below each of `roots`. listed: whether the list of recordings is open.
     overview: whether the returns of all episodes are at the top."""
-    axis = _newest() if scene.grows else _time_axis(linked=scene.linked)
+    axis = _time_axis(scene)
     pictures = [panel for panel in scene.beside if isinstance(panel, Picture | Camera)]
     beside = [panel for panel in scene.beside if not isinstance(panel, Picture | Camera)]
     if not scene.states and not pictures:  # without states, texts take their place
@@ -114,18 +114,13 @@ def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
     )
 
 
-def _time_axis(*, linked: bool) -> Any:
-    """The time axis of plots: if linked, plots move together; else each shows all its rows."""
-    if linked:
+def _time_axis(scene: Scene) -> Any:
+    """The time axis of plots. Linked ones move together, growing ones show the last rows before the cursor, which
+    follows the newest row; others show all their rows."""
+    start = end = rrb.TimeRangeBoundary.infinite()
+    if scene.grows:
+        start = rrb.TimeRangeBoundary.cursor_relative(seq=-_WINDOW)
+        end = rrb.TimeRangeBoundary.cursor_relative()
+    elif scene.linked:
         return rrb.archetypes.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
-    forever = rrb.TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
-    return rrb.archetypes.TimeAxis(view_range=forever)
-
-
-def _newest() -> Any:
-    """The time axis of growing plots: the last rows before the cursor, which follows the newest row."""
-    window = rrb.TimeRange(
-        start=rrb.TimeRangeBoundary.cursor_relative(seq=-_WINDOW),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
-    return rrb.archetypes.TimeAxis(view_range=window)
+    return rrb.archetypes.TimeAxis(view_range=rrb.TimeRange(start=start, end=end))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -94,13 +94,9 @@ class _Material(NamedTuple):
 def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = False) -> Scene:
     """The panels for some episodes of a recording. apart: give each dimension its own view, in which several episodes
     are overlaid."""
-    layout = recording.layout
     rows = int(recording.index["length"][np.asarray(positions, np.int64)].sum())
-    scene = Scene(rewards=[Rewards(layout.reward)], rows=rows)
     material = _Material(recording.labels, _sample(recording, positions), rows, apart)
-    for name in recording.cameras:
-        scene.beside.append(Camera(name, f"/camera/{escaped(name)}", f"camera {name}"))
-    _add_leaves(scene, layout, material)
+    scene = _scene(recording.layout, material, recording.cameras)
     infos, unseen = infos_of(recording, _spread(positions), _MOST_INFOS)
     if infos is not None:
         scene.beside.append(infos)
@@ -119,11 +115,9 @@ def live_scene(
 ) -> Scene:
     """The panels for a running rollout. sample: columns of its first steps. infos: keys of numbers in infos. apart:
     give each dimension its own view, in which several sub-environments are overlaid."""
-    scene = Scene(rewards=[Rewards(layout.reward)], grows=True)
-    if camera is not None:
-        scene.beside.append(Camera(camera, f"/camera/{escaped(camera)}", f"camera {camera}"))
     material = _Material(labels, sample, _MOST_LANE_ROWS + 1, apart)
-    _add_leaves(scene, layout, material)
+    scene = _scene(layout, material, () if camera is None else [camera])
+    scene.grows = True
     if infos:
         title = "infos of env 0" if apart else "infos"
         entities = {key: f"/info/{escaped(key)}" for key in infos}
@@ -131,11 +125,14 @@ def live_scene(
     return scene
 
 
-def _add_leaves(scene: Scene, layout: StepLayout, material: _Material) -> None:
+def _scene(layout: StepLayout, material: _Material, cameras: Iterable[str]) -> Scene:
+    scene = Scene(rewards=[Rewards(layout.reward)], rows=material.rows)
+    scene.beside += [Camera(name, f"/camera/{escaped(name)}", f"camera {name}") for name in cameras]
     for leaf in layout.state:
         _add(scene, scene.states, leaf, "states", material)
     for leaf in layout.action:
         _add(scene, scene.actions, leaf, "actions", material)
+    return scene
 
 
 def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _Material) -> None:
@@ -200,12 +197,11 @@ def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Pan
     stepped = column == "actions" or (leaf.dtype is not None and leaf.dtype.kind in "iub")
     panels: list[Panel] = []
     for dims in groups:
-        names_here = [names[i] for i in dims]
-        alone = len(groups) == 1
-        entity = entity_of(leaf)
-        path = entity if alone else f"{entity}/dims_{'_'.join(map(str, dims))}"
-        title = title_of(leaf) if alone else f"{title_of(leaf)}: {_some(names_here)}"
-        panels.append(Series(leaf, column, path, title, dims, names_here, stepped))
+        names_here, entity, title = [names[i] for i in dims], entity_of(leaf), title_of(leaf)
+        if len(groups) > 1:
+            entity += f"/dims_{'_'.join(map(str, dims))}"
+            title += f": {', '.join(names_here[:_TITLED])}{', …' if len(dims) > _TITLED else ''}"
+        panels.append(Series(leaf, column, entity, title, dims, names_here, stepped))
     return panels
 
 
@@ -216,11 +212,6 @@ def _magnitudes(values: Array) -> list[float]:
         finite = np.abs(column[np.isfinite(column)])
         found.append(float(np.percentile(finite, 95)) if len(finite) else 0.0)
     return found
-
-
-def _some(names: Sequence[str]) -> str:
-    """The first names, as many as fit a title."""
-    return ", ".join(names[:_TITLED]) + ("" if len(names) <= _TITLED else ", …")
 
 
 def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Panel]:

@@ -79,10 +79,12 @@ class LivePanels:
         decoder = None if layout.constant else MessageDecoder(layout)
         sample = [columns_of(layout, decoder, steps.newest(_SAMPLE)) for steps in self._steps]
         scene = live_scene(layout, labels, sample, follower.camera, keys, apart=count > 1)
-        roots = [f"/env_{i}" for i in range(count)] if count > 1 else [""]
+        places = [Root(None)]
+        if count > 1:
+            places = [Root(None, f"/env_{i}", f"env {i}", PALETTE[i % len(PALETTE)]) for i in range(count)]
+        roots = [place.root for place in places]
         self._envs = [
-            LiveEnv(layout, labels.step_seconds, scene, i, _place(root, i), count)
-            for i, root in enumerate(roots)
+            LiveEnv(layout, labels.step_seconds, scene, i, place, count) for i, place in enumerate(places)
         ]
         looks = hashlib.sha256(repr((layout.to_metadata(), roots, scene.looks)).encode()).hexdigest()[:6]
         self.application = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', self._title)[:40]} live {looks}"
@@ -137,7 +139,3 @@ class LivePanels:
                 stream.log(f"/overview/{name}", rr.BarChart(tensor_array([finite], ["episode"])), static=True)
         document = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
         stream.log("/card", document, static=True)
-
-
-def _place(root: str, env: int) -> Root:
-    return Root(None, root, f"env {env}", PALETTE[env % len(PALETTE)]) if root else Root(None)

@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, named
+from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, side_by_side
 from tupli_mcap.viewer.sdk import pa, rr, rrb
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
@@ -92,7 +92,7 @@ class Picture(LeafPanel):
         if self._is_stack:
             count = self.leaf.shape[-1 if self._frames_last else 0]
             title = f"{title}: {count} frames, the newest first"
-        return _side_by_side(title, roots, self.entity)
+        return side_by_side(rrb.Spatial2DView, title, roots, self.entity)
 
 
 @dataclass(frozen=True)
@@ -198,18 +198,9 @@ class Camera:
         place.stream.send_columns(place.root + self.entity, times.columns, columns)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _side_by_side(self.title, roots, self.entity)
-
-
-def _side_by_side(title: str, roots: Sequence[str], entity: str) -> Any:
-    views = [rrb.Spatial2DView(name=named(title, root), origin=root + entity) for root in roots]
-    return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
+        return side_by_side(rrb.Spatial2DView, self.title, roots, self.entity)
 
 
 def _tensors(title: str, roots: Sequence[str], entity: str) -> Any:
     colors = rrb.TensorScalarMapping(colormap="viridis", mag_filter="nearest")
-    views = [
-        rrb.TensorView(name=named(title, root), origin=root + entity, scalar_mapping=colors, view_fit="fill")
-        for root in roots
-    ]
-    return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
+    return side_by_side(rrb.TensorView, title, roots, entity, scalar_mapping=colors, view_fit="fill")

@@ -117,6 +117,12 @@ def named(title: str, root: str) -> str:
     return f"{root.strip('/').replace('_', ' ')}: {title}" if root else title
 
 
+def side_by_side(kind: Any, title: str, roots: Sequence[str], entity: str, **looks: Any) -> Any:
+    """A view of a kind on the entity below each root."""
+    views = [kind(name=named(title, root), origin=root + entity, **looks) for root in roots]
+    return views[0] if len(views) == 1 else rrb.Grid(*views, name=title)
+
+
 def plot(title: str, entities: Sequence[str], axis: Any, *, legend: bool = True) -> Any:
     """A view of series over time, without a legend if that would only repeat the title."""
     return rrb.TimeSeriesView(

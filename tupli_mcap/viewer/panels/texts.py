@@ -71,14 +71,10 @@ class Words(LeafPanel):
         send_texts(place.stream, entity, times, rr.TextLog.descriptor_text(), texts)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
-        return _texts(self.title, roots, self.entity)
-
-
-def _texts(title: str, roots: Sequence[str], entity: str) -> Any:
-    """The text of the moment below each root, and all of them in a log."""
-    moments = [rrb.TextDocumentView(name=named(title, root), origin=root + entity) for root in roots]
-    log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=[root + entity for root in roots])
-    return rrb.Tabs(*moments, log, name=title)
+        title, entity = self.title, self.entity
+        moments = [rrb.TextDocumentView(name=named(title, root), origin=root + entity) for root in roots]
+        log = rrb.TextLogView(name=f"{title}: log", origin="/", contents=[root + entity for root in roots])
+        return rrb.Tabs(*moments, log, name=title)
 
 
 def _shown(value: Any) -> str:
