@@ -247,6 +247,26 @@ def test_lost_messages_of_episodes(topic: str, with_index: bool, tmp_path: Path)
     assert report.steps_lost == 0
 
 
+def test_a_damaged_schema_of_infos_costs_at_most_the_infos(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", 11, record_info=True, compression="none")
+    with Recording(path) as recording:
+        wanted = [info for episode in recording.episodes for info in episode.infos]
+    data = path.read_bytes()
+    places = [match.start() for match in re.finditer(b"string json", data)]
+    assert len(places) == 3  # in the data section, in the chunk and in the summary
+    for damaged in (places[:1], places[1:2], places[2:], places):
+        broken = bytearray(data)
+        for place in damaged:
+            broken[place] = 0xF4
+        path.write_bytes(broken)
+        report, recording = recovered(path)
+        with recording:
+            found = [info for episode in recording.episodes for info in episode.infos]
+            assert recording.n_steps == 11
+        is_lost = places[1] in damaged  # then the chunk has another CRC
+        assert (found, report.infos_lost) == (([None] * 11, 11) if is_lost else (wanted, 0))
+
+
 def test_a_damaged_header_of_a_chunk_loses_nothing_with_the_index(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap")
     with Recording(path) as recording:

@@ -24,7 +24,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.assemble import replacing, tidy
-from tupli_mcap.recording.edit.repair.write import RepairWriter, rows_lost
+from tupli_mcap.recording.edit.repair.write import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_file_end
@@ -280,8 +280,7 @@ def _recover_ours(
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
         _report_plan(report, plan)
-        report.infos_lost = 0 if channels.info is None else rows_lost(evidence, [channels.info])
-        report.frames_lost = writer.frames_lost
+        report.infos_lost, report.frames_lost = writer.infos_lost, writer.frames_lost
     writer.finish()
     if evidence.metadata is None:
         report.notes.append("the recording's metadata are lost: it has a new uuid and names no benchmark")

@@ -16,6 +16,7 @@ import numpy as np
 from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.frames import (
     CAMERA_NAME,
@@ -26,6 +27,7 @@ from tupli_mcap.messages.frames import (
     encode_pair,
 )
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
+from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.layout import NUMBERS, renumbered
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, camera_names, parse
@@ -60,7 +62,7 @@ class RepairWriter:
         self._evidence = evidence
         self._now = time.time_ns()
         self.metadata_lost: list[str] = []
-        self.frames_lost = 0
+        self.infos_lost = self.frames_lost = 0
 
     def begin(self, next_episode: int | None) -> None:
         """Writes magic, header, metadata and the good attachments; no later episode gets a number that was lost."""
@@ -94,10 +96,7 @@ class RepairWriter:
         """Writes every message of the episodes that are kept."""
         channels = self._evidence.channels
         vector = Topics.of_step(channels[old.steps[0]].topic).is_vector
-        info = None
-        if old.info is not None:
-            schema = self._evidence.schemas.get(channels[old.info].schema_id)
-            info = None if schema is None else (schema.data.decode(), channels[old.info].metadata)
+        info = self._infos_channel(old.info)
         places = [Topics.of(env if vector else None) for env in range(len(old.steps))]
         cameras = _cameras(self._evidence, places)
         store.codecs = image_codecs(layout, channels)
@@ -130,6 +129,17 @@ class RepairWriter:
                 self.frames_lost += rows_lost(self._evidence, pair)
                 new_pair = topics[place.camera(name)], topics[place.frame(name)]
                 self._frames(store, pair, new_pair, episodes)
+
+    def _infos_channel(self, channel: int | None) -> tuple[str, dict[str, str]] | None:
+        """The schema and metadata of the channel of infos; None if there is none, or its metadata are damaged."""
+        if channel is None:
+            return None
+        self.infos_lost = rows_lost(self._evidence, [channel])
+        try:
+            return InfoCodec.from_metadata(self._evidence.channels[channel].metadata).schema()
+        except FormatError:
+            self.infos_lost += sum(piece.rows for piece in self._evidence.pieces.get(channel, ()))
+            return None
 
     def _frames(
         self, store: PackedStore, old: tuple[int, int], new: tuple[int, int], episodes: list[PlannedEpisode]
