@@ -256,8 +256,8 @@ def test_a_damaged_schema_of_infos_costs_at_most_the_infos(tmp_path: Path) -> No
     assert len(places) == 3  # in the data section, in the chunk and in the summary
     for damaged in (places[:1], places[1:2], places[2:], places):
         broken = bytearray(data)
-        for place in damaged:
-            broken[place] = 0xF4
+        for at in damaged:
+            broken[at] = 0xF4
         path.write_bytes(broken)
         report, recording = recovered(path)
         with recording:
