@@ -21,6 +21,7 @@ from serving import PASSWORD, serving
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import ArtifactMetadata, F
+from tupli_mcap.server.blobs import LostError, blobs_of
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import TupliAPIClient
@@ -126,6 +127,10 @@ def test_nothing_is_left_of_what_is_deleted(place: RunningServer, large: Path) -
     place.admin.delete_artifact(item.id)
     place.admin.delete_episodes(F("steps") > 0)
     assert place.names() == []
+    with pytest.raises(
+        LostError, match=f"the server has lost {name}"
+    ):  # a backup that had listed it begins again
+        blobs_of(place.settings).piece(name, 0, 1)
     assert list((place.directory / "server" / "uploads").iterdir()) == []
 
 

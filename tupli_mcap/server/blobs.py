@@ -29,6 +29,11 @@ class LostError(StorageError):
     """A file that the database names is missing."""
 
 
+def lost(name: str) -> LostError:
+    """What to raise for a file that is missing."""
+    return LostError(f"the server has lost {name}; restore it from a backup")
+
+
 class Blobs(Protocol):
     """Named bytes that never change. Thread-safe. A name is a path with forward slashes. Every method raises
     UnavailableError if the object store does not answer, and StorageError if the file system refuses."""
@@ -96,9 +101,15 @@ class DirectoryBlobs:
         return path.stat().st_size if path.is_file() else None
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
-        with os_errors("cannot read", self._root / name), (self._root / name).open("rb") as file:
-            file.seek(start)
-            return file.read(stop - start)
+        path = self._root / name
+        with os_errors("cannot read", path):
+            try:
+                file = path.open("rb")
+            except FileNotFoundError as err:
+                raise lost(name) from err
+            with file:
+                file.seek(start)
+                return file.read(stop - start)
 
     def delete(self, name: str) -> None:
         with os_errors("cannot delete", self._root / name):
@@ -170,6 +181,6 @@ class BucketBlobs:
         try:
             yield
         except self._missing as err:
-            raise LostError(f"the server has lost {name}; restore it from a backup") from err
+            raise lost(name) from err
         except (BaseError, OSError, ValueError) as err:
             raise UnavailableError(f"{shown(self.place(name))} cannot be used: {why(str(err))}") from err

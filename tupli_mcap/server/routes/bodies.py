@@ -19,7 +19,7 @@ from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.page.answers import attachment
-from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, LostError
+from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, lost
 from tupli_mcap.server.library import Library
 
 MEDIA: Final = "application/octet-stream"
@@ -63,7 +63,7 @@ def body_of(
         return RedirectResponse(blobs.signed(name, _SIGNED_SECONDS), 307, {"Cache-Control": "no-store"})
     size = blobs.size(name)
     if size is None:
-        raise LostError(f"the server has lost {name}; restore it from a backup")
+        raise lost(name)
     named = attachment(file_name) if file_name else {}
     # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
     if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
