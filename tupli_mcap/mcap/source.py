@@ -11,6 +11,7 @@ import resource
 import stat
 import threading
 import weakref
+from abc import abstractmethod
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -121,8 +122,8 @@ class _Checked(Source):
             f"{self.name}: expected {length} bytes at offset {offset}, found the end of the file at {self.size}"
         )
 
-    def _read(self, offset: int, length: int) -> bytes:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, offset: int, length: int) -> bytes: ...
 
 
 class PathSource(_Checked):

@@ -73,11 +73,16 @@ def _demand_guests(library: Library, caller: Caller) -> Caller:
 Reader = Annotated[Caller, Depends(_reader)]
 
 
+def demand_writing(caller: Caller) -> None:
+    """Raises DeniedError if the caller's token may only read."""
+    if not caller.may_write:
+        raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
+
+
 async def _writer(caller: AnyCaller) -> Caller:
     if caller.is_guest:
         raise SignInError("guests may change nothing")
-    if not caller.may_write:
-        raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
+    demand_writing(caller)
     return caller
 
 

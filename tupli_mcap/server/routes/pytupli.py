@@ -41,7 +41,7 @@ from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import Turns
 from tupli_mcap.server.routes.accounts import Credentials, list_roles
 from tupli_mcap.server.routes.bodies import BODY, body_of
-from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, no_machine
+from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, demand_writing, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.tables import AUDIT, CLAIM
@@ -58,8 +58,8 @@ _Filter = Annotated[dict[str, Any] | None, Body()]
 
 
 async def _changing(caller: Reader) -> Caller:
-    if not caller.is_guest and not caller.may_write:
-        raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
+    if not caller.is_guest:
+        demand_writing(caller)
     return caller
 
 
