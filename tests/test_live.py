@@ -94,6 +94,17 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(120)
 
 
+def is_shown_at(port: int) -> bool:
+    """Whether a process still shows a rollout in the viewer at a port."""
+    address = str(port).encode()
+    for place in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            words = (place / "cmdline").read_bytes().split(b"\0")
+            if b"tupli_mcap.viewer.live" in words and any(address in word for word in words):
+                return True
+    return False
+
+
 def roll(env: gym.Env[Any, Any], steps: int, pause: float = 0.0, seed: int = 1) -> None:
     env.action_space.seed(seed)
     env.reset(seed=seed)
@@ -754,6 +765,7 @@ def test_steps_that_are_left_out_break_the_lines(tmp_path: Path) -> None:
         with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port), chunk_size=4096) as env:
             roll_until_shown(env, tmp_path / "r.rrd")
             roll(env, 6000)
+        wait_for(lambda: not is_shown_at(port))  # the recorder waited only some seconds
     rows, values = shown(tmp_path / "r.rrd", "/state")
     with Recording(path) as recording:
         states = recording.read().states

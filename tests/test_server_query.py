@@ -165,7 +165,7 @@ def test_benchmarks_and_rights(users: Users, things: Things, names: list[str], t
 
 
 def test_who_goes_away_is_not_sent_to(users: Users, tmp_path: Path) -> None:
-    random, n = np.random.default_rng(0), 100_000
+    random, n = np.random.default_rng(0), 200_000  # more than the system keeps for a connection
     noise = random.normal(size=(n, 40)).astype(np.float32)
     data = [EpisodeData(noise, np.zeros(n, int), np.ones(n), np.zeros(n, bool), np.arange(n) == n - 1)]
     write_recording(
