@@ -166,6 +166,18 @@ def test_importing_does_not_bring_them_back(runs: Path, tmp_path: Path) -> None:
     assert sorted(map(str, seeds(lab))) == ["0", "1", "2", "3"]
 
 
+def test_importing_does_not_bring_back_all_of_a_recording(runs: Path, tmp_path: Path) -> None:
+    file, lab = str(runs / "a.mcap"), str(tmp_path / "lab")
+    run("import", file, "--storage", lab)
+    run("delete", lab, "--filter", "steps > 0")
+    for dry in (["--dry-run"], []):
+        told = run("import", file, "--storage", lab, *dry)
+        assert f"import{'' if dry else 'ed'} 0 of 4 episodes" in told
+        assert "not copied: 4 episodes that had been deleted there; `tupli-mcap restore " in told
+    assert "restored 4 episodes" in run("restore", lab)
+    assert len(list(Path(lab).rglob("*.mcap"))) == 1
+
+
 def test_of_a_directory_by_filter(runs: Path) -> None:
     for where in (runs, runs / "a.mcap"):
         assert "no episode has metadata.lost" in run(

@@ -760,15 +760,18 @@ def test_a_filter_whose_key_no_episode_has_is_an_error(admin: TupliAPIClient, tm
     run("push", tmp_path / "cart", path.parent, "--filter", "metadata.score > 0")  # one of them has it
 
 
-def test_what_was_deleted_here_is_not_fetched_again(admin: TupliAPIClient, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("deleted", "told"), [("episode = 3", "1 episode"), ("episode >= 0", "12 episodes")])
+def test_what_was_deleted_here_is_not_fetched_again(
+    admin: TupliAPIClient, tmp_path: Path, deleted: str, told: str
+) -> None:
     uri, mine = pushed(admin, tmp_path / "lab"), tmp_path / "mine"
     run("pull", uri, "--storage", mine)
-    run("delete", mine, "--filter", "episode = 3")
+    run("delete", mine, "--filter", deleted)
     for dry in (["--dry-run"], []):
         result = CliRunner().invoke(app, ["pull", uri, "--storage", str(mine), *dry])
         assert "fetch" in result.stdout and " 0 episodes of 1 benchmark" in result.stdout
-        assert "not copied: 1 episode that had been deleted there; `tupli-mcap restore" in result.stderr
-    assert run("restore", mine) == "restored 1 episode\n"
+        assert f"not copied: {told} that had been deleted there; `tupli-mcap restore" in result.stderr
+    assert run("restore", mine) == f"restored {told}\n"
     assert len(list(mine.rglob("*.mcap"))) == 1
     with FileStorage(mine) as storage:
         assert sorted(header.episode for header in storage.list_episodes()) == list(range(12))

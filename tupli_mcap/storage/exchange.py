@@ -34,7 +34,7 @@ from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
-from tupli_mcap.storage.bundles.read import deleted_beside, place_for, say_what_was_deleted
+from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
@@ -90,6 +90,7 @@ def _copy(
         wanted = {header.id: [] for header in source.list_benchmarks()}
     for header in each_once(source.list_episodes(chosen)):
         wanted.setdefault(header.benchmark_id, []).append(header)
+    deleted = restorable(target) if isinstance(target, FileStorage) else ()
     copied = {}
     for uri, headers in wanted.items():
         try:
@@ -102,7 +103,6 @@ def _copy(
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         absent = [header for header in headers if header.id not in held]
-        deleted = deleted_beside(target, held.values()) if isinstance(target, FileStorage) else ()
         new = [header for header in absent if header.id not in deleted]
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = by_recording(new)

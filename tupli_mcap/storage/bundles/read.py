@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,7 +17,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.sign.sign import episodes_alike
-from tupli_mcap.schema import ArtifactMetadata, BenchmarkQuery, EpisodeHeader, FilterEQ, FilterIN
+from tupli_mcap.schema import ArtifactMetadata, BenchmarkQuery, FilterIN
 from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import artifacts_of
@@ -26,6 +27,7 @@ from tupli_mcap.storage.bundles.carried import (
     carried_environment,
     checked_signature,
 )
+from tupli_mcap.storage.listing import scan
 from tupli_mcap.storage.sidecar import Notes
 
 if TYPE_CHECKING:
@@ -160,10 +162,14 @@ def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
     )
 
 
-def deleted_beside(storage: FileStorage, held: Iterable[EpisodeHeader]) -> set[str]:
-    """The ids of deleted episodes that a storage can restore, of the recordings whose other episodes are `held`: in
-    another file they would come back twice."""
-    return set(storage.deleted_episodes({header.recording for header in held}))
+def restorable(storage: FileStorage) -> set[str]:
+    """The ids of deleted episodes that a storage can restore: in another file they would come back twice. A recording
+    that cannot be read brings none back."""
+    found: set[str] = set()
+    for item in scan(storage.root):
+        with contextlib.suppress(FormatError, RecordingError):
+            found.update(storage.deleted_episodes({item.relative}))
+    return found
 
 
 def say_what_was_deleted(episodes: int, directory: Path | None) -> None:
@@ -203,8 +209,7 @@ def _missing(
                 )
     held = {number for numbers in stored_numbers.values() for number in numbers}
     missing = {uri: number for uri, number in ids.items() if number not in held}
-    of_benchmark = FilterEQ(key="benchmark_id", value=recording.benchmark_id)
-    deleted = missing.keys() & deleted_beside(storage, storage.list_episodes(of_benchmark) if missing else ())
+    deleted = missing.keys() & restorable(storage) if missing else set()
     return [number for uri, number in missing.items() if uri not in deleted], len(deleted)
 
 
