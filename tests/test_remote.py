@@ -34,6 +34,7 @@ from web_server import WebServer, serving
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, RecordingError, TupliDataset, write_recording
 from tupli_mcap.cli import app
+from tupli_mcap.dataset.items import Windows, steps_of
 from tupli_mcap.remote import copied, matching, objects, plan, shown, source
 from tupli_mcap.remote.patterns import _expression
 from tupli_mcap.remote.plan import pieces_of
@@ -296,6 +297,27 @@ def test_a_file_of_a_server_without_ranges_comes_once(server: WebServer, large: 
     server.tags["/r.mcap"] = '"second"'
     with pytest.warns(UserWarning, match="sends whole"), pytest.raises(tupli_mcap.FormatError):
         Recording(server.url())
+
+
+def test_windows_of_a_server_without_ranges_go_into_other_processes(server: WebServer, large: Path) -> None:
+    server.ranges = False
+    with pytest.warns(UserWarning, match="sends whole files only"):
+        windows = tupli_mcap.open(server.url()).windows(8)
+    copied = pickle.dumps(windows)
+    assert np.array_equal(pickle.loads(copied)[5].states, tupli_mcap.open(large).windows(8)[5].states)
+    server.files["/r.mcap"], server.tags["/r.mcap"] = server.files["/r.mcap"][::-1], '"second"'
+    with (
+        pytest.warns(UserWarning, match="sends whole"),
+        pytest.raises(RecordingError, match="has been changed since it was opened"),
+    ):
+        pickle.loads(copied)
+
+
+def test_windows_of_a_file_object_cannot_be_pickled(large: Path) -> None:
+    with large.open("rb") as file:
+        windows = Windows(steps_of(Recording(file)), 8)
+        with pytest.raises(RecordingError, match="was opened as a file object, which cannot be copied"):
+            pickle.dumps(windows)
 
 
 def test_a_folder_of_a_bucket(server: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:

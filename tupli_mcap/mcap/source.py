@@ -12,6 +12,7 @@ import stat
 import threading
 import weakref
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -20,6 +21,7 @@ from urllib.parse import unquote, urlsplit
 from tupli_mcap.errors import FormatError, RecordingError, no_file, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
+HEAD_BYTES = 1024  # hold a file's first metadata: the recording's UUID, and which rewriting it is
 _LARGEST_LENT = 4 << 20
 _ROOM = 64  # files that a program opens beside recordings
 _MANY_FILES = 10_240  # that every system allows
@@ -227,13 +229,14 @@ def _delete(place: Path, process: int) -> None:
 
 
 class FileSource(_Checked):
-    """An open, seekable binary file; `close` closes it only if it is `owned`."""
+    """An open, seekable binary file. With a `url`, it is the whole of what is there: `close` closes it, and a copy in
+    another process downloads it again."""
 
-    def __init__(self, file: BinaryIO, name: str, *, owned: bool) -> None:
+    def __init__(self, file: BinaryIO, name: str, *, url: str | None = None) -> None:
         self.path = None
         self.name = name
         self._file = file
-        self._owned = owned
+        self._url = url
         self._lock = threading.Lock()
         self._process = os.getpid()
         # a system file is read at offsets, not at its cursor, which forked children share
@@ -259,12 +262,26 @@ class FileSource(_Checked):
             self.size = self._file.seek(0, os.SEEK_END)
 
     def close(self) -> None:
-        if self._owned:
+        if self._url is not None:
             self._file.close()
 
     def __del__(self) -> None:
         with contextlib.suppress(AttributeError):
             self.close()
+
+    def __reduce__(self) -> tuple[Callable[..., Source], tuple[str, bytes]]:
+        if self._url is None:
+            raise RecordingError(
+                f"{self.name} was opened as a file object, which cannot be copied; give its path"
+            )
+        return _opened_again, (self._url, self.read(0, min(HEAD_BYTES, self.size)))
+
+
+def _opened_again(url: str, head: bytes) -> Source:
+    source = open_source(url)
+    if source.size < len(head) or source.read(0, len(head)) != head:
+        raise RecordingError(f"{shown(url)} has been changed since it was opened; open it again")
+    return source
 
 
 def _is_system_file(file: BinaryIO) -> bool:
@@ -280,9 +297,9 @@ def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource) -> 
         return PathSource(Path(unquote(urlsplit(source).path)))
     if isinstance(source, str) and is_url(source):
         found = open_url(source)
-        return found if isinstance(found, RemoteSource) else FileSource(found, shown(source), owned=True)
+        return found if isinstance(found, RemoteSource) else FileSource(found, shown(source), url=source)
     if isinstance(source, str | os.PathLike):
         return PathSource(Path(source))
     if not hasattr(source, "read") or not hasattr(source, "seek"):
         raise RecordingError(f"expected a path, a URL or a seekable binary file, found {source!r}")
-    return FileSource(source, str(getattr(source, "name", "<file>")), owned=False)
+    return FileSource(source, str(getattr(source, "name", "<file>")))

@@ -18,7 +18,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.segments import Segments, SegmentsBuilder
 from tupli_mcap.errors import NotFoundError
-from tupli_mcap.mcap.source import Source, open_source
+from tupli_mcap.mcap.source import HEAD_BYTES, Source, open_source
 from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -29,7 +29,6 @@ from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import uuid_of
 
 _CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
-_HEAD = 1024  # bytes: the file's first metadata are shorter
 _MOST_OPEN = 64  # files; a few more while several threads read
 
 
@@ -293,7 +292,7 @@ class FileOfMany:
         self.name = where
         self.path: Path | None = path
         self.size = source.size
-        self._head = source.read(0, min(_HEAD, source.size))
+        self._head = source.read(0, min(HEAD_BYTES, source.size))
 
     def read(self, offset: int, length: int) -> bytes:
         return self._opened().read(offset, length)
