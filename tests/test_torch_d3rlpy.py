@@ -13,7 +13,8 @@ import pytest
 from gymnasium import spaces
 from test_sampling import SPACES, record
 
-from tupli_mcap import F, RecordEpisodes, TupliDataset
+import tupli_mcap
+from tupli_mcap import EpisodeWriter, F, RecordEpisodes, TupliDataset
 from tupli_mcap.dataset.items import SamplingError
 from tupli_mcap.errors import MissingExtraError
 
@@ -150,6 +151,26 @@ def test_a_dataset_without_transitions(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(tmp_path / "r.mcap")
     for buffer in (mdp_dataset(dataset), replay_buffer(dataset)):
         assert (buffer.transition_count, buffer.size(), list(buffer.episodes)) == (0, 0, [])
+
+
+@pytest.mark.d3rlpy
+def test_actions_of_recordings_with_different_spaces(tmp_path: Path) -> None:
+    from tupli_mcap.torch.d3rlpy import mdp_dataset, replay_buffer
+
+    for name, action_space in (
+        ("a", spaces.Discrete(2)),
+        ("b", spaces.Discrete(5)),
+        ("c", spaces.Discrete(3, start=-1)),
+    ):
+        with EpisodeWriter(tmp_path / f"{name}.mcap", spaces.Box(-1, 1, (2,)), action_space) as writer:
+            writer.begin()
+            for i in range(int(action_space.n)):
+                writer.step(np.zeros(2, np.float32), action_space.start + i, 0.0)
+    more, below = (tupli_mcap.open([tmp_path / "a.mcap", tmp_path / name]) for name in ("b.mcap", "c.mcap"))
+    for make in (mdp_dataset, replay_buffer):
+        assert make(more).dataset_info.action_size == 5
+        with pytest.raises(SamplingError, match="expected Discrete actions from 0.*, found the action -1"):
+            make(below)
 
 
 def test_without_d3rlpy_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

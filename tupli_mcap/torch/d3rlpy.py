@@ -254,12 +254,17 @@ def _actions_of(steps: Steps) -> tuple[ActionSpace, int]:
     if steps.layout is None or not len(steps):
         raise SamplingError("expected at least one step, found an empty dataset; look at its filters")
     space = steps.layout.action_space
+    found = str(space)
     if isinstance(space, spaces.Discrete) and space.start == 0:
-        return ActionSpace.DISCRETE, int(space.n)
+        # that is the space of the first recording, and another one may have more actions
+        actions = steps.read(["actions"], np.arange(len(steps)))["actions"]
+        if actions.min() >= 0:
+            return ActionSpace.DISCRETE, max(int(space.n), int(actions.max()) + 1)
+        found = f"the action {actions.min()}"
     if isinstance(space, spaces.Box) and len(space.shape) == 1:
         return ActionSpace.CONTINUOUS, space.shape[0]
     raise SamplingError(
-        f"expected Discrete actions from 0, or a Box of one dimension, found {space}: d3rlpy supports no others"
+        f"expected Discrete actions from 0, or a Box of one dimension, found {found}: d3rlpy supports no others"
     )
 
 
