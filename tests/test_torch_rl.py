@@ -83,6 +83,21 @@ def test_next_observations_that_were_not_recorded(tmp_path: Path) -> None:
     assert batch["next", "observation"].tolist() == [1, 2, 1, 1]
 
 
+def test_transitions_of_a_mask_of_numbers_and_of_nothing_else(tmp_path: Path) -> None:
+    dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["box"], 30, length=8))
+    storage, buffer = RecordedStorage(dataset.transitions()), replay_buffer(dataset.transitions(), 4)
+    done = storage[:]["next", "done"][:, 0]
+    for found in (storage[done], storage[done.numpy()], buffer[done]):
+        assert torch.equal(found["observation"], storage[[7, 15, 23, 29]]["observation"])
+    assert storage[~done & done].shape == storage[[]].shape == (0,)
+    with pytest.raises(SamplingError, match="expected a mask of 30 transitions, found one of shape"):
+        storage[done[1:]]
+    with pytest.raises(SamplingError, match="expected numbers from 0 to 29 in one dimension"):
+        storage[torch.tensor([1.5])]
+    with pytest.raises(IndexError, match="expected numbers from 0 to 29, found -31"):
+        storage[-31]
+
+
 def test_slices_of_episodes(tmp_path: Path) -> None:
     dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["box"], 70))
     sampler = SliceSampler(num_slices=4, end_key=("next", "done"))

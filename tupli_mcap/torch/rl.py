@@ -52,21 +52,33 @@ class RecordedStorage(Storage):  # type: ignore[misc]  # untyped
         return len(self._transitions)
 
     def get(self, index: Any) -> TensorDict:
-        """The transitions of an integer, a slice, or a tensor, an array or a list of integers, read together."""
+        """The transitions of an integer, a slice, or a tensor, an array or a list of integers, read together; or those
+        of a mask.
+
+        Raises:
+            IndexError: there is no transition of that number.
+            SamplingError: it is something else, or a mask of another length.
+        """
         if isinstance(index, tuple) and len(index) == 1:
             (index,) = index
         if isinstance(index, torch.Tensor):
             index = index.numpy()
         if isinstance(index, slice):
             index = np.arange(*index.indices(len(self)))
-        numbers = np.asarray(index, np.int64)
-        numbers = np.where(numbers < 0, numbers + len(self), numbers)
+        numbers = np.asarray(index)
+        if numbers.dtype == np.bool_:
+            if numbers.shape != (len(self),):
+                raise SamplingError(
+                    f"expected a mask of {len(self)} transitions, found one of shape {numbers.shape}"
+                )
+            numbers = np.flatnonzero(numbers)
         batch = self._read(numbers.reshape(-1))
         return batch.reshape(numbers.shape)
 
     def _read(self, numbers: Array) -> TensorDict:
-        columns = tensors(self._transitions[numbers].asdict())
-        breaks = torch.from_numpy(np.isin(numbers, self._transitions.source.breaks))
+        transitions = self._transitions[numbers]
+        columns = tensors(transitions.asdict())
+        breaks = torch.from_numpy(np.isin(transitions.steps, self._transitions.source.breaks))
         terminated = columns["terminals"]
         truncated = columns["timeouts"] | (breaks & ~terminated)
         following = {
