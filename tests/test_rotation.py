@@ -420,6 +420,7 @@ class TestStorage:
         assert len(storage.list_episodes()) == sum(len(Recording(path)) for path in paths)
         assert env.recording_path == paths[-1]
         assert {header.benchmark_id for header in storage.list_episodes()} == {env.id}
+        assert storage.count_episodes('run.name = "cartpole"') == len(storage.list_episodes())
 
     def test_a_storage_that_cannot_list_now_does_not_stop_the_rollout(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

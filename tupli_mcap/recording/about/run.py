@@ -23,8 +23,9 @@ MAX_RUN: Final = 1 << 26  # bytes of `run.json`
 _MAX_GIVEN: Final = 1 << 20  # bytes of one run, as a user gives it
 _LISTS: Final = ("tags", "command")
 _TEXTS: Final = ("id", "name", "split", "environment", "started", "ended", "host")
-OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}")
-"""What a storage calls the file of a recording, see `storage.base.new_name`."""
+OF_STORAGE: Final = re.compile(r"\d{8}T\d{6}-(?:(?P<name>.+)-)?[0-9a-f]{12}(?:_\d{4,})?")
+"""What a storage calls the files of a recording, see `storage.base.new_name`; further ones of a series end in their
+number."""
 
 
 @dataclass(frozen=True)
