@@ -64,6 +64,18 @@ def test_episodes_are_sent_once_while_they_are_recorded_and_once_with_the_whole(
     assert waiting(admin) == 0
 
 
+def test_a_run_without_a_name_is_named_as_in_a_directory(admin: TupliAPIClient) -> None:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), admin, max_bytes=8000, chunk_size=1000)
+    env.store(name="cart")
+    roll(env, 20)
+    assert {header.run["name"] for header in admin.list_episodes()} == {"cart"}  # of parts
+    roll(env, 100, 20)
+    env.close()
+    listed = admin.list_episodes()
+    assert len({header.recording for header in listed}) > 2
+    assert {header.run["name"] for header in listed} == {"cart"}
+
+
 def test_what_was_deleted_does_not_come_back_with_the_whole(
     admin: TupliAPIClient, env: TupliEnvWrapper
 ) -> None:

@@ -233,7 +233,7 @@ class Outbox:
         with Recording(path) as recording:
             if len(recording):
                 try:
-                    send_file(self._session, path, sent_before=before, tell=tell)
+                    send_file(self._session, path, name=path.name, sent_before=before, tell=tell)
                 except ConflictError:  # some of what was sent is not here any more
                     if not before:
                         raise
@@ -258,7 +258,7 @@ class Outbox:
             return
         with files.private_directory(path.parent, shown=path) as directory:
             rewrite_recording(recording, directory / path.name, episodes=numbers)
-            send_file(self._session, directory / path.name)
+            send_file(self._session, directory / path.name, name=path.name)
         files.write_bytes(_note(path), json.dumps({"sent_before": numbers[-1] + 1}).encode())
 
     def _send_at_exit(self, process: int) -> None:
