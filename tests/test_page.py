@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import io
+import math
 import re
 import shlex
 import shutil
@@ -636,6 +637,29 @@ def test_sizes_are_rounded_as_commands_round_them(tmp_path: Path) -> None:
         page = client.get(f"/dataset/{dataset['key']}").text
     assert "1.0 MB" in command.output
     assert "<td>1.0 MB" in page and "1000 kB" not in page
+
+
+@pytest.mark.parametrize(
+    ("returns", "mean"),
+    [
+        ((1.7e308, -1.7e308, 0.0), "–"),
+        ((math.inf, -math.inf, 2.0), "–"),
+        ((math.inf, 1.0, 2.0), "∞"),
+        ((5e-324, 0.0, 0.0), "0"),
+        ((9999.6, 9999.6, 9999.7), "10,000"),
+    ],
+)
+def test_returns_of_all_sizes(tmp_path: Path, returns: tuple[float, ...], mean: str) -> None:
+    episodes = [tupli_mcap.EpisodeData([0], [0], [value], [True], [False]) for value in returns]
+    space = gym.spaces.Discrete(2)
+    tupli_mcap.write_recording(tmp_path / "r.mcap", episodes, observation_space=space, action_space=space)
+    with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+        (dataset,) = told(client, "/")["datasets"]
+        page = client.get(f"/dataset/{dataset['key']}")
+        table = client.get("/episodes")
+    assert page.status_code == 200
+    assert f"<dt>Mean return</dt><dd>{mean}</dd>" in page.text
+    assert "nan%" not in table.text
 
 
 @pytest.mark.filterwarnings("ignore:.*")  # of copies, and of files without their journals

@@ -7,6 +7,7 @@ sheet, so that dark pages have their own. Only numbers and escaped texts go into
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -169,9 +170,9 @@ def _dots(at: Array, values: Array, across: tuple[float, float], up: tuple[float
 
 def _ticks(low: float, high: float) -> list[float]:
     """About four round numbers from `low` to `high`."""
-    if not high > low:
-        return [low]
     rough = (high - low) / _TICKS
+    if not rough >= sys.float_info.min:  # of smaller ones, no power of ten may be left
+        return [low]
     unit = 10.0 ** math.floor(math.log10(rough))
     step = unit * next((factor for factor in (1, 2, 5) if factor * unit >= rough), 10)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)

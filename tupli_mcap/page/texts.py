@@ -25,7 +25,7 @@ def number(value: float | None) -> str:
         return "∞" if value > 0 else "-∞"
     if abs(value) < 1e15 and float(value).is_integer():
         return f"{int(value):,}".replace("-", "\N{MINUS SIGN}")
-    shown = f"{value:.4g}" if abs(value) < 1e4 or abs(value) >= 1e7 else f"{value:,.0f}"
+    shown = f"{value:.4g}" if abs(value) < 9999.5 or abs(value) >= 1e7 else f"{value:,.0f}"
     return shown.replace("-", "\N{MINUS SIGN}")
 
 

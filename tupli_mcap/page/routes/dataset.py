@@ -25,7 +25,7 @@ from tupli_mcap.page.samples import (
     sample_values,
 )
 from tupli_mcap.page.shelf import Shelf, python_line
-from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges
+from tupli_mcap.plots.statistics import LeafValues, bands, bin_edges, drawable_numbers
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.schema import EpisodeHeader
@@ -137,7 +137,7 @@ def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[
         ("Length", episodes.steps),
         ("Success", episodes.success),
     ):
-        drawable = np.where(np.isfinite(values), values, np.nan)
+        drawable = drawable_numbers(values)
         known = drawable[np.isfinite(drawable)]
         if len(known) and known.min() == known.max():
             which = "every episode" if len(known) == len(values) else plural(len(known), "episode")

@@ -7,8 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite
-from typing import Annotated, Final
+from typing import Annotated, Final, TypeGuard
 
 from fastapi import APIRouter, Query, Request, Response
 from markupsafe import Markup
@@ -21,6 +20,7 @@ from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, seen_in
 from tupli_mcap.page.shelf import Shelf, find_episode, python_line
+from tupli_mcap.plots.statistics import LARGEST
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
 from tupli_mcap.schema.facts import comparisons, path_in
@@ -58,11 +58,9 @@ class Table:
 
     def bar(self, row: EpisodeHeader) -> Markup:
         """A bar: where the return of a row lies between the smallest and the largest of the page."""
-        known = [
-            r.episode_return for r in self.rows if r.episode_return is not None and isfinite(r.episode_return)
-        ]
+        known = [r.episode_return for r in self.rows if _is_drawable(r.episode_return)]
         value = row.episode_return
-        if value is None or not isfinite(value) or min(known) == max(known):
+        if not _is_drawable(value) or min(known) == max(known):
             return Markup("")
         return charts.share((value - min(known)) / (max(known) - min(known)))
 
@@ -159,6 +157,10 @@ def table_of(
         after=rows[-1].id if rows and (before or more) else None,
         slow=_slow(shelf, connection, wanted, order) if shelf.changes else (),
     )
+
+
+def _is_drawable(value: float | None) -> TypeGuard[float]:
+    return value is not None and abs(value) <= LARGEST
 
 
 def _slow(

@@ -35,7 +35,8 @@ class Tally(NamedTuple):
 
     Attributes:
         size: of the file (bytes); None unless all of its episodes are visible.
-        returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is.
+        returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is. The
+            sum is NaN if some are too large and others too small to be added.
         told, succeeded: number of episodes that say whether they succeeded, and of those that did.
         first, last: when the first and the last of them ended (ns since 1970, UTC).
         runs: of the episodes, as `EpisodeHeader.run`.
@@ -133,5 +134,7 @@ def tallies(
     for path, most, uuid, benchmark_id, environment, size, mixed, runs, *summed in connection.execute(query):
         counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
         named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
+        if counts[4] is not None and counts[4] <= -_LARGE and counts[5] >= _LARGE:
+            counts[3] = math.nan
         seen_size = size if counts[0] == int(most) else None
         yield Tally(*named, seen_size, mixed, jsonvalue.loads(runs), *counts)
