@@ -491,6 +491,18 @@ class TestPeople:
             assert ann.post("/group/delete", data=told).status_code == 303
             assert "legs" not in ann.get("/share?dataset=-").text
 
+    def test_links_to_groups_lead_somewhere(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            own, crew = code(ann), {"name": "readers"}
+            ann.post("/groups", data={"code": own, **crew})
+            ann.post("/group/members", data={"code": own, **crew, "user": "bob", "role": "guest"})
+            assert 'href="/group?name=readers"' in ann.get("/groups").text
+            page = bob.get("/groups").text  # a guest of a group reads what is published in it, and not its members
+            assert "readers" in page
+            assert "/group?name=readers" not in page
+            left = ann.post("/group/members/delete", data={"code": own, **crew, "user": "ann"})
+            assert ann.get(left.headers["location"]).status_code == 200
+
     def test_users(self, server: str) -> None:
         with browser(server, "ann") as ann, browser(server, "admin", PASSWORD) as admin:
             told = {"username": "carl", "password": "carl's password"}

@@ -79,10 +79,8 @@ def _groups(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = N
     with visit.library.database.reading() as connection:
         groups = accounts.list_groups(connection, visit.caller)
         own = accounts.memberships_of(connection, visit.caller.name)
-    may_create = visit.caller.may(Right.GROUP_CREATE)
-    return visit.page(
-        "groups.html", {"groups": groups}, wrong, status, sent=sent, own=own, may_create=may_create
-    )
+    may = {"create": visit.caller.may(Right.GROUP_CREATE), "open": partial(accounts.may_open, visit.caller)}
+    return visit.page("groups.html", {"groups": groups}, wrong, status, sent=sent, own=own, may=may)
 
 
 @router.get("/group")
@@ -100,7 +98,8 @@ def add_member(visit: Code, name: _Text = "", user: _Text = "", role: _Text = "m
 @router.post("/group/members/delete")
 def remove_member(visit: Code, name: _Text = "", user: _Text = "") -> Response:
     change = partial(visit.change, accounts.remove_members, name, [user])
-    return tried(change, partial(_group, visit, name), address("group", name=name))
+    left = user == visit.caller.name  # who may not see the group any more
+    return tried(change, partial(_group, visit, name), "/groups" if left else address("group", name=name))
 
 
 @router.post("/group/delete")

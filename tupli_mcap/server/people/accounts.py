@@ -308,11 +308,16 @@ def remove_members(connection: Connection, caller: Caller, group: str, users: Se
         audit(connection, caller.name, "remove_member", f"{group}: {user}")
 
 
+def may_open(caller: Caller, group: str) -> bool:
+    """Whether the caller may see more of a group than its name."""
+    rights = (Right.GROUP_READ, Right.GROUP_UPDATE, Right.GROUP_DELETE)
+    return any(caller.may(right, group) for right in rights)
+
+
 def _known(connection: Connection, caller: Caller, group: str) -> None:
     """Raises NotFoundError for a group that does not exist, or that the caller may not see."""
     is_group = group == GLOBAL or connection.execute(select(GROUP).where(GROUP.c.name == group)).first()
-    rights = (Right.GROUP_READ, Right.GROUP_UPDATE, Right.GROUP_DELETE)
-    if not is_group or not any(caller.may(right, group) for right in rights):
+    if not is_group or not may_open(caller, group):
         raise NotFoundError("Group not found")
 
 
