@@ -34,6 +34,7 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.recording.write.options import RecordOptions
+from tupli_mcap.reexecute import certify
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -1120,6 +1121,31 @@ def test_environments_that_reset_themselves(tmp_path: Path) -> None:
     assert [e.states.tolist() for e in episodes] == [[0, 1, 2], [0, 1, 2], [0]]
     assert [e.final_state for e in episodes] == [3, 3, 1]
     assert [e.metadata["total"] for e in episodes] == [3, 3, 1]
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"record_info": True}, {"max_bytes": 1}], ids=["plain", "infos", "rotation"]
+)
+@pytest.mark.parametrize(
+    ("limit", "states"), [(2, [[0, 1], [2], [0], [1], [2]]), (4, [[0, 1, 2], [0], [1], [2], [0]])]
+)
+def test_a_time_limit_around_an_environment_that_resets_itself(
+    tmp_path: Path, options: dict[str, Any], limit: int, states: list[list[int]]
+) -> None:
+    """Its end makes the next step no reset, and a step that was a reset may have its flag."""
+    inner = gym.wrappers.Autoreset(Scripted(lambda step: step, spaces.Discrete(99), length=3))
+    with RecordEpisodes(gym.wrappers.TimeLimit(inner, limit), tmp_path / "r.mcap", **options) as recorded:
+        recorded.reset(seed=0)
+        for _ in range(sum(map(len, states)) + (2 if limit == 4 else 1)):
+            recorded.step(1)
+    found = [episode for path in recorded.paths for episode in Recording(path).episodes]
+    assert [e.states.tolist() for e in found] == states
+    assert [e.final_state for e in found] == [each[-1] + 1 for each in states]
+    assert [e.end == "terminal" for e in found] == [each[-1] == 2 for each in states]
+    if "max_bytes" not in options:
+        assert certify(recorded.path, env=gym.wrappers.TimeLimit(inner, limit)).agreed.steps == sum(
+            map(len, states)
+        )
 
 
 @pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])

@@ -100,8 +100,9 @@ def fingerprint(env: gym.Env[Any, Any]) -> bytes | None:
 
 
 def resets_itself(env: gym.Env[Any, Any]) -> bool:
-    """Whether the step after an end is a reset, since `gymnasium.wrappers.Autoreset` is among the wrappers."""
-    return any(isinstance(layer, gym.wrappers.Autoreset) for layer in _layers(env))
+    """Whether the next step is a reset: `gymnasium.wrappers.Autoreset` is among the wrappers, and what it wraps has
+    ended. An end that comes from a wrapper around it, such as a time limit, makes it reset nothing."""
+    return any(isinstance(layer, gym.wrappers.Autoreset) and layer.autoreset for layer in _layers(env))
 
 
 class Snapshot:

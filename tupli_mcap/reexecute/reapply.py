@@ -60,7 +60,6 @@ class Reexecutor:
         self._owned = owned
         self.plain = plain
         self._env: gym.Env[Any, Any] | None = None
-        self._resets_itself = False
         self._used = False
         self._last: Moment | None = None
         self._last_action: Any = None
@@ -75,7 +74,6 @@ class Reexecutor:
         """The environment; built at the first use."""
         if self._env is None:
             self._env = self._make()
-            self._resets_itself = resets_itself(self._env)
             self._used = False
         return self._env
 
@@ -96,7 +94,7 @@ class Reexecutor:
         if plan.how == "continues" and self._last is not None:
             return Moment(self._last.state)
         env = self.env
-        if plan.auto and self._resets_itself and self._last is not None:
+        if plan.auto and self._last is not None and resets_itself(env):
             try:
                 state, *_ = env.step(self._last_action)  # Autoreset ignores the action after an end
             except (Exception, SystemExit) as err:

@@ -194,7 +194,8 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
                 if not (terminal or timeout):
                     work.state = DONE
                     return result
-                if not names_success(result[4]):
+                if self._recorder.step_index and not names_success(result[4]):
+                    self._recorder.resets_itself = resets_itself(self.env)
                     self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
                     work.state = DONE
                     return result
@@ -287,7 +288,9 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     def _end(self, action: Any, result: Any) -> None:
         """Ends the episode after its last step."""
         _, _, terminal, timeout, info = result
-        if terminal or timeout:
+        # the flag of a step that was a reset ends nothing
+        if (terminal or timeout) and self._recorder.step_index:
+            self._recorder.resets_itself = resets_itself(self.env)
             self._recorder.metadata = with_success(self._recorder.metadata, info)
             self._recorder.end(TERMINAL if terminal else TIMEOUT)
             self._work.ask(self._reset_callback)
@@ -301,7 +304,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     def _go_on(self, action: Any, result: Any) -> None:
         """Goes on in another file if this one is full, and syncs to the disk if `durability` asks for it."""
         state, _, terminal, timeout, _ = result
-        if (terminal or timeout) and self.rotation.is_due(self._writer):
+        if (terminal or timeout) and self._recorder.running[0] < 0 and self.rotation.is_due(self._writer):
             self._rotate(state)
         self._writer.after_steps()
 

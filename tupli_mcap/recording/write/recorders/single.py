@@ -85,7 +85,7 @@ class SingleRecorder:
         self._episode: StartedEpisode | None = None
         self._over: int | None = None  # how the last step ended its episode, until that is written
         self._rows: SingleRows | None = None  # if episodes are derived from them
-        self.resets_itself = False  # the step after an end is a reset (gymnasium.wrappers.Autoreset)
+        self.resets_itself = False  # the step after this end is a reset (gymnasium.wrappers.Autoreset)
         self.put: Put = self._unreset
         writer.on_close = self._stop
         writer.start_is_droppable = lambda: self._episode is not None and self.step_index == 0
