@@ -1111,6 +1111,31 @@ def test_an_image_whose_values_stray_is_an_array(tmp_path: Path) -> None:
     check_against(tmp_path / "r.mcap", taken)
 
 
+class _AnySeed(Scripted):
+    """Takes any seed."""
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return super().reset()
+
+
+@pytest.mark.parametrize("seed", [5.0, "5", [5], np.array([5.0, 6.0])], ids=repr)
+def test_a_seed_is_an_integer(tmp_path: Path, seed: Any) -> None:
+    """Any other one is refused before the environment is reset: the running episode goes on."""
+    env = _AnySeed(lambda step: step, spaces.Discrete(99))
+    for kind in ("single", "vector"):
+        wrapped: Any = RecordEpisodes if kind == "single" else RecordVectorEpisodes
+        made: Any = env if kind == "single" else gym.vector.SyncVectorEnv([lambda: env] * 2)
+        with wrapped(made, tmp_path / f"{kind}.mcap") as recorded:
+            recorded.reset(seed=3)
+            action = recorded.action_space.sample()
+            recorded.step(action)
+            with pytest.raises(StepError, match="seed: expected an integer"):
+                recorded.reset(seed=seed)
+            recorded.step(action)
+        first = Recording(tmp_path / f"{kind}.mcap").episodes[0]
+        assert (first.seed, len(first)) == (3, 2)
+
+
 def test_environments_that_reset_themselves(tmp_path: Path) -> None:
     env = gym.wrappers.Autoreset(Scripted(lambda step: step, spaces.Discrete(99), length=3))
     with RecordEpisodes(env, tmp_path / "r.mcap", metadata_callback=Totals()) as recorded:

@@ -23,7 +23,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.infos import entries_of
 from tupli_mcap.recording.write.rotation import Rotation
@@ -155,10 +155,9 @@ class EpisodeWriter(Recorder):
             RecordingError: the metadata is no dict of JSON values.
         """
         self._between(env)
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
-            raise StepError(f"seed: expected an integer or None, found {shorten(seed)}")
+        number = seed_number(seed)
         told = "" if options is None else jsonvalue.dumps_any(options)
-        facts = ResetFacts(None if seed is None else int(seed), None, told, "{}", time.time_ns())
+        facts = ResetFacts(number, None, told, "{}", time.time_ns())
         entries = _metadata(metadata)
         with self._work:
             self._next(env).begin(facts, entries)

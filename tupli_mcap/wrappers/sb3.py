@@ -169,8 +169,13 @@ class _Recorder(RecordEpisodes):
 
     env: StableBaselinesVecEnv
 
-    def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
-        facts = super()._facts(self._seeds, unseeded, options, infos)
+    def _seeds_of(self, seed: Any) -> list[int | None]:
+        return super()._seeds_of(self._seeds)
+
+    def _facts(
+        self, seeds: Sequence[int | None], unseeded: list[bool], options: str, infos: Any
+    ) -> list[ResetFacts]:
+        facts = super()._facts(seeds, unseeded, options, infos)
         texts = [jsonvalue.dumps_any(one) if one else "" for one in self._options]
         return [one._replace(options=text) for one, text in zip(facts, texts, strict=True)]
 

@@ -19,7 +19,7 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import names_success, with_success
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
@@ -218,6 +218,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         work = self._work
         if work.state:
             work.refuse()
+        number = seed_number(seed)
         told = "" if options is None else jsonvalue.dumps_any(options)  # before the environment takes any out
         work.state = ASKING
         unseeded = seed is None and getattr(self._base, "_np_random", 0) is None
@@ -232,7 +233,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
                     return result
                 work.state = ASKING
             facts = ResetFacts(
-                seed,
+                number,
                 drawn_seed(self.env) if unseeded else None,
                 told,
                 jsonvalue.dumps_any(info) if info else "{}",

@@ -18,7 +18,7 @@ from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import tells_success, with_success
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import (
     Capture,
     CaptureEnv,
@@ -34,6 +34,7 @@ from tupli_mcap.recording.write.recorders.infos import final_infos_of, infos_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of, reset_callback
 
 
@@ -188,6 +189,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         work = self._work
         if work.state:
             work.refuse()
+        seeds = self._seeds_of(seed)
         # before the environment takes any out; the mask is for the vector environment, not its sub-environments
         given = None if options is None else {key: options[key] for key in options if key != "reset_mask"}
         told = "" if given is None else jsonvalue.dumps_any(given)
@@ -198,7 +200,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             unseeded = [getattr(env.unwrapped, "_np_random", 0) is None for env in self._sub_environments()]
             result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
             states, infos = result
-            facts = self._facts(seed, unseeded, told, infos)
+            facts = self._facts(seeds, unseeded, told, infos)
             if self._watches:
                 self._states = self._each_state(states)
             work.go_on()
@@ -227,13 +229,25 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         envs = getattr(self.env.unwrapped, "envs", None)
         return list(envs) if isinstance(envs, list | tuple) else []
 
-    def _facts(self, seed: Any, unseeded: list[bool], options: str, infos: Any) -> list[ResetFacts]:
-        n, now = self.num_envs, time.time_ns()
-        seeds: list[int | None] = [None] * n
-        if isinstance(seed, int | np.integer):
-            seeds = [int(seed) + i for i in range(n)]
-        elif seed is not None:
+    def _seeds_of(self, seed: Any) -> list[int | None]:
+        """The seed of each sub-environment; StepError if there is not one for each."""
+        n = self.num_envs
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else int(seed) + i for i in range(n)]
+        try:
             seeds = list(seed)
+        except TypeError:
+            seeds = []
+        if len(seeds) != n:
+            raise StepError(
+                f"seed: expected an integer, None, or a list of {n} of these, found {shorten(seed)}"
+            )
+        return [seed_number(one) for one in seeds]
+
+    def _facts(
+        self, seeds: Sequence[int | None], unseeded: list[bool], options: str, infos: Any
+    ) -> list[ResetFacts]:
+        n, now = self.num_envs, time.time_ns()
         facts = []
         for i, info in enumerate(infos_of(infos, range(n), n)):
             text = jsonvalue.dumps_any(info) if info else "{}"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.errors import StepError
 from tupli_mcap.journal.derive import EpisodeBatch, StartedEpisode
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.journal.logs import EventLog, ToFile, sealed_records
@@ -24,6 +26,7 @@ from tupli_mcap.messages.episodes import (
 )
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.recording.index import EPISODE_ROWS, IndexBuilder, indexed_seed
+from tupli_mcap.spaces.exact import shorten
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.channels import Channels
@@ -56,6 +59,14 @@ class ResetFacts(NamedTuple):
 def plain_reset(time_ns: int, *, continued: bool = False) -> ResetFacts:
     """A reset without arguments and info; or none, if the episode is `continued`."""
     return ResetFacts(None, None, "", "{}", time_ns, continued)
+
+
+def seed_number(seed: Any) -> int | None:
+    """The seed of a reset as an integer. StepError if it is none."""
+    try:
+        return None if seed is None else operator.index(seed)
+    except TypeError as err:
+        raise StepError(f"seed: expected an integer or None, found {shorten(seed)}") from err
 
 
 # makes a StartedEpisode of its fields
