@@ -12,6 +12,7 @@ import warnings
 from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -1109,6 +1110,19 @@ def test_an_image_whose_values_stray_is_an_array(tmp_path: Path) -> None:
         with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
             taken = roll(recorded, 12)
     check_against(tmp_path / "r.mcap", taken)
+
+
+def test_infos_that_are_mappings_and_no_dicts(tmp_path: Path) -> None:
+    class Told(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(self, **options: Any) -> tuple[Any, Any]:
+            return self.env.reset(**options)[0], MappingProxyType({"place": 3})
+
+    info: Any = MappingProxyType({"is_success": True})
+    env = Told(Scripted(lambda step: step, spaces.Discrete(99), info=lambda step: info, length=2))
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        roll(recorded, 2)
+    (episode,) = Recording(tmp_path / "r.mcap").episodes
+    assert (episode.success, episode.reset_info) == (True, {"place": 3})
 
 
 class _AnySeed(Scripted):

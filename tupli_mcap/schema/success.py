@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ def success_of(said: Any) -> bool | None:
 
     That is a bool, a number that is 0 or 1, or an array of one of these, as `success` or `is_success`.
     """
-    if isinstance(said, dict) and said:
+    if isinstance(said, Mapping):
         for key in KEYS:
             value = said.get(key)
             if isinstance(value, np.ndarray) and value.size == 1:

@@ -236,7 +236,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
                 number,
                 drawn_seed(self.env) if unseeded else None,
                 told,
-                jsonvalue.dumps_any(info) if info else "{}",
+                jsonvalue.dumps_any(dict(info) if isinstance(info, Mapping) else info) if info else "{}",
                 time.time_ns(),
             )
             if self._watches:
