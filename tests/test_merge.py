@@ -684,3 +684,19 @@ def test_vectorised_copies_of_an_environment_are_no_other_one(
     assert not [warning for warning in recwarn if "another environment" in str(warning.message)]
     with pytest.warns(UserWarning, match=r"other.mcap carries another environment than .*one.mcap"):
         merge_recordings([tmp_path / "one.mcap", tmp_path / "other.mcap"], tmp_path / "m.mcap")
+
+
+@pytest.mark.parametrize("change", ["save", "map", "trim"])
+def test_of_a_dataset_whose_file_was_removed_since(tmp_path: Path, change: str) -> None:
+    """An open file stays readable, and another one may be replaced."""
+    dataset = open_dataset(record(tmp_path / "run.mcap"))
+    wanted = dataset[0].rewards.tolist()
+    (tmp_path / "run.mcap").unlink()
+    target = record(tmp_path / "out.mcap", seed=2)
+    given: dict[str, list[Any]] = {
+        "save": [],
+        "map": [lambda episode: episode.rewards],
+        "trim": [slice(None)],
+    }
+    getattr(dataset, change)(*given[change], target, overwrite=True)
+    assert open_dataset(target)[0].rewards.tolist() == wanted

@@ -212,6 +212,14 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
+def is_same(one: Path, other: Path | None) -> bool:
+    """Whether two paths lead to one file; not if one leads to none any more, or is None."""
+    try:
+        return other is not None and one.samefile(other)
+    except OSError:
+        return False
+
+
 def as_file_name(name: str) -> str:
     """A file name made of `name`: letters, digits, `_`, `-`, `+` and dots, at most 80 bytes.
 

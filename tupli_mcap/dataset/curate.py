@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import files
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource, numbers_by_recording
@@ -270,8 +271,7 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
         )
     if not target.exists():
         return
-    paths = (recording.path for _, recording in dataset.opened())
-    if any(path is not None and target.samefile(path) for path in paths):
+    if any(files.is_same(target, recording.path) for _, recording in dataset.opened()):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     if not overwrite:
         raise DatasetError(

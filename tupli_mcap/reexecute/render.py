@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 
+from tupli_mcap import files
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
@@ -130,7 +131,7 @@ def render(
 
 
 def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
-    if goal.exists() and recording.path is not None and goal.samefile(recording.path):
+    if files.is_same(goal, recording.path):
         raise RecordingError(f"{goal} is the recording itself, which is never overwritten; give another name")
     kind = check_goal(goal, _KINDS, overwrite=overwrite)
     if not goal.absolute().parent.is_dir():

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap import files
 from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
@@ -60,7 +61,7 @@ def write_layout(
                 f"expected one recording to make a layout for, found {len(chosen)}; give them one by one"
             )
         recording = chosen[0].recording
-        if recording.path is not None and path.exists() and path.samefile(recording.path):
+        if files.is_same(path, recording.path):
             raise RecordingError(
                 f"{path} is the recording itself, which is never overwritten; give another name"
             )

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import files
 from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
 from tupli_mcap.errors import RecordingError, SpaceError, asking, warn
@@ -333,7 +334,7 @@ def _define_missing(
 
 def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
     if target.exists():
-        if any(source.path is not None and target.samefile(source.path) for source in sources):
+        if any(files.is_same(target, source.path) for source in sources):
             raise RecordingError(f"{target} is one of the recordings to merge; write to another path")
         if not overwrite:
             raise RecordingError(

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tupli_mcap import files
 from tupli_mcap.errors import RecordingError, asking
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
@@ -62,7 +63,7 @@ def trim_recording(
         raise RecordingError(
             f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
         )
-    if target.exists() and source.path is not None and target.samefile(source.path):
+    if files.is_same(target, source.path):
         raise RecordingError(f"{target} is the recording itself; write to another path")
     trims = trims_of(source, steps)
     rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tupli_mcap import files
 from tupli_mcap.errors import (
     FormatError,
     MissingExtraError,
@@ -190,7 +191,7 @@ def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
         raise RecordingError(f"{path} is being recorded; close its writer first, then recover it")
     if dry_run:
         return
-    if goal.exists() and path.exists() and goal.samefile(path):
+    if files.is_same(goal, path):
         raise RecordingError(f"{path} is never overwritten; give another file to write to")
     if goal.exists() and not overwrite:
         raise RecordingError(
