@@ -193,7 +193,7 @@ def test_deleted_episodes_of_a_file_are_not_sent(admin: TupliAPIClient, tmp_path
 def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
     admin: TupliAPIClient, tmp_path: Path
 ) -> None:
-    one, two = paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    one, two = paths = [tmp_path / "one.mcap", tmp_path / "two #1?.mcap"]
     for seed, path in enumerate(paths):
         record_rollouts("CartPole-v1", path, steps=5, seed=seed)
     uri = fill(tmp_path / "lab", 2)

@@ -497,7 +497,9 @@ class TestPeople:
             ann.post("/groups", data={"code": own, **crew})
             ann.post("/group/members", data={"code": own, **crew, "user": "bob", "role": "guest"})
             assert 'href="/group?name=readers"' in ann.get("/groups").text
-            page = bob.get("/groups").text  # a guest of a group reads what is published in it, and not its members
+            page = bob.get(
+                "/groups"
+            ).text  # a guest of a group reads what is published in it, and not its members
             assert "readers" in page
             assert "/group?name=readers" not in page
             left = ann.post("/group/members/delete", data={"code": own, **crew, "user": "ann"})

@@ -17,7 +17,7 @@ from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
-from tupli_mcap.remote import shown
+from tupli_mcap.remote import shown_name
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,
@@ -99,7 +99,7 @@ def _copy(
             if uri == benchmark_id:
                 raise
             # somebody has published the episodes without their benchmark, which must not keep the others away
-            warn(f"not copied: {len(headers)} episodes: {err}")
+            warn(f"not copied: {plural(len(headers), 'episode')}: {err}")
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         absent = [header for header in headers if header.id not in held]
@@ -242,7 +242,7 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
             _send_carried(client, recording, path, dry_run=dry_run)
         if dry_run:
             return Pushed("", recording.benchmark_id, len(recording), False)
-        with progress(kept.stat().st_size, f"sending {shown(str(path))}", in_bytes=True) as bar:
+        with progress(kept.stat().st_size, f"sending {shown_name(str(path))}", in_bytes=True) as bar:
             sent = client.send(kept, bar.advance, file_name(name) if name else path.name)
         stored = _stored(client, sent.name)
         say_what_was_deleted(len(recording) - stored, None)

@@ -27,7 +27,7 @@ from tupli_mcap.cli.options import (
 from tupli_mcap.cli.output import counted, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say
 from tupli_mcap.errors import TupliError, bytes_of, no_file
-from tupli_mcap.remote import copied, is_url, path_of, shown
+from tupli_mcap.remote import copied, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
@@ -122,8 +122,8 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
 
     with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
         pushed = push_recording(client, path, name=source, dry_run=dry_run)
-    what = f"{counted(pushed.episodes, 'episode')} of {shown(source)}"
-    names = [pushed.name or shown(source)]
+    what = f"{counted(pushed.episodes, 'episode')} of {shown_name(source)}"
+    names = [pushed.name or shown_name(source)]
     if pushed.was_there:
         return _Pushed(f"already there: {what} at {client.url}", [], names, 0, "")
     it = format_filter(FilterEQ(key="recording", value=pushed.name))
@@ -168,10 +168,10 @@ def _naming(source: str, failed: list[_Failed]) -> Iterator[None]:
     try:
         yield
     except TupliError as err:
-        message = str(err) if shown(source) in str(err) else f"{shown(source)}: {err}"
+        message = str(err) if shown_name(source) in str(err) else f"{shown_name(source)}: {err}"
         if isinstance(err, SignInError | UnreachableError):
             raise type(err)(message) from err
-        failed.append(_Failed(shown(source), message))
+        failed.append(_Failed(shown_name(source), message))
 
 
 def _verb(dry_run: bool) -> str:

@@ -18,7 +18,7 @@ from tupli_mcap.mcap.source import TemporarySource
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.opened import is_finished
-from tupli_mcap.remote import is_cut_cheaper, is_url, shown
+from tupli_mcap.remote import is_cut_cheaper, is_url, shown_name
 from tupli_mcap.storage.api.answers import as_told
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Sent, Tell, send_file
@@ -129,11 +129,11 @@ def _demand_finished(path: Path, name: str) -> None:
     if is_finished(path):
         return
     if is_locked(path):
-        raise RecordingError(f"{shown(name)} is being recorded; send it when its writer has closed it")
+        raise RecordingError(f"{shown_name(name)} is being recorded; send it when its writer has closed it")
     fetch, file = ("download it, ", "FILE") if is_url(name) else ("", shlex.quote(str(path)))
     raise RecordingError(
-        f"{shown(name)} is not finished: its writer was killed, or its end is missing; {fetch}write a finished copy "
-        f"with tupli-mcap recover {file}, and send that"
+        f"{shown_name(name)} is not finished: its writer was killed, or its end is missing; {fetch}write a finished "
+        f"copy with tupli-mcap recover {file}, and send that"
     )
 
 
