@@ -410,6 +410,28 @@ def test_recording_off_and_on(storage: FileStorage) -> None:
     assert len({h.recording for h in headers}) == 1  # the file went on
 
 
+def test_a_reset_is_recorded_as_it_was(storage: FileStorage) -> None:
+    """Though the recorder sees it later, when the environment and the policy have changed what it was given."""
+
+    class Takes(gym.Wrapper[Any, Any, Any, Any]):
+        def reset(
+            self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        ) -> tuple[Any, dict[str, Any]]:
+            return self.env.reset(seed=seed)[0], {"given": (options or {}).pop("level")}
+
+    env = TupliEnvWrapper(Takes(gym.make("CartPole-v1")), storage)
+    state, info = env.reset(seed=0, options={"level": 3})
+    first = state.copy()
+    state[:] = 7
+    info["given"] = 7
+    env.store(name="cart")
+    env.step(0)
+    env.close()
+    (episode,) = Recording(env.recording_path).episodes
+    assert (episode.options, episode.reset_info) == ({"level": 3}, {"given": 3})
+    assert episode.states[0].tolist() == first.tolist()
+
+
 def test_recording_off_accepts_anything(storage: FileStorage) -> None:
     class Odd(gym.Env[Any, Any]):
         observation_space = gym.spaces.Box(-1, 1, (1,))

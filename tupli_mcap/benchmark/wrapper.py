@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,7 +15,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from pydantic import ValidationError
 
-from tupli_mcap import trust as _trust
+from tupli_mcap import jsonvalue, trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
@@ -32,6 +33,11 @@ _RECORDING_OPTIONS = (
     "frames", "frame_format", "image_format", "max_bytes", "max_seconds", "name", "metadata", "tags", "split",
     "capture",
 )  # fmt: skip
+
+
+def _as_recorded(value: Any) -> Any:
+    """A copy of options or an info as a recording gives them back."""
+    return jsonvalue.loads(jsonvalue.dumps_any(value))
 
 
 class DeletedBenchmark(NamedTuple):
@@ -139,12 +145,15 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         if self._recorder is not None:
             return self._recorder.reset(seed=seed, options=options)
         unseeded = seed is None and getattr(self.env.unwrapped, "_np_random", 0) is None
+        told = _as_recorded(options)  # before the environment takes any out
         result = self.env.reset(seed=seed, options=options)
         if unseeded:
             drawn = getattr(self.env.unwrapped, "_np_random_seed", None)
             seed = drawn if isinstance(drawn, int) and drawn >= 0 else None
         before = self._pending if seed is None else []
-        self._pending = [*before, PendingReset(result, seed, options)]
+        # the caller may change them before a recorder sees them
+        kept = deepcopy(result[0]), _as_recorded(result[1])
+        self._pending = [*before, PendingReset(kept, seed, told)]
         return result
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
