@@ -110,6 +110,7 @@ def check(path: Path, taken: list[list[list[tuple[Any, ...]]]]) -> Recording:
                 assert same(step.state, state)
                 assert same(step.action, action)
                 assert (step.reward, step.terminal, step.timeout) == (reward, terminal, timeout)
+                assert step.env == episode[-1].env == episode.env
             assert same(episode.final_state, steps[-1][5])
             assert episode.return_ == pytest.approx(sum(step[2] for step in steps), abs=0)
     assert [e.number for e in recording.episodes] == list(range(len(recording.index)))

@@ -366,7 +366,7 @@ class Episode(GymnasiumNames):
         action = item_getter(layout.action_space, columns.actions)
         reward = reward_getter(layout.reward_space, columns.rewards)
         for i in range(len(columns)):
-            yield Step(
+            step = Step(
                 state(i),
                 action(i),
                 reward(i),
@@ -374,6 +374,8 @@ class Episode(GymnasiumNames):
                 bool(columns.timeouts[i]),
                 None if infos is None else infos[i],
             )
+            step.env = self.env
+            yield step
 
     def __repr__(self) -> str:
         return f"<Episode {self.number}: {plural(len(self), 'step')}, return {self.return_:g}, {self.end}>"
