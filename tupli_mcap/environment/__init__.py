@@ -6,7 +6,7 @@ _pickling                    pickles of environments
 _docs                        names of dimensions and actions"""
 
 from tupli_mcap.environment._build import build, entry_point_name, more_than_data, reasons_for_distrust
-from tupli_mcap.environment._capture import Snapshot, capture, fingerprint, name_of, note, resets_itself
+from tupli_mcap.environment._capture import Snapshot, autoresets_of, capture, fingerprint, name_of, note
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._pickling import rebuild_ezpickled
 from tupli_mcap.environment._record import (
@@ -24,6 +24,7 @@ __all__ = [
     "PICKLE_NAME",
     "EnvironmentRecord",
     "Snapshot",
+    "autoresets_of",
     "build",
     "canonical_json",
     "capture",
@@ -35,6 +36,5 @@ __all__ = [
     "note",
     "reasons_for_distrust",
     "rebuild_ezpickled",
-    "resets_itself",
     "sha256",
 ]

@@ -99,10 +99,10 @@ def fingerprint(env: gym.Env[Any, Any]) -> bytes | None:
         return None
 
 
-def resets_itself(env: gym.Env[Any, Any]) -> bool:
-    """Whether the next step is a reset: `gymnasium.wrappers.Autoreset` is among the wrappers, and what it wraps has
-    ended. An end that comes from a wrapper around it, such as a time limit, makes it reset nothing."""
-    return any(isinstance(layer, gym.wrappers.Autoreset) and layer.autoreset for layer in _layers(env))
+def autoresets_of(env: gym.Env[Any, Any]) -> list[gym.wrappers.Autoreset]:
+    """The `Autoreset` wrappers of an environment. The next step is a reset if `autoreset` of one is true, which is so
+    after an end of what it wraps; an end that comes from a wrapper around it, such as a time limit, resets nothing."""
+    return [layer for layer in _layers(env) if isinstance(layer, gym.wrappers.Autoreset)]
 
 
 class Snapshot:

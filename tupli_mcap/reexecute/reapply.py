@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.environment import resets_itself
+from tupli_mcap.environment import autoresets_of
 from tupli_mcap.errors import TupliError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.episode import item_getter
@@ -94,7 +94,8 @@ class Reexecutor:
         if plan.how == "continues" and self._last is not None:
             return Moment(self._last.state)
         env = self.env
-        if plan.auto and self._last is not None and resets_itself(env):
+        resets_itself = any(layer.autoreset for layer in autoresets_of(env))
+        if plan.auto and resets_itself and self._last is not None:
             try:
                 state, *_ = env.step(self._last_action)  # Autoreset ignores the action after an end
             except (Exception, SystemExit) as err:

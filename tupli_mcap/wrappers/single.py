@@ -12,7 +12,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.environment import resets_itself
+from tupli_mcap.environment import autoresets_of
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
@@ -157,12 +157,11 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         self._parts = (RecordEpisodes._watch, RecordEpisodes._end, RecordEpisodes._go_on)
         self._stepped = True  # so that the callback is reset: another recorder may have used it
         self._state: Any = None
+        self._autoresets = autoresets_of(env)
         self._open(path, options, StepLayout(env.observation_space, env.action_space, reward_space), None)
 
     def _recorder_of(self, writer: RecordingWriter) -> SingleRecorder:
-        recorder = SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)
-        recorder.resets_itself = resets_itself(self.env)
-        return recorder
+        return SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
@@ -195,7 +194,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
                     work.state = DONE
                     return result
                 if self._recorder.step_index and not names_success(result[4]):
-                    self._recorder.resets_itself = resets_itself(self.env)
+                    self._note_autoreset()
                     self._recorder.leave_end(TERMINAL if terminal else TIMEOUT)
                     work.state = DONE
                     return result
@@ -291,11 +290,16 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         _, _, terminal, timeout, info = result
         # the flag of a step that was a reset ends nothing
         if (terminal or timeout) and self._recorder.step_index:
-            self._recorder.resets_itself = resets_itself(self.env)
+            self._note_autoreset()
             self._recorder.metadata = with_success(self._recorder.metadata, info)
             self._recorder.end(TERMINAL if terminal else TIMEOUT)
             self._work.ask(self._reset_callback)
             self._work.ask(self._check_flag, self.path, info)
+
+    def _note_autoreset(self) -> None:
+        """Tells the recorder whether the step after this end is a reset."""
+        if self._autoresets:
+            self._recorder.resets_itself = any(layer.autoreset for layer in self._autoresets)
 
     def _reset_callback(self) -> None:
         self._stepped = False

@@ -255,6 +255,7 @@ class SingleRecorder:
         before._derive_pending()
         self.writer.layout = before.writer.layout
         self.writer.lost_streams = {0}
+        self.resets_itself = before.resets_itself
         if self.resets_itself and before._episode is None:
             self.put = self._continue
             return
