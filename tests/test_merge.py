@@ -32,7 +32,7 @@ from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.dataset.curate import filter_dataset
 from tupli_mcap.mcap.source import PathSource
-from tupli_mcap.recording import rewrite_recording
+from tupli_mcap.recording import annotate_episodes, rewrite_recording, undo_annotation
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -375,6 +375,31 @@ class TestMerge:
         with Recording(tmp_path / "all.mcap") as recording:
             assert len(recording) > before
             assert [e.number for e in recording.episodes] == list(range(len(recording)))
+
+    @pytest.mark.parametrize("parts", [False, True])
+    def test_an_annotation_stays_one(self, tmp_path: Path, parts: bool) -> None:
+        """Also of recordings that took turns, or were parts of one: --undo takes it back from all of its episodes."""
+        paths = [tmp_path / f"{name}.mcap" for name in "ab"]
+        for turn in range(6):
+            record(paths[turn % 2], steps=20, seed=turn, mode="a")
+        for place, note in ((0, {"good": 1}), (1, {"other": 1}), (0, {"oops": 1})):
+            annotate_episodes(paths[place], note)
+        numbers = Recording(paths[0]).index["episode"].tolist()
+        count = len(numbers)
+        if parts:
+            middle = count // 2
+            split_recording(paths.pop(0), tmp_path / "part.mcap", episodes=middle + 1)
+            paths += [tmp_path / "part_0001.mcap", tmp_path / "part.mcap"]
+        merged = merge_recordings(paths, tmp_path / "all.mcap").path
+        assert [next(iter(said.values)) for said in Recording(merged).annotations.said] == [
+            "good",
+            "other",
+            "oops",
+        ]
+        undone = undo_annotation(merged)
+        assert (undone.values, len(undone.episodes)) == ({"oops": 1}, count)
+        assert sum("good" in episode.metadata for episode in open_dataset(merged)) == count
+        assert not any("oops" in episode.metadata for episode in open_dataset(merged))
 
     def test_attachments(self, tmp_path: Path) -> None:
         one = record(tmp_path / "1.mcap", attachments={"a": ("text/plain", b"1"), "c": ("text/plain", b"3")})

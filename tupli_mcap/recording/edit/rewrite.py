@@ -6,12 +6,14 @@ Also what every recording made of others carries: metadata, channels, runs, anno
 from __future__ import annotations
 
 import hashlib
+import heapq
 import itertools
 import json
 import os
 import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,12 @@ from tupli_mcap.errors import FormatError, warn
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.about.annotations import ANNOTATIONS_MEDIA_TYPE, ANNOTATIONS_NAME, Annotations
+from tupli_mcap.recording.about.annotations import (
+    ANNOTATIONS_MEDIA_TYPE,
+    ANNOTATIONS_NAME,
+    Annotation,
+    Annotations,
+)
 from tupli_mcap.recording.about.described import MADE_OF_NAME, MAX_MADE_OF
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.channels import register_channels
@@ -185,7 +192,7 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
     runs: list[Run] = []
     known: dict[str, int] = {}  # by what the files say: names and times of files differ within a run
     places: list[int] = []
-    annotations = []
+    said_of: dict[Recording, list[Annotation]] = {}
     several = len({recording.uuid for recording, _, _ in parts}) > 1  # files whose names are lost
     for recording, rows, shift in parts:
         said_runs = recording.runs if several else recording.recorded_runs.runs
@@ -200,10 +207,11 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
                 runs.append(said_runs[place])
         places += [carried[place] for place in of_episodes]
         kept = set(rows["episode"].tolist())
-        for annotation in recording.annotations.said:
-            numbers = [number + shift for number in annotation.episodes if number in kept]
-            if numbers:
-                annotations.append(annotation._replace(episodes=numbers))
+        said_here = said_of.setdefault(
+            recording, [one._replace(episodes=[]) for one in recording.annotations.said]
+        )
+        for annotation, new in zip(recording.annotations.said, said_here, strict=True):
+            new.episodes.extend(number + shift for number in annotation.episodes if number in kept)
     spans = [(len(list(same)), place) for place, same in itertools.groupby(places)]
     found = {}
     if runs and runs != [Run()]:
@@ -213,8 +221,21 @@ def carry_runs(parts: Sequence[tuple[Recording, Array, int]]) -> dict[str, tuple
         edits = [(place, was) for place, was in edited if place is not None]
         written = RecordedRuns(runs, spans if len(runs) > 1 else (), edits)
         found[RUN_NAME] = (RUN_MEDIA_TYPE, written.to_json())
+    annotations = _in_turn(said_of.values())
     if annotations:
         found[ANNOTATIONS_NAME] = (ANNOTATIONS_MEDIA_TYPE, Annotations(annotations).to_json())
+    return found
+
+
+def _in_turn(lists: Iterable[Sequence[Annotation]]) -> list[Annotation]:
+    """The annotations of several recordings that still have episodes, in the order of their times, for the last one is
+    the one that is taken back. One that several recordings have, parts of one, stays one."""
+    found: list[Annotation] = []
+    for one in heapq.merge(*lists, key=attrgetter("at")):
+        if found and one._replace(episodes=found[-1].episodes) == found[-1]:
+            found[-1].episodes.extend(one.episodes)
+        elif one.episodes:
+            found.append(one)
     return found
 
 
