@@ -571,6 +571,18 @@ class TestFilter:
             assert kept.uuid == recording.uuid
             assert (report.episodes, report.left_out) == (len(numbers), len(recording) - len(numbers))
 
+    def test_an_annotation_of_others_stays_behind(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "a.mcap")
+        annotate_episodes(path, {"note": "private"}, [0])
+        copies = [
+            open_dataset(path)[1:].save(tmp_path / "some.mcap"),
+            open_dataset(path)[1:].trim(slice(1), tmp_path / "trimmed.mcap"),
+            *(part.path for part in split_recording(path, tmp_path / "part.mcap", episodes=1)[1:3]),
+        ]
+        for copy in copies:
+            assert list(Recording(copy).annotations.said) == []
+            assert b"private" not in copy.read_bytes()
+
     @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
     def test_chunks_before_the_first_change_are_copied(self, tmp_path: Path, compression: str) -> None:
         path = record(tmp_path / "run.mcap", steps=400, compression=compression)
