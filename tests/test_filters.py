@@ -627,6 +627,7 @@ class TestTimes:
             (F("terminated") == 1, "'terminated' is true or false: expected such a value, found 1"),
             (F("end") > 1, "'end' is a text: expected such a value, found 1"),
             (F("end") == "terminated", "'end' is terminal, timeout or interrupted, found 'terminated'"),
+            (F("end").contains("lost"), "'end' is terminal, timeout or interrupted, found 'lost'"),
             (
                 F("end") > "terminal",
                 r"'end' has no order: expected ==, != or in, found F\(.end.\) > 'terminal'",
@@ -661,6 +662,14 @@ class TestTimes:
             compile_predicate(filter, EpisodeHeader)
         with pytest.raises(FilterError, match=message), Catalog(None) as catalog:
             catalog.count((F("n_tuples") > 0) & ~filter)
+
+    def test_a_part_of_an_end(self) -> None:
+        rows = [
+            base_row({}, i) | {"end": end} for i, end in enumerate(("terminal", "timeout", "interrupted"))
+        ]
+        headers = [header_of(i, row) for i, row in enumerate(rows)]
+        found = [compile_predicate('end ~ "TERM"', EpisodeHeader)(header) for header in headers]
+        assert found == [True, False, False]
 
     def test_dates_are_about_times(self) -> None:
         for value in (datetime.date(2026, 11, 21), datetime.datetime(2026, 11, 21)):

@@ -195,7 +195,8 @@ def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
             raise FilterError(f"nan is equal to nothing; {key} <= inf is true of all numbers")
         if not _may_be(kinds, scalar, ordered):
             raise FilterError(f"{key} is {_one_of(kinds)}: expected such a value, found {value!r:.60}")
-        if name == "end" and not ordered and value not in _ENDS:
+        part_of_one = filter.type is FilterType.CONTAINS and any(value.lower() in end for end in _ENDS)
+        if name == "end" and not ordered and value not in _ENDS and not part_of_one:
             raise FilterError(f"{key} is terminal, timeout or interrupted, found {value!r:.60}")
     if name == "end" and ordered:
         raise FilterError(f"{key} has no order: expected ==, != or in, found {filter!r:.80}")
