@@ -628,6 +628,8 @@ def test_numbers_that_mean_nothing(dataset: TupliDataset) -> None:
         SamplingError, match="expected at least 2000000 items for one full batch in each rank"
     ):
         StreamDataset(windows, 1_000_000, seed=0, drop_last=True, rank=0, ranks=2)
+    with pytest.raises(SamplingError, match="expected at least one item for each of 10000000 ranks, found"):
+        StreamDataset(windows, 1, seed=0, rank=0, ranks=10_000_000)
     with pytest.raises(SamplingError, match="expected rank and ranks, or neither of them, found rank=1"):
         StreamDataset(windows, 4, seed=0, rank=1)
     with pytest.raises(SamplingError, match="expected a rank from 0 to 1, found 2"):

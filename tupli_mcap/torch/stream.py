@@ -73,6 +73,10 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
         self._drawn: tuple[int, int] | None = None  # a worker's seed, and its number of passes
         self._loaded: dict[str, Any] | None = None
         self._state = self._state_of(None, 0)
+        if not len(self) and not drop_last:
+            raise SamplingError(
+                f"expected at least one item for each of {self._ranks} ranks, found {len(items)}; take fewer ranks"
+            )
         if not len(self):
             raise SamplingError(
                 f"expected at least {self._size * self._ranks} items for one full batch in each rank, found "
