@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.server
 import json
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -116,6 +117,25 @@ def test_what_is_no_server_of_this_version_is_one_error(
                 ask()
         with pytest.raises(TupliError, match="is it a tupli-mcap server"):
             client.push(tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "why"),
+    [
+        ("http_proxy", "ftp://u:secret@127.0.0.1:9", "proxies of the environment .* Unknown scheme"),
+        ("no_proxy", "[::1],127.0.0.0/8", "proxies of the environment .* Invalid port"),
+        ("SSL_CERT_FILE", "/nowhere.pem", "authorities .PEM. in /nowhere.pem .SSL_CERT_FILE.: No such file"),
+    ],
+)
+def test_an_environment_without_a_way_to_a_server(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, why: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    done = CliRunner().invoke(app, ["whoami", "--url", "http://127.0.0.1:9"])
+    assert done.exit_code == 1
+    assert re.match(f"error: (the|expected certificates of) {why}", done.stderr)
+    assert "secret" not in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path) -> None:

@@ -49,6 +49,7 @@ class Session:
 
     Raises:
         StorageError: the address is not that of a web server.
+            Or the proxies or authorities that the environment names cannot be used.
         MissingExtraError: httpx is not installed.
     """
 
@@ -68,7 +69,20 @@ class Session:
 
         logging.getLogger("httpx").addFilter(_NO_TICKETS)  # added twice, it is there once
         timeout = httpx.Timeout(TIMEOUT, connect=_CONNECT_TIMEOUT)
-        client = httpx.Client(base_url=self.url, timeout=timeout, headers={"Accept": "application/json"})
+        accept = {"Accept": "application/json"}
+        try:
+            client = httpx.Client(base_url=self.url, timeout=timeout, headers=accept)
+        except OSError as err:
+            authorities = os.environ.get("SSL_CERT_FILE") or os.environ.get("SSL_CERT_DIR")
+            raise StorageError(
+                f"expected certificates of authorities (PEM) in {authorities} (SSL_CERT_FILE): "
+                f"{err.strerror or err}; correct or unset it"
+            ) from err
+        except (ImportError, ValueError, httpx.InvalidURL) as err:
+            raise StorageError(
+                "the proxies of the environment (HTTP_PROXY, HTTPS_PROXY, ALL_PROXY, NO_PROXY) cannot be used: "
+                f"{shown(str(err)).rstrip('.')}; correct or unset them"
+            ) from err
         weakref.finalize(self, client.close)
         return client
 
