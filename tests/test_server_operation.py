@@ -125,6 +125,19 @@ def test_who_is_sending_may_finish_when_the_server_stops(tmp_path: Path, recordi
             assert {header.recording for header in admin.list_episodes()} == {name}
 
 
+def test_a_certificate_that_is_none(tmp_path: Path) -> None:
+    _, key = certificate(tmp_path)
+    for workers in ("1", "2"):
+        command = [COMMAND, "serve", str(tmp_path / "b"), "--port", "0", "--workers", workers]
+        command += ["--certificate", str(key), "--key", str(key)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert done.stderr.startswith(
+            f"error: expected a certificate in {key} and its key in {key}, both in PEM: "
+        )
+        assert done.stderr.count("\n") == 1
+
+
 def test_an_address_that_is_taken(tmp_path: Path) -> None:
     with served(tmp_path / "served") as server:
         command = [COMMAND, "serve", str(tmp_path / "b"), "--port", str(server.port)]

@@ -8,6 +8,7 @@ import gc
 import os
 import shutil
 import socket
+import ssl
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,11 +44,12 @@ class Listening:
 
 
 def run(settings: Settings, listening: Listening, tell: Callable[[str, str | None], None]) -> None:
-    """Serves until a signal stops the process; finishes running requests. StorageError if the directory, its database
-    or the address cannot be used.
+    """Serves until a signal stops the process; finishes running requests. StorageError if the directory, its database,
+    the certificate or the address cannot be used.
 
     tell: called with the address, and the admin's password if it is new and random (else None).
     """
+    _check_certificate(listening)
     with _bound(listening) as bound:
         library = Library(settings)
         try:
@@ -103,6 +105,18 @@ def _application(settings: Settings) -> FastAPI:
     app = create_app(Library(settings))
     gc.freeze()  # modules and routes are no garbage: looking at them again and again takes long
     return app
+
+
+def _check_certificate(listening: Listening) -> None:
+    if listening.certificate is None:
+        return
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(listening.certificate, listening.key)
+    except OSError as err:
+        raise StorageError(
+            f"expected a certificate in {listening.certificate} and its key in {listening.key}, both in PEM: "
+            f"{err.strerror or err}"
+        ) from err
 
 
 def _bound(listening: Listening) -> socket.socket:
