@@ -1112,6 +1112,17 @@ def test_an_image_whose_values_stray_is_an_array(tmp_path: Path) -> None:
     check_against(tmp_path / "r.mcap", taken)
 
 
+@pytest.mark.parametrize(("side", "name"), [("observation", "state"), ("action", "action")])
+def test_a_space_that_is_none(tmp_path: Path, side: str, name: str) -> None:
+    env = Scripted(lambda step: step, spaces.Discrete(99))
+    setattr(env, f"{side}_space", None)
+    with pytest.raises(
+        SpaceError, match=f"{name}: expected a space of Gymnasium itself, found builtins.NoneType"
+    ):
+        RecordEpisodes(env, tmp_path / "r.mcap")
+    assert not list(tmp_path.iterdir())
+
+
 def test_infos_that_are_mappings_and_no_dicts(tmp_path: Path) -> None:
     class Told(gym.Wrapper[Any, Any, Any, Any]):
         def reset(self, **options: Any) -> tuple[Any, Any]:

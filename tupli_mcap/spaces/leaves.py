@@ -152,8 +152,9 @@ def flatten_space(
         elif type(space) in CONSTANT:
             yield _constant_leaf(space, keys, root, names.take(name), images)
         else:
+            kind = type(space)
             raise SpaceError(
-                f"{path}: expected a space of Gymnasium itself, found {type(space).__qualname__}; "
+                f"{path}: expected a space of Gymnasium itself, found {kind.__module__}.{kind.__qualname__}; "
                 "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction) with a function "
                 "that makes a value of Gymnasium's own of it, and the space of such values"
             )
@@ -191,7 +192,9 @@ def own_space(space: gym.Space[Any]) -> gym.Space[Any]:
         if all(one is sub for (_, one), (_, sub) in zip(own, parts, strict=True)):
             return space
         return spaces.Dict(own) if type(space) is spaces.Dict else spaces.Tuple([sub for _, sub in own])
-    if type(space) in _VARIABLE or space.shape is not None or space.dtype is None or space.dtype.kind != "U":
+    if type(space) in _VARIABLE or not isinstance(space, gym.Space) or space.shape is not None:
+        return space
+    if space.dtype is None or space.dtype.kind != "U":
         return space
     return spaces.Text(4096, min_length=0, charset=string.printable)
 
