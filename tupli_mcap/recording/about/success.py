@@ -13,7 +13,7 @@ from tupli_mcap.schema.success import KEYS as KEYS, success_of as success_of
 
 def names_success(info: Any) -> bool:
     """Whether an info has a key of `KEYS`."""
-    return isinstance(info, Mapping) and any(key in info for key in KEYS)
+    return bool(info) and isinstance(info, Mapping) and any(key in info for key in KEYS)
 
 
 class FlagCheck:

@@ -48,8 +48,8 @@ class Session:
     A token in the environment (TUPLI_MCAP_TOKEN) takes precedence over stored ones.
 
     Raises:
-        StorageError: the address is not that of a web server.
-            Or the proxies or authorities that the environment names cannot be used.
+        StorageError: the address is not that of a web server, or the proxies or authorities that the environment names
+            cannot be used.
         MissingExtraError: httpx is not installed.
     """
 
