@@ -286,6 +286,27 @@ class TestRecord:
         with Recording("a.mcap") as recording:
             assert recording.n_steps == 9
 
+    @pytest.mark.parametrize("envs", [1, 2])
+    def test_environments_that_cannot_be_closed(self, here: Path, envs: int) -> None:
+        name = f"sticking_{envs}"
+        Path(f"{name}.py").write_text(
+            "import gymnasium as gym\n"
+            "from gymnasium.envs.classic_control import CartPoleEnv\n"
+            "class Stuck(CartPoleEnv):\n    def close(self):\n        raise RuntimeError('no window')\n"
+            f"gym.register('Stuck{envs}-v0', Stuck)\n"
+            "def act(state):\n    raise KeyError('left')\n"
+        )
+        args = ("record", f"{name}:Stuck{envs}-v0", "--num-envs", envs, "--steps", 10)
+        told = "a.mcap is finished, but the environment failed when it was closed: RuntimeError: no window"
+        done = run(*args, "-o", "a.mcap")
+        assert (done.code, done.err) == (0, f"warning: {told}\n")
+        with Recording("a.mcap") as recording:
+            assert recording.n_steps == 10
+        done = run(*args, "-o", "b.mcap", "--policy", f"{name}:act")
+        assert done.code == 1
+        assert "error: the policy or the environment failed at step 0: KeyError: 'left'" in done.err
+        assert not Path("b.mcap").exists()
+
     def test_environments_that_cannot_be_made(self, here: Path) -> None:
         line = fails("record", "NoSuchEnvironment-v0", "-o", "a.mcap")
         assert line.startswith("the environment 'NoSuchEnvironment-v0' cannot be made: NameNotFound: ")

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import RecordingError, TupliError, brief
+from tupli_mcap.errors import RecordingError, TupliError, brief, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import spread_of
 from tupli_mcap.recording.write.options import RENDER_MODE, Mode, RecordOptions
@@ -87,15 +87,14 @@ def record_rollouts(
     began = time.perf_counter()
     asked = RecordOptions(**options)
     report = _every(max(1, (steps or 100 * _REPORTS) // _REPORTS), progress)
-    with contextlib.closing(_make(env_id, num_envs, RENDER_MODE if asked.every else None)) as made:
-        is_vector = isinstance(made, gym.vector.VectorEnv)
-        wrapped: Any = (RecordVectorEpisodes if is_vector else RecordEpisodes)(made, path, **options)
-        known = wrapped._writer.index.count
-        try:
-            with _closing(wrapped, asked.mode):
-                done = (_run_vector if is_vector else _run)(wrapped, limit, seed, policy, report)
-        except KeyboardInterrupt as err:
-            raise KeyboardInterrupt(*wrapped.paths) from err
+    wrapped = _recorder(_make(env_id, num_envs, RENDER_MODE if asked.every else None), path, options)
+    known = wrapped._writer.index.count
+    try:
+        with _closing(wrapped, asked.mode):
+            run: Any = _run if isinstance(wrapped, RecordEpisodes) else _run_vector
+            done = run(wrapped, limit, seed, policy, report)
+    except KeyboardInterrupt as err:
+        raise KeyboardInterrupt(*wrapped.paths) from err
     return _summary(wrapped.paths, known, done, time.perf_counter() - began)
 
 
@@ -146,17 +145,43 @@ def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:
         raise RecordingError(f"the environment {env_id!r} cannot be made: {brief(err)}") from err
 
 
+def _recorder(
+    env: Any, path: str | os.PathLike[str], options: dict[str, Any]
+) -> RecordEpisodes | RecordVectorEpisodes:
+    """The recorder of an environment, which is closed if it cannot be recorded."""
+    try:
+        if isinstance(env, gym.vector.VectorEnv):
+            return RecordVectorEpisodes(env, path, **options)
+        return RecordEpisodes(env, path, **options)
+    except BaseException:
+        with contextlib.suppress(Exception, SystemExit):
+            env.close()
+        raise
+
+
 @contextlib.contextmanager
 def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator[None]:
     """Closes a wrapper after the block. A new file without steps is removed, so that the next try does not find it."""
     try:
-        with contextlib.closing(env):
+        try:
             yield
+        finally:
+            _close(env)
     except BaseException:
         with contextlib.suppress(TupliError, OSError):
             if mode == "x" and not len(_returns(env.path)):
                 env.path.unlink()
         raise
+
+
+def _close(env: RecordEpisodes | RecordVectorEpisodes) -> None:
+    """Closes a wrapper; warns if the environment fails at that, for its recording is finished then."""
+    try:
+        env.close()
+    except (TupliError, OSError):
+        raise
+    except (Exception, SystemExit) as err:  # noqa: BLE001 - an environment may raise anything
+        warn(f"{env.path} is finished, but the environment failed when it was closed: {brief(err)}")
 
 
 class _Limit:
