@@ -634,3 +634,17 @@ def test_an_environment_of_the_other_kind_is_told_its_class(tmp_path: Path) -> N
     ):
         RecordSingle(many, tmp_path / "a.mcap")  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
+
+
+def test_an_environment_without_the_spaces_of_one_is_told_so(tmp_path: Path) -> None:
+    """As SuperSuit's are."""
+
+    class Bare(gym.vector.VectorEnv[Any, Any, Any]):
+        num_envs = 2
+        observation_space = action_space = spaces.Discrete(2)
+
+    with pytest.raises(
+        RecordingError, match="a vector environment with single_observation_space, found Bare"
+    ):
+        RecordEpisodes(Bare(), tmp_path / "r.mcap")
+    assert not list(tmp_path.iterdir())

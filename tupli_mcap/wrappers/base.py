@@ -232,9 +232,16 @@ def drawn_seed(env: gym.Env[Any, Any]) -> int | None:
 
 
 def check_kind(env: object, *, vector: bool) -> None:
-    """Raises RecordingError unless an environment is Gymnasium's, and single or a vector one as expected."""
+    """Raises RecordingError unless an environment is Gymnasium's, and single or a vector one as expected; the latter
+    must say the spaces of one sub-environment."""
     if not isinstance(env, gym.vector.VectorEnv if vector else gym.Env):
         raise wrong_kind(env, "a vector environment" if vector else "a single environment")
+    for name in ("single_observation_space", "single_action_space") if vector else ():
+        if not hasattr(env, name):
+            raise RecordingError(
+                f"expected a vector environment with {name}, found {type(env).__name__} without; "
+                "set it to the space of one sub-environment"
+            )
 
 
 def wrong_kind(env: object, expected: str) -> RecordingError:
