@@ -992,6 +992,7 @@ class TestFileStorage(StorageContract):
         assert storage.list_benchmarks(F("metadata.name") == "pole") == []
         assert storage.store_benchmark(query("pole")).metadata.name == "cart pole, windy"
         storage.bundle(header.id, tmp_path / "b.mcap")
+        assert preview_import(None, tmp_path / "b.mcap").name == "cart pole, windy"
         other = FileStorage(tmp_path / "other")
         assert other.import_bundle(tmp_path / "b.mcap") == header.id
         assert other.load_benchmark(header.id).metadata == edited.metadata

@@ -117,7 +117,7 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
             say_what_was_deleted(deleted, storage.root)
         return ImportPreview(
             benchmark_id=carried.benchmark_id,
-            name="" if carried.query is None else carried.query.metadata.name,
+            name=carried.name,
             episodes=len(recording) - len(left_out),
             new_episodes=len(missing),
             artifacts=len(carried.needed),
@@ -131,11 +131,13 @@ class _Carried(NamedTuple):
 
     Attributes:
         digest: of its environment.
+        name: of its benchmark, as it was last renamed.
         needed: the ids of the artifacts that its benchmark needs, of which the file carries `artifacts`.
     """
 
     digest: str = ""
     benchmark_id: str = ""
+    name: str = ""
     query: BenchmarkQuery | None = None
     needed: Sequence[str] = ()
     artifacts: Sequence[tuple[bytes, ArtifactMetadata]] = ()
@@ -145,7 +147,8 @@ class _Carried(NamedTuple):
         if recording.benchmark_id:
             record, header, query = carried_benchmark(recording, path)
             artifacts = carried_artifacts(recording, record, path, storage)
-            return cls(record.digest, header.id, query, artifacts_of(record, str(path)), artifacts)
+            needed = artifacts_of(record, str(path))
+            return cls(record.digest, header.id, header.metadata.name, query, needed, artifacts)
         has_environment = DOCUMENT_NAME in recording.attachments
         return cls(carried_environment(recording, path).digest) if has_environment else cls()
 
