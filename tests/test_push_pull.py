@@ -807,6 +807,18 @@ def test_push_of_a_directory_without_recordings_says_so(admin: TupliAPIClient, t
     )
 
 
+def test_a_recording_whose_episodes_are_all_deleted_is_not_sent(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.mcap"
+    record_rollouts("CartPole-v1", path, steps=5, seed=1)
+    run("delete", path, "--filter", "steps > 0")
+    for dry in (["--dry-run"], []):
+        result = CliRunner().invoke(app, ["push", str(path), *dry])
+        assert (result.exit_code, result.stdout) == (1, "")
+        assert f"found none in {path}; tupli-mcap restore {path} brings deleted ones back" in result.stderr
+
+
 def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "lab" / "run.mcap"
     path.parent.mkdir()

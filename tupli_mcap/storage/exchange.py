@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import NotFoundError, StorageError, did_you_mean, plural, warn
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, did_you_mean, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -233,11 +234,18 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
     `name`: its path or URL, where `path` is a copy.
 
     Raises:
-        RecordingError: the recording is not finished; nothing was sent.
+        RecordingError: the recording is not finished, or has no episodes; nothing was sent.
         FormatError: the file is damaged.
         StorageError: the server refuses it: its benchmark is neither stored there nor in the file.
     """
     with without_deleted(path, name) as kept, Recording(kept) as recording:
+        if not len(recording):
+            hint = (
+                ""
+                if kept == path
+                else f"; tupli-mcap restore {shlex.quote(str(path))} brings deleted ones back"
+            )
+            raise RecordingError(f"expected episodes to send, found none in {shown(name or str(path))}{hint}")
         if recording.benchmark_id and DOCUMENT_NAME in recording.attachments:
             _send_carried(client, recording, path, dry_run=dry_run)
         if dry_run:
