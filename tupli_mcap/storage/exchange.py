@@ -245,7 +245,9 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
                 if kept == path
                 else f"; tupli-mcap restore {shlex.quote(str(path))} brings deleted ones back"
             )
-            raise RecordingError(f"expected episodes to send, found none in {shown(name or str(path))}{hint}")
+            raise RecordingError(
+                f"expected episodes to send, found none in {shown_name(name or str(path))}{hint}"
+            )
         if recording.benchmark_id and DOCUMENT_NAME in recording.attachments:
             _send_carried(client, recording, path, dry_run=dry_run)
         if dry_run:
