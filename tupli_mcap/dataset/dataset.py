@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -564,7 +565,7 @@ class Dataset(RandomAccess):
             found |= self._stats[name] if name in images else part_of(field, part, self._stats[field])
         for key in keys:
             found |= self._stats[f"info.{key}"]
-        return ColumnDict(found)
+        return ColumnDict(copy.deepcopy(found))  # the caller may change the arrays
 
     # ---- out
 
