@@ -32,7 +32,7 @@ from typer.testing import CliRunner
 from web_server import WebServer, serving
 
 import tupli_mcap
-from tupli_mcap import EpisodeData, Recording, RecordingError, TupliDataset, write_recording
+from tupli_mcap import EpisodeData, EpisodeWriter, Recording, RecordingError, TupliDataset, write_recording
 from tupli_mcap.cli import app
 from tupli_mcap.dataset.items import Windows, steps_of
 from tupli_mcap.remote import copied, matching, objects, plan, shown, source
@@ -311,6 +311,24 @@ def test_windows_of_a_server_without_ranges_go_into_other_processes(server: WebS
         pytest.raises(RecordingError, match="has been changed since it was opened"),
     ):
         pickle.loads(copied)
+
+
+def test_many_files_of_a_server_without_ranges(server: WebServer, tmp_path: Path) -> None:
+    """Each of them is open; the limit that was set can be raised."""
+    server.ranges = False
+    for i in range(100):
+        with EpisodeWriter(tmp_path / f"{i}.mcap", spaces.Discrete(2), spaces.Discrete(2)) as writer:
+            writer.begin()
+            writer.step(0, 1, 1.0)
+        server.files[f"/{i}.mcap"] = (tmp_path / f"{i}.mcap").read_bytes()
+    code = (
+        "import resource, sys, tupli_mcap\n"
+        "limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (80, limit))\n"
+        "assert len(tupli_mcap.open(sys.argv[1:]).windows(1)) == 100\n"
+    )
+    urls = [server.url(f"/{i}.mcap") for i in range(100)]
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code, *urls], check=True, timeout=120)
 
 
 def test_windows_of_a_file_object_cannot_be_pickled(large: Path) -> None:

@@ -241,6 +241,7 @@ class FileSource(_Checked):
         self._process = os.getpid()
         # a system file is read at offsets, not at its cursor, which forked children share
         self._fd = file.fileno() if _is_system_file(file) else -1
+        _leave_room(self._fd)
         try:
             self.size = file.seek(0, os.SEEK_END)
         except (OSError, ValueError, AttributeError) as err:
