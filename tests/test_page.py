@@ -328,6 +328,8 @@ class TestChosen:
         ids = [episode["id"] for episode in best]
         assert {e["id"] for e in told(web, "/compare", episode=ids)["episodes"]} == set(ids)
         text = web.get("/compare", params={"episode": ids}).text
+        (as_json,) = re.findall(r'href="([^"]*)">This page as JSON<', text)
+        assert {e["id"] for e in web.get(f"/compare{html.unescape(as_json)}").json()["episodes"]} == set(ids)
         assert text.count('class="line s2"') == len(["reward", "so far", "action", "4 states"]) + 3
         assert web.get("/compare", params={"episode": ids[:1]}).status_code == 400
         assert web.get("/compare", params={"episode": [*ids, "0" * 32 + "-1"]}).status_code == 404

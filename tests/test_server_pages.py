@@ -578,6 +578,7 @@ class TestPeople:
                     kept |= f'value="{value}" selected' in answer.text
                     assert kept == (name not in ("password", "code")), (address, name)
                 assert "wrong words" not in answer.text
+                assert "This page as JSON" not in answer.text  # which has no address of its own
             admin.post("/group/delete", data={"code": own, "name": "kept"})
 
     def test_pages_with_codes_are_not_kept(self, server: str) -> None:

@@ -14,6 +14,7 @@ from fastapi.responses import RedirectResponse
 from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.convertors import PathConvertor, register_url_convertor
+from starlette.datastructures import QueryParams
 from starlette.exceptions import HTTPException
 
 import tupli_mcap
@@ -102,7 +103,8 @@ def page(
     if _wants_json(request):
         return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
     drawn |= {"request": request, "shelf": shelf, "facts": facts}
-    drawn |= {"here": request.url.path, "params": request.query_params}
+    got = request.method in ("GET", "HEAD")  # what a form has led to has no address
+    drawn |= {"here": request.url.path, "params": request.query_params, "got": got}
     made = _templates().get_template(template).render(drawn)
     # A text of a file may hold characters that UTF-8 cannot encode (lone surrogates).
     return Response(made.encode("utf-8", "replace"), status, media_type="text/html")
@@ -121,6 +123,12 @@ def address(*path: object, **params: Any) -> str:
     )
     query = urlencode(given, doseq=True, errors="surrogatepass")
     return "/" + "/".join(parts) + (f"?{query}" if query else "")
+
+
+def _same_query(params: QueryParams, **changes: str) -> str:
+    """A query with some parameters changed; others may be there several times."""
+    kept = [(key, value) for key, value in params.multi_items() if key not in changes]
+    return urlencode([*kept, *changes.items()], errors="surrogatepass")
 
 
 def _size(given: int | None) -> str:
@@ -145,7 +153,7 @@ def _templates() -> Environment:
         "address": address,
         "metadata_key": lambda key: join_key(["metadata", key]),
         "recording_filter": lambda name: format_filter(FilterEQ(key="recording", value=name)),
-        "same_query": lambda params, **changes: urlencode({**params, **changes}, errors="surrogatepass"),
+        "same_query": _same_query,
         "version": tupli_mcap.__version__,
     }
     return made
