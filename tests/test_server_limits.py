@@ -292,6 +292,14 @@ def test_an_upload_that_fills_the_disk_is_deleted(small_disk: Path, tmp_path: Pa
         assert len(admin.list_episodes()) == 1
 
 
+def test_files_of_the_server_are_not_named_to_clients(tmp_path: Path) -> None:
+    with server_with(tmp_path) as admin:
+        (tmp_path / "artifacts").write_text("no directory")
+        with pytest.raises(StorageError, match="the server cannot reach what it keeps things in") as failed:
+            admin.store_artifact(b"weights", ArtifactMetadata(name="weights"))
+        assert str(tmp_path) not in str(failed.value)
+
+
 def test_a_full_disk_is_named_and_keeps_nobody_from_reading(small_disk: Path) -> None:
     ballast = small_disk / "ballast"
     with server_with(small_disk) as admin:

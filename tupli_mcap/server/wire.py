@@ -197,6 +197,8 @@ def _as_json(value: Any) -> Any:
 def told(err: TupliError) -> tuple[int, str]:
     """The status and the message of an error. Failures of the server are logged."""
     kind = next((kind for kind in type(err).__mro__ if kind in _STATUS), None)
+    if kind is StorageError and isinstance(err.__cause__, OSError):  # it names a file of the server
+        kind = UnavailableError
     status = 500 if kind is None else _STATUS[kind]
     if status >= 500 and kind is not FullError:
         why = {} if kind is None else {"error": str(err)}  # about the server; others may quote the request
