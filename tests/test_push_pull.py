@@ -372,6 +372,21 @@ def test_publish_only_the_episodes_that_match(admin: TupliAPIClient, tmp_path: P
     assert admin.count_episodes(seen) == 0 and len(admin.list_benchmarks(seen)) == 1
 
 
+def test_episodes_of_a_hidden_benchmark_cannot_be_pulled(admin: TupliAPIClient, tmp_path: Path) -> None:
+    uri = fill(tmp_path / "lab")
+    run("push", tmp_path / "lab")
+    advice = f"the benchmark is not published in global: tupli-mcap publish {uri[:8]}\n"
+    published = CliRunner().invoke(app, ["publish", "--filter", "episode < 2"])
+    assert (published.exit_code, published.stderr.endswith(advice)) == (0, True)
+    bob = signed_in(admin, "bob")
+    with FileStorage(tmp_path / "bob") as mine, pytest.warns(UserWarning, match="ask admin to publish it$"):
+        assert copy_episodes(bob, mine, F("episode") < 2) == {}
+    admin.login("admin", PASSWORD)
+    admin.publish_benchmark(uri)
+    again = CliRunner().invoke(app, ["publish", "--filter", "episode < 2"])
+    assert (again.exit_code, again.stderr) == (0, "")
+
+
 def test_episodes_without_a_benchmark_are_published_by_a_filter(
     admin: TupliAPIClient, tmp_path: Path
 ) -> None:

@@ -100,7 +100,9 @@ def _copy(
             if uri == benchmark_id:
                 raise
             # somebody has published the episodes without their benchmark, which must not keep the others away
-            warn(f"not copied: {plural(len(headers), 'episode')}: {err}")
+            of_user = isinstance(source, TupliAPIClient) and headers
+            hint = f"; ask {headers[0].created_by} to publish it" if of_user else ""
+            warn(f"not copied: {plural(len(headers), 'episode')}: {err}{hint}")
             continue
         held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
         absent = [header for header in headers if header.id not in held]
@@ -338,11 +340,18 @@ def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str,
 
 
 def publish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
-    """Makes the caller's episodes that match a filter visible to a group; returns their number.
-    StorageError if there are none."""
+    """Makes the caller's episodes that match a filter visible to a group; returns their number. A warning counts those
+    whose benchmark the group does not see. StorageError if there are none."""
     episodes = _show(client, group, chosen, dry_run=dry_run)
     if not episodes:
         raise StorageError("no episode of yours matches; what others recorded, only they can publish")
+    hidden = [one.id for one in client.list_benchmarks() if {group, "global"}.isdisjoint(one.published_in)]
+    count = client.count_episodes(_own(client, chosen) & FilterIN(key="benchmark_id", value=hidden))
+    if count:
+        warn(
+            f"{plural(count, 'episode')} of these cannot be pulled by others, as the benchmark is not published in "
+            f"{group}: tupli-mcap publish {hidden[0][:8] if len(hidden) == 1 else 'BENCHMARK_ID'}"
+        )
     return episodes
 
 
