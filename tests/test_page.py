@@ -110,6 +110,10 @@ class TestDatasets:
         assert told(web, "/", q="hopper")["datasets"] == []
         assert "No dataset matches" in web.get("/?q=hopper").text
 
+    def test_there_is_no_page_after_the_last(self, web: httpx.Client) -> None:
+        answer = web.get("/", params={"page": 2})
+        assert answer.status_code == 404 and "there is no page 2 of datasets" in answer.text
+
     def test_a_dataset_opens_with_an_episode(self, web: httpx.Client) -> None:
         facts = told(web, "/dataset/CartPole-v1", show="best")
         best = told(web, "/episodes", dataset="CartPole-v1", sort="-return")["episodes"][0]

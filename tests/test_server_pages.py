@@ -156,6 +156,8 @@ class TestSigningIn:
             session = client.cookies[COOKIE]
             assert client.post("/sign-out", data={"code": code(client)}).status_code == 303
             assert client.get("/account").status_code == 303
+            late = client.post("/account/password", data={"code": "", "old": "x", "new": "y"})
+            assert late.status_code == 401 and '<a href="/sign-in">Sign in</a>' in late.text
         with httpx.Client(base_url=server, cookies={COOKIE: session}) as thief:
             assert thief.get("/account").status_code == 303
 

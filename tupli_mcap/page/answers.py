@@ -177,9 +177,8 @@ def error_page(request: Request, err: Exception) -> Response:
         return _with_headers(RedirectResponse(address("sign-in", next=here), 303))
     status, text = _told(request, err)
     title, shelf = _TITLES.get(status, "This did not work"), getattr(request.state, "shelf", None)
-    return _with_headers(
-        page(request, "error.html", {"error": text}, status=status, shelf=shelf, title=title)
-    )
+    drawn = {"title": title, "may_sign_in": isinstance(err, SignInNeededError)}
+    return _with_headers(page(request, "error.html", {"error": text}, status=status, shelf=shelf, **drawn))
 
 
 def _told(request: Request, err: Exception) -> tuple[int, str]:

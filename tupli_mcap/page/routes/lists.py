@@ -14,7 +14,7 @@ from markupsafe import Markup
 from sqlalchemy import Connection, func, select
 
 from tupli_mcap.dataset.keys import check_metadata
-from tupli_mcap.errors import FilterError
+from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
 from tupli_mcap.page.copies import MOST_COMPARED
@@ -74,6 +74,8 @@ def datasets(
     chosen = [dataset for dataset in found if dataset.holds(q.lower().split())]
     first = (number - 1) * _DATASETS
     shown = chosen[first : first + _DATASETS]
+    if first and not shown:
+        raise NotFoundError(f"there is no page {number} of datasets")
     facts = {
         "datasets": [dataset.facts() for dataset in shown],
         "count": len(chosen),
