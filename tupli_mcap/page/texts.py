@@ -22,7 +22,7 @@ def number(value: float | None) -> str:
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
+        return "∞" if value > 0 else "\N{MINUS SIGN}∞"
     if abs(value) < 1e15 and float(value).is_integer():
         return f"{int(value):,}".replace("-", "\N{MINUS SIGN}")
     shown = f"{value:.4g}" if abs(value) < 9999.5 or abs(value) >= 1e7 else f"{value:,.0f}"
