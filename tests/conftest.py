@@ -3,6 +3,7 @@ no width of a terminal, even if pytest runs in one."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import itertools
@@ -19,6 +20,9 @@ import httpx
 import pytest
 import typer.testing
 from hypothesis import settings
+
+with contextlib.suppress(ImportError):  # `view` hides it from pyarrow, in processes that have not imported it
+    import pandas  # noqa: F401
 
 if TYPE_CHECKING:
     from between import Between
