@@ -185,6 +185,13 @@ def test_without_a_token_nothing_is_shown(users: Users) -> None:
 @ONE
 @BOTH
 def test_a_token_that_may_read_changes_nothing(users: Users) -> None:
+    made = users.admin._session.ask("POST", "/v1/api-tokens", {"name": "laptop", "scope": "read"})
+    token = {"Authorization": f"Bearer {made['token']}"}
+    for path in ("/v1/users", "/access/users/create"):  # for which even the rights of an admin do not count
+        told = {"username": f"of{path.count('/')}", "password": "long enough"}
+        refused = httpx.post(users.url + path, headers=token, json=told)
+        assert (refused.status_code, "may only read" in refused.text) == (403, True), path
+    users.admin._session.ask("DELETE", f"/v1/api-tokens/{made['id']}")
     made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "laptop", "scope": "read"})
     token = {"Authorization": f"Bearer {made['token']}"}
     for method, path in routes(users.url):

@@ -10,7 +10,7 @@ from pydantic import BaseModel, FailFast, Field
 from tupli_mcap.schema import Group, Right, UserRole
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.routes.callers import Address, AnyCaller, Person, Reader, Served, Writer
+from tupli_mcap.server.routes.callers import Address, Newcomer, Person, Reader, Served, Writer
 from tupli_mcap.server.wire import Asked
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
@@ -124,7 +124,7 @@ def who_am_i(library: Served, caller: Reader) -> Me:
 
 
 @router.post("/users")
-def create_user(library: Served, caller: AnyCaller, address: Address, told: Credentials) -> User:
+def create_user(library: Served, caller: Newcomer, address: Address, told: Credentials) -> User:
     """Creates a user. Everybody may if the server is open to sign-ups; else it takes the right `user_create`."""
     library.create_user(caller, told.username, told.password, address)
     with library.database.reading() as connection:

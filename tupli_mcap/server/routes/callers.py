@@ -89,6 +89,16 @@ async def _writer(caller: AnyCaller) -> Caller:
 Writer = Annotated[Caller, Depends(_writer)]
 
 
+async def _newcomer(caller: AnyCaller) -> Caller:
+    if not caller.is_guest:
+        demand_writing(caller)
+    return caller
+
+
+Newcomer = Annotated[Caller, Depends(_newcomer)]
+"""A user whose token may write, or a guest, who may sign up where the server lets everybody."""
+
+
 def no_machine(caller: Caller) -> Caller:
     """The same caller. Raises DeniedError for a token for machines."""
     if caller.is_machine:

@@ -41,7 +41,7 @@ from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import Turns
 from tupli_mcap.server.routes.accounts import Credentials, list_roles
 from tupli_mcap.server.routes.bodies import BODY, body_of
-from tupli_mcap.server.routes.callers import Address, AnyCaller, Reader, Served, demand_writing, no_machine
+from tupli_mcap.server.routes.callers import Address, Newcomer, Reader, Served, demand_writing, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.tables import AUDIT, CLAIM
@@ -115,7 +115,7 @@ def _user(name: str, held: dict[str, list[str]]) -> dict[str, Any]:
 
 
 @router.post("/access/users/create")
-def create_user(library: Served, caller: AnyCaller, address: Address, told: Credentials) -> dict[str, Any]:
+def create_user(library: Served, caller: Newcomer, address: Address, told: Credentials) -> dict[str, Any]:
     """Makes a user."""
     library.create_user(caller, told.username, told.password, address)
     with library.database.reading() as connection:
