@@ -147,6 +147,15 @@ def test_pages_show_what_was_stored_first(lab: Lab) -> None:
         assert [each["created_by"] for each in table] == ["ann"] * 3
 
 
+def test_a_dataset_with_the_same_recording_of_two_users_shows_an_episode(lab: Lab) -> None:
+    lab.eve.send(lab.whole)  # instead of the forgery, so that it sorts before that of ann, which is shown
+    with Browser(lab.url, "bob") as browser:
+        for show in ("newest", "best", "worst"):
+            told = browser.client.get("/dataset/-", params={"format": "json", "show": show}).json()
+            assert told["episode"] in lab.ids
+        assert browser.client.get("/cover/-").status_code == 200
+
+
 def test_a_pull_brings_what_was_stored_first(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

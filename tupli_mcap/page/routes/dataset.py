@@ -100,19 +100,20 @@ def _look(shelf: Shelf, header: EpisodeHeader) -> Seen | None:
 def shown_first(shelf: Shelf, connection: Connection, dataset: Dataset, show: str) -> EpisodeHeader | None:
     """The newest episode, or the one with the highest or the lowest return."""
     known = [item for item in dataset.recordings if show == "newest" or item.return_most is not None]
-    if not known:
-        return None
     if show == "newest":
-        chosen = max(known, key=lambda item: item.last)
+        known.sort(key=lambda item: -item.last)
         order = Sort("ended", descending=True)
     elif show == "best":
-        chosen = max(known, key=lambda item: item.return_most or 0.0)
+        known.sort(key=lambda item: -(item.return_most or 0.0))
         order = Sort("return", descending=True)
     else:
-        chosen = min(known, key=lambda item: item.return_least or 0.0)
+        known.sort(key=lambda item: item.return_least or 0.0)
         order = Sort("return")
-    seen = seen_in(shelf, connection, dataset.key, of_recording(chosen.recording))
-    return next(find_episodes(connection, None, limit=1, sort=order, **seen), None)
+    for item in known:  # all episodes of one may be copies of others that are shown instead
+        seen = seen_in(shelf, connection, dataset.key, of_recording(item.recording))
+        for header in find_episodes(connection, None, limit=1, sort=order, **seen):
+            return header
+    return None
 
 
 def _ends(values: Array) -> str:
