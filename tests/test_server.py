@@ -363,6 +363,22 @@ def test_the_same_content_of_two_users(users: Users, things: Things) -> None:
     assert users.ann.load_benchmark(things.benchmark).created_by == "ann"
 
 
+def test_who_may_delete_hides_the_same_content_of_all(users: Users, things: Things) -> None:
+    users.bob.store_artifact(b"wind", ArtifactMetadata(name="my wind"))
+    users.bob.store_benchmark(query(artifacts=(things.artifact,)))
+    for user in (users.ann, users.bob):
+        user.publish_benchmark(things.benchmark)
+        user.publish_artifact(things.artifact)
+    users.eve.store_artifact(b"wind", ArtifactMetadata(name="private"))
+    users.admin.store_artifact(b"wind", ArtifactMetadata(name="private"))  # its own one is not in that group
+    users.admin.unpublish_benchmark(things.benchmark, "global")
+    users.admin.unpublish_artifact(things.artifact, "global")
+    assert users.eve.list_benchmarks() == []
+    assert [item.created_by for item in users.eve.list_artifacts()] == ["eve"]
+    users.eve.delete_artifact(things.artifact)
+    assert users.eve.list_artifacts() == []
+
+
 # --- names, passwords, tokens ---
 
 

@@ -177,16 +177,19 @@ class Items:
         audit(connection, caller.name, f"publish_{kind}", f"{uri} in {group}")
 
     def unpublish(self, connection: Connection, caller: Caller, kind: Kind, uri: str, group: str) -> None:
-        """Hides an item from a group. The owner may, and whoever has the right to delete in that group."""
-        for row in self._visible(connection, caller, kind, uri):
+        """Hides an item from a group. The owner may; whoever has the right to delete in that group hides all readable
+        ones of this id."""
+        may = caller.may(_DELETE[kind], group)
+        visible = self._visible(connection, caller, kind, uri)
+        rows = [row for row in visible if may or row.created_by == caller.name]
+        if not rows:
+            self._find(connection, caller, kind, uri)
+            raise DeniedError(f"Insufficient permissions in group: {group}. Required: {_DELETE[kind]}")
+        for row in rows:
             groups = json.loads(row.published_in)
-            if row.created_by == caller.name or caller.may(_DELETE[kind], group):
-                if group in groups:
-                    self._set_audience(connection, row, [name for name in groups if name != group])
-                    audit(connection, caller.name, f"unpublish_{kind}", f"{uri} from {group}")
-                return
-        self._find(connection, caller, kind, uri)
-        raise DeniedError(f"Insufficient permissions in group: {group}. Required: {_DELETE[kind]}")
+            if group in groups:
+                self._set_audience(connection, row, [name for name in groups if name != group])
+                audit(connection, caller.name, f"unpublish_{kind}", f"{uri} from {group}")
 
     def _set_audience(self, connection: Connection, row: Row[Any], groups: list[str]) -> None:
         text = audience(connection, groups)
