@@ -1321,6 +1321,21 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     assert path.read_bytes() == before  # what is refused changes nothing
 
 
+def test_an_append_that_was_killed_leaves_nothing_that_looks_damaged(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 1, name="one")
+    annotate_episodes(path, {"good": True})
+    for name in ("two", "three"):
+        if (pid := os.fork()) == 0:
+            env = RecordEpisodes(gym.make("CartPole-v1"), path, mode="a", name=name)
+            env.reset(seed=1)
+            env.step(1)
+            os.kill(os.getpid(), signal.SIGKILL)
+        os.waitpid(pid, 0)
+        record(path, 0, mode="a")  # finishes it
+    assert [problem.message for problem in verify_recording(path).problems] == []
+    assert [episode.run.name for episode in Recording(path).episodes] == ["one", "two", "three"]
+
+
 def test_a_damaged_run_does_not_keep_anybody_from_appending(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", 1)
     add_attachments(path, {"run.json": ("application/json", b"no JSON")})

@@ -367,5 +367,7 @@ class Structure:
 
 
 def _ordered(opcode: int, records: list[Any]) -> list[Any]:
-    """The records, definitions sorted by id: the summary may have these in another order."""
+    """The records, definitions sorted by id and attachments by place: the summary may have these in another order."""
+    if opcode == Opcode.ATTACHMENT_INDEX:
+        return sorted(records, key=lambda r: r.offset)
     return sorted(records, key=lambda r: r.id) if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else records

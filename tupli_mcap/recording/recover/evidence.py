@@ -332,6 +332,7 @@ def _take_next(evidence: Evidence, record: Found) -> bool:
     if record.attachment is not None:
         if record.attachment.name == INDEX_NAME:
             return False
+        evidence.attachments.pop(record.attachment.name, None)  # the summary lists them as they lie
         evidence.attachments[record.attachment.name] = record.attachment
         return True
     if record.opcode not in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
