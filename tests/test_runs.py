@@ -1321,6 +1321,20 @@ def test_a_recording_that_is_appended_to_has_each_run(tmp_path: Path) -> None:
     assert path.read_bytes() == before  # what is refused changes nothing
 
 
+@pytest.mark.parametrize(
+    ("given", "names"), [({"name": "two", "metadata": {"lr": 2}}, ["r", "r", "two"]), ({}, ["r", "r", "r"])]
+)
+def test_what_is_appended_says_nothing_of_episodes_without_a_run(
+    given: dict[str, Any], names: list[str], tmp_path: Path
+) -> None:
+    path = record(tmp_path / "r.mcap", 2, capture="none")
+    record(path, 1, mode="a", **given)
+    dataset = tupli_mcap.open(path)
+    assert [episode.run.name for episode in dataset] == names
+    assert [bool(episode.run.command) for episode in dataset] == [False, False, "two" in names]
+    assert verify_recording(path).ok
+
+
 def test_an_append_that_was_killed_leaves_nothing_that_looks_damaged(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", 1, name="one")
     annotate_episodes(path, {"good": True})

@@ -164,12 +164,13 @@ class RecordedRuns(NamedTuple):
     def followed_by(self, run: Run, episodes: int) -> Self:
         """These runs of so many episodes, and the one that begins now.
 
-        It goes on with the last one if it is of the same environment, and the user gives it the same name, metadata,
-        tags and split, or none of them.
+        It goes on with the last one if it is of the same environment, where both are known, and the user gives it the
+        same name, metadata, tags and split, or none of them.
         """
         last, earlier = self.runs[-1], [was for place, was in self.before if place == len(self.runs) - 1]
         known = [_given(each) for each in (Run(), last, *earlier)]
-        if _given(run) in known and run.environment in ("", last.environment):
+        alike = run.environment == last.environment or not (run.environment and last.environment)
+        if alike and _given(run) in known:
             return self
         places = itertools.groupby(self.places(episodes))
         spans = [(len(list(same)), place) for place, same in places]

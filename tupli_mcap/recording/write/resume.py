@@ -17,7 +17,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import Topics, parse
-from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns
+from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
 from tupli_mcap.recording.index import IndexBuilder
@@ -80,6 +80,8 @@ def resume(
     # The two halves of an environment: one that was lost is not made up for by half of another environment.
     parts = {DOCUMENT_NAME, PICKLE_NAME}
     known |= parts if known & parts else set()
+    if episodes.count:  # the run that begins now says nothing of these
+        known.add(RUN_NAME)
     arriving = {name: a for name, a in given.items() if name not in known} | runs
     steps = step_channels(container.channels, source.name)
     if not steps:
@@ -173,13 +175,15 @@ def _check_aligned(path: Path, contents: Contents) -> None:
 def _more_runs(
     attachments: Mapping[str, tuple[str, bytes]], contents: Contents, source: Source, episodes: int
 ) -> dict[str, tuple[str, bytes]]:
-    """`run.json` with the run that begins now, behind some episodes; empty if it goes on with the last one, or the file
-    has none, or a damaged one."""
+    """`run.json` with the run that begins now, behind some episodes; empty if it goes on with the last one, or the one
+    that is there is damaged. Episodes of a file without one are of a run of which nothing is known."""
     given, recorded = attachments.get(RUN_NAME), contents.attachments.get(RUN_NAME)
-    if given is None or recorded is None:
+    if given is None or not (recorded or episodes):
         return {}
+    earlier = RecordedRuns([Run()])
     try:
-        earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{source.name}: {RUN_NAME}")
+        if recorded is not None:
+            earlier = RecordedRuns.from_json(read_attachment(source, recorded), f"{source.name}: {RUN_NAME}")
     except FormatError:
         return {}
     run = RecordedRuns.from_json(given[1], RUN_NAME).runs[-1]
