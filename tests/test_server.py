@@ -9,6 +9,7 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,8 @@ import httpx
 import jwt
 import numpy as np
 import pytest
+from pwdlib import PasswordHash
+from pwdlib.hashers.argon2 import Argon2Hasher
 from serving import PASSWORD, serving
 from test_storage import episode, query
 from typer.testing import CliRunner
@@ -34,6 +37,9 @@ from tupli_mcap.schema import (
     UserRole,
     format_filter,
 )
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people.tokens import SignInError as EndedError
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 from tupli_mcap.storage.api.answers import SignInError
@@ -431,6 +437,40 @@ def test_a_new_password_ends_every_sign_in(users: Users) -> None:
     assert users.ann.whoami().username == "ann"
 
 
+@pytest.mark.parametrize("ending", ["new password", "deletion"])
+def test_nothing_overtakes_the_end_of_a_sign_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    """A request that was let in before, and is done afterwards, leaves nothing with which one is signed in."""
+    slow = PasswordHash((Argon2Hasher(time_cost=60, memory_cost=19 << 10, parallelism=1),))
+    monkeypatch.setattr(accounts, "_HASHES", slow)
+    library = Library(Settings(tmp_path))
+    hashed = [accounts.hash_password(password, 8) for password in ("the old one", "the new one")]
+    with library.database.writing() as connection:
+        accounts.create_user(connection, "ann", hashed[0])
+        ann = accounts.caller_named(connection, "ann")
+    assert ann is not None
+    with ThreadPoolExecutor() as pool:
+        begun = [
+            pool.submit(library.sign_in, "ann", "the old one", "127.0.0.1"),
+            pool.submit(library.change_password, ann, "ann", "a third one", old="the old one"),
+        ]
+        time.sleep(0.1)
+        with library.database.writing() as connection:
+            if ending == "deletion":
+                accounts.delete_user(connection, "ann")
+            else:
+                accounts.change_password(connection, "ann", hashed[1])
+        for each in begun:
+            with pytest.raises((EndedError, NotFoundError)):
+                each.result()
+    with library.database.writing() as connection:
+        with pytest.raises(EndedError, match="this sign-in has ended"):
+            library.tokens.create_api_token(connection, ann, "robot", "write", None)
+        assert accounts.verify_password(connection, "ann", "the new one") == (ending == "new password")
+    library.close()
+
+
 def test_a_refresh_token_that_is_used_twice_ends_the_sign_in(users: Users) -> None:
     pair = httpx.post(f"{users.url}/v1/tokens", json={"username": "ann", "password": "ann-password"}).json()
     told = {"refresh_token": pair["refresh_token"]}
@@ -608,6 +648,25 @@ def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch
             with pytest.raises(StorageError, match="guests may change nothing .* sign in"):
                 guest.store_artifact(b"x", ArtifactMetadata(name="x"))
         admin.close()
+
+
+def test_a_ticket_of_a_deleted_user_is_not_that_of_a_guest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving(Settings(tmp_path / "served", guests=True)) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        admin.signup("ann", "ann-password")
+        ann = client(url, "ann", tmp_path, monkeypatch)
+        made = admin.record_episodes([episode(admin.store_benchmark(query()).id)])
+        admin.publish_episode(made[0].id)
+        paths = [ann._session.ask("POST", "/v1/query/tickets", {})["path"]]
+        paths += [ann._session.ask("POST", "/v1/tickets", {"recording": made[0].recording})["path"]]
+        guest = httpx.post(f"{url}/v1/query/tickets", json={}).json()["path"]
+        admin.delete_user("ann")
+        assert [httpx.get(url + path).status_code for path in paths] == [401, 401]
+        assert httpx.get(url + guest).status_code == 200
+        admin.close()
+        ann.close()
 
 
 def test_a_sign_in_that_has_ended_makes_no_guest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

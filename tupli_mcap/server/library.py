@@ -144,11 +144,12 @@ class Library:
         most = {f"{username[:80]} at {address}": _MOST_OF_A_USER, address: _MOST_OF_AN_ADDRESS}
         with self.database.reading() as connection:
             limits.demand_few_failures(connection, most)
+            epoch = accounts.epoch_of(connection, username)
             right = accounts.verify_password(connection, username, password)
         with self.database.writing() as connection:
             limits.note_attempt(connection, most, failed=not right)
             if right:
-                return self.tokens.pair(connection, username)
+                return self.tokens.pair(connection, username, epoch=epoch)
         raise SignInError("Incorrect username or password")
 
     def create_user(self, caller: Caller, name: str, password: str, address: str) -> None:
@@ -170,7 +171,7 @@ class Library:
 
         Raises:
             DeniedError: it is another user, and the caller lacks the right, or a right of theirs.
-            SignInError: `old` is not the password.
+            SignInError: `old` is not the password, or not any more.
             TooManyError: it was wrong too often.
             StorageError: the new one is not valid.
             NotFoundError: there is no such user.
@@ -187,6 +188,8 @@ class Library:
             limits.note_attempt(connection, most, failed=not right)
             if right:
                 accounts.demand_over(connection, caller, name)
+                if name == caller.name and accounts.epoch_of(connection, name) != caller.epoch:
+                    raise SignInError("the password was changed at the same time; sign in again")
                 accounts.change_password(connection, name, hashed)
                 audit(connection, caller.name, "change_password", name)
         if not right:

@@ -74,6 +74,12 @@ def verify_password(connection: Connection, name: str, password: str) -> bool:
     return valid and found is not None
 
 
+def epoch_of(connection: Connection, name: str) -> int | None:
+    """How often a user's password was changed; None if there is no such user."""
+    epoch: int | None = connection.execute(select(USER.c.epoch).where(USER.c.name == name)).scalar()
+    return epoch
+
+
 def change_password(connection: Connection, name: str, hashed: str) -> None:
     """Changes a user's password to one of this hash, and ends all sign-ins and tokens of the user. NotFoundError if
     there is no such user."""

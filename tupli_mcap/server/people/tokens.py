@@ -23,8 +23,8 @@ from sqlalchemy import Connection, delete, func, insert, or_, select, update
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
 from tupli_mcap.server.database import audit
-from tupli_mcap.server.people.access import Caller
-from tupli_mcap.server.people.accounts import caller_named, guest
+from tupli_mcap.server.people.access import GUEST, Caller
+from tupli_mcap.server.people.accounts import caller_named, epoch_of, guest
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import API_TOKEN, REFRESH_TOKEN, USER
 
@@ -45,9 +45,18 @@ class Tokens:
         self._settings = settings
         self._secret = _secret(settings.secret)
 
-    def pair(self, connection: Connection, user: str, family: str = "") -> dict[str, Any]:
-        """An access token and the refresh token for the next, as OAuth 2 names them."""
-        epoch = connection.execute(select(USER.c.epoch).where(USER.c.name == user)).scalar_one()
+    def pair(
+        self, connection: Connection, user: str, family: str = "", *, epoch: int | None = None
+    ) -> dict[str, Any]:
+        """An access token and the refresh token for the next, as OAuth 2 names them.
+
+        epoch: that of the password which was checked before; SignInError if the user has another one by now, or is
+        deleted.
+        """
+        now = epoch_of(connection, user)
+        if now is None or epoch not in (None, now):
+            raise SignInError("Incorrect username or password")
+        epoch = now
         refresh = secrets.token_urlsafe(32)
         now = int(time.time())
         connection.execute(delete(REFRESH_TOKEN).where(REFRESH_TOKEN.c.expires < now))
@@ -120,9 +129,12 @@ class Tokens:
     def create_api_token(
         self, connection: Connection, caller: Caller, name: str, scope: str, days: int | None
     ) -> dict[str, Any]:
-        """A new token for a machine: its listed fields, and the `token` itself, which is not stored."""
+        """A new token for a machine: its listed fields, and the `token` itself, which is not stored. SignInError if the
+        caller has a new password by now, or is deleted."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
+        if epoch_of(connection, caller.name) != caller.epoch:  # a new password revokes a token that is just being made
+            raise SignInError("this sign-in has ended; sign in again")
         if days is not None and not 1 <= days <= _MOST_DAYS:
             raise StorageError(
                 f"expected 1 to {_MOST_DAYS} days, found {days}; make another token after them"
@@ -164,10 +176,12 @@ class Tokens:
         """The caller who was given a ticket, and what it opens. SignInError if it is not valid, has expired, or was
         revoked."""
         told = self._told(ticket, "ticket")
-        found = caller_named(connection, told["sub"]) or guest(connection)
-        if not found.is_guest:
+        if told["sub"] == GUEST:
+            return guest(connection), told
+        found = caller_named(connection, told["sub"])
+        if found is not None:
             found = found._replace(sign_in=str(told.get("by", "")))
-        if told.get("epoch") != found.epoch or not (found.is_guest or _lasts(connection, found)):
+        if found is None or told.get("epoch") != found.epoch or not _lasts(connection, found):
             raise SignInError("the ticket is not valid any more")
         return found, told
 
