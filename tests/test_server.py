@@ -369,6 +369,15 @@ def test_the_same_content_of_two_users(users: Users, things: Things) -> None:
     assert users.ann.load_benchmark(things.benchmark).created_by == "ann"
 
 
+def test_who_deletes_an_artifact_is_not_told_of_private_benchmarks(users: Users, things: Things) -> None:
+    users.ann.publish_artifact(things.artifact)
+    with pytest.raises(StorageError, match="is needed by a private benchmark of its owner") as failed:
+        users.admin.delete_artifact(things.artifact)
+    assert things.benchmark not in str(failed.value)
+    with pytest.raises(StorageError, match=f"is needed by benchmark {things.benchmark}"):
+        users.ann.delete_artifact(things.artifact)
+
+
 def test_who_may_delete_hides_the_same_content_of_all(users: Users, things: Things) -> None:
     users.bob.store_artifact(b"wind", ArtifactMetadata(name="my wind"))
     users.bob.store_benchmark(query(artifacts=(things.artifact,)))

@@ -133,7 +133,9 @@ class Tokens:
         caller has a new password by now, or is deleted."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
-        if epoch_of(connection, caller.name) != caller.epoch:  # a new password revokes a token that is just being made
+        if (
+            epoch_of(connection, caller.name) != caller.epoch
+        ):  # a new password revokes a token that is just being made
             raise SignInError("this sign-in has ended; sign in again")
         if days is not None and not 1 <= days <= _MOST_DAYS:
             raise StorageError(

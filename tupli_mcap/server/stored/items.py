@@ -147,10 +147,10 @@ class Items:
             )
             users = [row.id for row in connection.execute(of_owners) if uri in json.loads(row.needs)]
             if users:
-                raise StorageError(
-                    f"artifact {uri} is needed by benchmark {', '.join(users)}; delete that first, "
-                    "or pass force=True"
-                )
+                seen = {row.id for row in self._readable(connection, caller, "benchmark")}
+                known = [user for user in users if user in seen]
+                by = f"benchmark {', '.join(known)}" if known else "a private benchmark of its owner"
+                raise StorageError(f"artifact {uri} is needed by {by}; delete that first, or pass force=True")
         self._delete(connection, caller, "artifact", uri)
 
     # --- both ---
