@@ -16,7 +16,7 @@ import pytest
 from persons import Person, cart_benchmark
 from serving import ENGINES, serving, settings_of
 
-from tupli_mcap import Recording
+from tupli_mcap import Recording, merge_recordings
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -260,3 +260,22 @@ def test_lists_and_queries_give_what_may_be_read(lab: Lab, tmp_path: Path) -> No
             asker = Person(lab.url) if guest_of_ticket else person
             (source,) = asker.ask("GET", path)["sources"]
             assert numbers_in(asker.call("GET", f"/v1/{source['url']}"), file) == numbers, (reader, path)
+
+
+def test_runs_of_which_nothing_may_be_read_are_not_named(lab: Lab, tmp_path: Path) -> None:
+    """Of a merged recording, of which one run is published."""
+    for name in ("untold", "told"):
+        record_rollouts(
+            "CartPole-v1", tmp_path / f"{name}.mcap", steps=40, seed=3, name=name, tags=[f"tag-{name}"]
+        )
+    merge_recordings([tmp_path / "untold.mcap", tmp_path / "told.mcap"], tmp_path / "both.mcap")
+    lab.ann.send((tmp_path / "both.mcap").read_bytes())
+    wanted = {"filter": 'run.name = "told"', "group": "global"}
+    assert lab.ann.ask("POST", "/v1/episodes/publish", wanted)["episodes"] > 0
+    for reader, runs in (("guest", ["told"]), ("user", ["told"]), ("ann", ["untold", "told"])):
+        person = lab.ann if reader == "ann" else lab.people[reader]
+        (file,) = person.ask("GET", "/dataset/CartPole-v1?format=json")["files"]
+        assert [run["name"] for run in file["runs"]] == runs
+        assert ("tag-untold" in person.call("GET", "/dataset/CartPole-v1").text) == (reader == "ann")
+        found = person.ask("GET", "/?format=json&q=tag-untold")["count"]
+        assert found == (reader == "ann")

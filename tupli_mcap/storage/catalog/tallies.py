@@ -10,6 +10,7 @@ from sqlalchemy import (
     ColumnElement,
     Connection,
     Float,
+    and_,
     case,
     cast,
     delete,
@@ -39,7 +40,7 @@ class Tally(NamedTuple):
             sum is NaN if some are too large and others too small to be added.
         told, succeeded: number of episodes that say whether they succeeded, and of those that did.
         first, last: when the first and the last of them ended (ns since 1970, UTC).
-        runs: of the episodes, as `EpisodeHeader.run`.
+        runs: of the visible episodes, as `EpisodeHeader.run`; if all are visible, also those of deleted ones.
     """
 
     recording: str
@@ -125,16 +126,27 @@ def tallies(
         func.max(TALLY.c.last),
     ]
     query = (
-        select(RECORDING.c.path, count, *recording, *sums)
+        select(RECORDING.c.path, RECORDING.c.id, count, *recording, *sums)
         .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
         .where(true() if seen is None else seen, true() if of is None else of)
         .group_by(RECORDING.c.id)
         .order_by(RECORDING.c.path)
     )
-    for path, most, uuid, benchmark_id, environment, size, mixed, runs, *summed in connection.execute(query):
+    found = connection.execute(query).all()
+    for path, number, most, uuid, benchmark_id, environment, size, mixed, text, *summed in found:
         counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
         named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
         if counts[4] is not None and counts[4] <= -_LARGE and counts[5] >= _LARGE:
             counts[3] = math.nan
-        seen_size = size if counts[0] == int(most) else None
-        yield Tally(*named, seen_size, mixed, jsonvalue.loads(runs), *counts)
+        runs, whole = jsonvalue.loads(text), counts[0] == int(most)
+        if not whole and len(runs) > 1:
+            runs = [runs[place] for place in _runs_seen(connection, number, seen)]
+        yield Tally(*named, size if whole else None, mixed, runs, *counts)
+
+
+def _runs_seen(connection: Connection, recording_id: int, seen: ColumnElement[bool] | None) -> list[int]:
+    """The places of the runs of which some episodes are visible, among those of their recording."""
+    same = [TALLY.c[name] == EPISODE.c[name] for name in ("recording_id", "created_by", "published_in")]
+    query = select(EPISODE.c.run).distinct().join(TALLY, and_(*same)).order_by(EPISODE.c.run)
+    visible = true() if seen is None else seen
+    return list(connection.execute(query.where(episodes_of(recording_id, EPISODE.c.id), visible)).scalars())
