@@ -11,11 +11,13 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 import numpy as np
 import pytest
 from gymnasium import spaces
+from persons import Person
 from test_schemas import validator
 from test_server import Things, Users, things, token_of, users
 from waiting import wait_for
@@ -290,3 +292,26 @@ def test_the_server_cuts_where_ranges_bring_much_more(
 ) -> None:
     assert is_cut_cheaper(range(wanted), episodes, size) == cut
     assert not is_cut_cheaper(None, episodes, size)
+
+
+def test_a_part_is_cut_without_the_episodes_of_other_parts(users: Users, tmp_path: Path) -> None:
+    """As the server keeps them of a recording that goes on."""
+    whole = short_episodes(tmp_path / "whole.mcap", 6, 0)
+    with Recording(whole) as recording:
+        halves = [
+            b"".join(stream_excerpts(contextlib.nullcontext([Excerpt(recording, recording.index[some])])))
+            for some in (slice(0, 3), slice(3, 6))
+        ]
+    ann = Person(users.url, "ann", "ann-password")
+    names = [ann.send(half) for half in halves]
+    gone = ann.ask("POST", "/v1/episodes/list", {"filter": "episode = 4"})["items"][0]
+    assert gone["recording"] == names[1]
+    ann.ask("DELETE", f"/v1/episodes/{gone['id']}")
+    (source,) = ann.ask("GET", "/v1/manifest", params={"recording": names[1]})["sources"]
+    for answer in (
+        ann.call("GET", f"/v1/files/{quote(names[1])}"),
+        ann.call("POST", "/v1/query", {"recordings": [names[1]]}),
+        ann.call("GET", f"/v1/{source['url']}"),
+    ):
+        with kept(answer, tmp_path / "cut.mcap") as cut:
+            assert cut.index["episode"].tolist() == [3, 5]

@@ -85,7 +85,7 @@ def count_episodes(connection: Connection, caller: Caller, filter: BaseFilter | 
 
 def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     """The file of a recording. NotFoundError if there is none of which the caller may read an episode."""
-    for each in names_of(name):
+    for each in dict.fromkeys((name, whole_name(name))):  # the part may have been replaced
         found = connection.execute(select(FILE).where(FILE.c.path == escape_text(each))).first()
         if found is not None:
             seen = count_episodes(connection, caller, FilterEQ(key="recording", value=each))
@@ -96,9 +96,14 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     raise NotFoundError(f"there is no recording {name[:200]!r}")
 
 
-def names_of(name: str) -> list[str]:
-    """The names under which a recording may be found: its own, and that of the recording that has replaced it."""
-    return list(dict.fromkeys((name, whole_name(name))))
+def name_now(connection: Connection, caller: Caller, name: str) -> str:
+    """The name of a recording, or that of the whole one which has replaced this part."""
+    if whole_name(name) == name:
+        return name
+    try:
+        return file_of(connection, caller, name).name
+    except NotFoundError:
+        return name
 
 
 def whole_name(name: str) -> str:

@@ -74,8 +74,8 @@ def select_episodes(
         ids = [header.id for header in items.list_benchmarks(connection, caller, query.benchmark_filter)]
         wanted.append(FilterIN(key="benchmark_id", value=ids))
     if query.recordings is not None:
-        names = [each for name in query.recordings for each in episodes.names_of(name)]
-        wanted.append(FilterIN(key="recording", value=names))
+        names = {episodes.name_now(connection, caller, name) for name in query.recordings}
+        wanted.append(FilterIN(key="recording", value=sorted(names)))
     meant = reduce(and_, wanted) if wanted else None
     numbers: dict[str, list[int]] = {}
     kept = None if query.episodes is None else frozenset(query.episodes)
