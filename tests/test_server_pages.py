@@ -99,6 +99,16 @@ def episodes_of(client: httpx.Client, **params: Any) -> list[dict[str, Any]]:
     return found
 
 
+def test_a_browser_keeps_pictures_for_one_sign_in(server: str) -> None:
+    with browser(server, "ann") as client:
+        for address in ("/cover/CartPole-v1", "/cover/-"):
+            kept = client.get(address).raise_for_status().headers
+            assert kept["cache-control"] == "private, max-age=3600"
+            assert "Cookie" in kept["vary"]
+    with browser(server, "bob") as client:
+        assert client.get("/cover/CartPole-v1").status_code == 404
+
+
 def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:
     for path in ("/nope", "/episodes/nope"):
         page = httpx.get(server + path, headers={"Accept": "text/html"})

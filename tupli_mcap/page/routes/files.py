@@ -26,7 +26,8 @@ _MOST_CURVES = 5
 _DRAWING = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 }
-_KEPT = {"Cache-Control": "private, max-age=3600"}
+# Not for who signs in next in the same browser.
+_KEPT = {"Cache-Control": "private, max-age=3600", "Vary": "Cookie"}
 
 
 @router.get("/static/{name}")
