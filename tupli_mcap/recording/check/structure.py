@@ -178,8 +178,10 @@ class Structure:
             if metadata.name in (RECORDING_METADATA, REPEATED_METADATA):
                 if self._crc(metadata.metadata, RECORDING_KEYS, "metadata", record.offset):
                     check_version(metadata.metadata, self._source.name)
-                self._said = self._said or metadata.metadata
-                if metadata.metadata != self._said:
+                # a recording of the first writers has `crc` only in what was repeated when it was changed
+                said = {key: value for key, value in metadata.metadata.items() if key != "crc"}
+                self._said = self._said or said
+                if said != self._said:
                     self._error(
                         "metadata", f"expected what {RECORDING_METADATA!r} says", offset=record.offset
                     )
