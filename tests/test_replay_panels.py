@@ -368,6 +368,37 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     assert sides[~np.isnan(sides)].tolist() == [-2, -4, -6, -8, -10] * 2
 
 
+@pytest.mark.parametrize("rare", range(10))
+def test_an_info_that_only_one_of_ten_episodes_has(tmp_path: Path, rare: int) -> None:
+    steps = 0
+
+    def info(step: int) -> dict[str, Any]:
+        nonlocal steps
+        steps += 1
+        return {"rare": step} if (steps - 1) // 10 == rare else {}
+
+    found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), 100, record_info=True)
+    assert found.rows("/info/rare", "step") == list(range(11 * rare, 11 * rare + 10))
+
+
+@pytest.mark.parametrize("form", ["joined", "compare"])
+def test_what_only_the_second_recording_has_is_shown(tmp_path: Path, form: Any) -> None:
+    pytest.importorskip("PIL")
+    paths = [tmp_path / "plain.mcap", tmp_path / "filmed.mcap"]
+    for path in paths:
+        env = gym.make("CartPole-v1", render_mode="rgb_array", max_episode_steps=3)
+        filmed = path.stem == "filmed"
+        callback = (lambda step: {"speed": 2.0}) if filmed else None
+        with RecordEpisodes(env, path, frames=filmed, step_callback=callback) as recorder:
+            recorder.reset(seed=0)
+            for _ in range(3):
+                recorder.step(0)
+    found = Rrd(viewer.save(paths, tmp_path / "both.rrd", form=form))
+    root, first = ("", 4) if form == "joined" else ("/filmed_0", 0)
+    assert found.rows(f"{root}/camera/render", "step") == list(range(first, first + 4))
+    assert found.rows(f"{root}/info/speed", "step") == list(range(first, first + 3))
+
+
 def test_infos_whose_keys_are_no_texts(tmp_path: Path) -> None:
     def info(step: int) -> dict[Any, Any]:
         return {0: step / 2, "x": 1.0, 7: "said", (1, 2): np.zeros(17)}

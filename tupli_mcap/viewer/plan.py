@@ -200,7 +200,7 @@ def _alike(chosen: Chosen, among: Sequence[Chosen]) -> list[Recording]:
 def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
     several = sum(len(item.positions) for item in chosen) > 1
     for item in chosen:
-        scene = scene_of(item.recording, item.positions)
+        scene = scene_of([item])
         scene.rows = int(row_counts(*item).max())
         for position in item.positions:
             number = item.recording.episodes[position].number
@@ -212,7 +212,7 @@ def _apart(chosen: Sequence[Chosen]) -> Iterator[Plan]:
 
 
 def _joined(chosen: Sequence[Chosen]) -> Plan:
-    scene = scene_of(*chosen[0])
+    scene = scene_of(chosen)
     parts: list[ShownEpisodes] = []
     first = 0
     for item in chosen:
@@ -276,7 +276,7 @@ def _compared(chosen: Sequence[Chosen]) -> Plan:
                 f"expected recordings of the same spaces to compare, found {first.name} and {item.recording.name} "
                 "with different ones; show them without --compare"
             )
-    scene = scene_of(*chosen[0], apart=True)
+    scene = scene_of(chosen, apart=True)
     parts: list[ShownEpisodes] = []
     titles = [_title(item) for item in chosen]
     if len(set(titles)) < len(titles):  # files of one run

@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.dataset.chosen import Chosen
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Columns, Recording
+from tupli_mcap.recording import Columns, Episode
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.describe.description import by_scale
 from tupli_mcap.spaces.labels import Labels, distinct
@@ -45,6 +46,7 @@ _MOST_FRAMES: Final = 16  # of a stack that is not declared as one
 _LEAST_FRAME: Final = 16  # pixels of each of its sides
 _RATIO: Final = 30.0  # magnitudes further apart than this do not share an axis
 _SAMPLE_EPISODES, _SAMPLE_STEPS, _SAMPLE_BYTES = 8, 512, 8 << 20
+_INFO_EPISODES: Final = 16  # whose infos are read for the keys
 
 
 @dataclass
@@ -91,13 +93,16 @@ class _Material(NamedTuple):
         return np.concatenate(parts).astype(np.float64)
 
 
-def scene_of(recording: Recording, positions: Sequence[int], *, apart: bool = False) -> Scene:
-    """The panels for some episodes of a recording. apart: give each dimension its own view, in which several episodes
-    are overlaid."""
-    rows = int(recording.index["length"][np.asarray(positions, np.int64)].sum())
-    material = _Material(recording.labels, _sample(recording, positions), rows, apart)
-    scene = _scene(recording.layout, material, recording.cameras)
-    infos, unseen = infos_of(recording, _spread(positions), _MOST_INFOS)
+def scene_of(chosen: Sequence[Chosen], *, apart: bool = False) -> Scene:
+    """The panels for episodes of recordings of the same spaces: every camera and info that one of them has. apart: give
+    each dimension its own view, in which several episodes are overlaid."""
+    recording = chosen[0].recording
+    episodes = [item.recording.episodes[position] for item in chosen for position in item.positions]
+    rows = sum(map(len, episodes))
+    material = _Material(recording.labels, _sample(_spread(episodes, _SAMPLE_EPISODES)), rows, apart)
+    cameras = dict.fromkeys(camera for item in chosen for camera in item.recording.cameras)
+    scene = _scene(recording.layout, material, cameras)
+    infos, unseen = infos_of(_spread(episodes, _INFO_EPISODES), _MOST_INFOS)
     if infos is not None:
         scene.beside.append(infos)
     scene.unseen += unseen
@@ -228,20 +233,20 @@ def _many(scene: Scene, leaf: Leaf, column: str, material: _Material) -> list[Pa
     return panels + _series(leaf, column, material, _LINES_SMALL)
 
 
-def _spread(positions: Sequence[int]) -> list[int]:
+def _spread(episodes: Sequence[Episode], most: int) -> list[Episode]:
     """A few of the episodes, evenly spaced."""
-    chosen = np.unique(np.linspace(0, len(positions) - 1, _SAMPLE_EPISODES).astype(int))
-    return [int(positions[i]) for i in chosen]
+    chosen = np.unique(np.linspace(0, len(episodes) - 1, most).astype(int))
+    return [episodes[i] for i in chosen]
 
 
-def _sample(recording: Recording, positions: Sequence[int]) -> list[Columns]:
+def _sample(episodes: Sequence[Episode]) -> list[Columns]:
     """A few steps from the middle of a few episodes, without images, to measure how large values get."""
-    at_once = _SAMPLE_BYTES // _SAMPLE_EPISODES // step_bytes(recording.layout, images=False)
+    at_once = _SAMPLE_BYTES // _SAMPLE_EPISODES // step_bytes(episodes[0].recording.layout, images=False)
     most = max(1, min(_SAMPLE_STEPS, at_once))
     sample = []
-    for position in _spread(positions):
-        length = int(recording.index["length"][position])
-        start = max(0, (length - most) // 2)
-        stop = min(length, start + most)
-        sample.append(recording.read_steps(position, start, stop, ("states", "actions"), images=False))
+    for episode in episodes:
+        start = max(0, (len(episode) - most) // 2)
+        stop = min(len(episode), start + most)
+        fields = ("states", "actions")
+        sample.append(episode.recording.read_steps(episode.position, start, stop, fields, images=False))
     return sample

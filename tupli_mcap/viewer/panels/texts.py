@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.jsonvalue import shown
 from tupli_mcap.messages.infos import parts_of
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Episode
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
 from tupli_mcap.viewer.panels.panel import PALETTE, LeafPanel, Root, named, plot
@@ -160,11 +160,11 @@ class LiveInfos(Infos):
         return super().view([""], axis)
 
 
-def infos_of(recording: Recording, positions: Sequence[int], most: int) -> tuple[Infos | None, list[str]]:
+def infos_of(episodes: Sequence[Episode], most: int) -> tuple[Infos | None, list[str]]:
     """The panel of the infos of the given episodes, and notes on infos that are not shown."""
     kinds: dict[str, str] = {}
-    for position in positions:
-        for info in recording.infos(position) or ():
+    for episode in episodes:
+        for info in episode.infos or ():
             for key, value in parts_of(info or {}).items():
                 kind = "text" if isinstance(value, str) else "number" if _is_number(value) else "other"
                 kinds[key] = kind if kinds.get(key, kind) == kind else "other"
