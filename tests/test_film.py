@@ -92,6 +92,27 @@ def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:
         film(episodes, tmp_path / "c.gif", camera="front")
 
 
+@pytest.mark.parametrize(
+    ("frames", "every", "rate"), [(True, 1, 50), (2, 1, 25), (2, 2, 12.5), (True, 4, 12.5)]
+)
+def test_frames_of_some_steps_take_as_long_as_those_of_all(
+    tmp_path: Path, frames: int, every: int, rate: float
+) -> None:
+    env = gym.make("CartPole-v1", render_mode="rgb_array", max_episode_steps=9)
+    episode = tupli_mcap.open(record_until_timeout(tmp_path / "r.mcap", env, frames))[0]
+    episode.video(tmp_path / "film.mp4", every=every)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        assert float(container.streams.video[0].average_rate or 0) == rate
+
+
+def record_until_timeout(path: Path, env: gym.Env[Any, Any], frames: int) -> Path:
+    with RecordEpisodes(env, path, frames=frames) as recorded:
+        recorded.reset(seed=1)
+        for step in range(9):
+            recorded.step(step % 2)
+    return path
+
+
 def test_some_pictures_of_a_size(tmp_path: Path) -> None:
     recording = Recording(record(tmp_path / "r.mcap", Camera(), frames=True))
     episodes = list(recording.episodes)

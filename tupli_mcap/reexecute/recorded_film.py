@@ -68,8 +68,9 @@ def film(
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
         camera: a camera, or an image in the states, such as `state.wrist` or `wrist`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
-        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30, by `every`. A
-            picture is shown for at most 10 minutes.
+        fps: pictures a second; by default, from the duration of a step if the recording has it, else 30 steps a
+            second: fewer of frames that were not recorded at every step, and with `every`. A picture is shown for at
+            most 10 minutes.
         every: only every n-th picture of an episode, and its last one.
         width: of the film (pixels). By default as recorded; small pictures become larger, by a whole number.
 
@@ -86,16 +87,17 @@ def film(
         if not episodes:
             raise RecordingError("expected episodes to film, found none")
         parts = [_pictures(episode, camera) for episode in episodes]
-        count = sum(-(-(number - 1) // every) + 1 for number, _ in parts)
+        count = sum(-(-(number - 1) // every) + 1 for number, _, _ in parts)
         seconds = episodes[0].recording.labels.step_seconds
+        between = max(steps for _, _, steps in parts) * every
         pictures = (
             _scaled(picture, width)
-            for number, drawn in parts
+            for number, drawn, _ in parts
             for i, picture in enumerate(drawn)
             if i % every == 0 or i == number - 1
         )
         with replacing(goal) as (_, path):
-            rate = film_rate(fps or (1 / seconds if seconds else _FPS) / every)
+            rate = film_rate(fps or (1 / seconds if seconds else _FPS) / between)
             write_movie(path, kind, pictures, count, rate)
         return Film(count, kind, None if target is None else goal, goal.read_bytes())
 
@@ -108,7 +110,8 @@ def _scaled(picture: Picture, width: int | None) -> Picture:
     return picture.repeat(times, axis=0).repeat(times, axis=1) if times > 1 else picture
 
 
-def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Picture]]:
+def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Picture], int]:
+    """How many pictures of an episode there are, the pictures, and how many steps are from one to the next."""
     recording, images = episode.recording, episode.recording.layout.images
     if camera is not None and camera not in recording.cameras:
         leaf = leaves_by_name(images).get(camera)
@@ -120,7 +123,7 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
         )
     frames = recording.frames(episode.position, camera)
     if len(frames):
-        return len(frames), iter(frames)
+        return len(frames), iter(frames), _steps_between(frames.steps)
     if camera is None and images:
         return _of_states(episode, images[0])
     raise RecordingError(
@@ -128,7 +131,12 @@ def _pictures(episode: Episode, camera: str | None) -> tuple[int, Iterator[Pictu
     )
 
 
-def _of_states(episode: Episode, leaf: Leaf) -> tuple[int, Iterator[Picture]]:
+def _steps_between(steps: Array) -> int:
+    """The usual number of steps from one frame to the next; that to the last one may be smaller."""
+    return max(1, int(np.quantile(np.diff(steps), 0.5, method="higher"))) if len(steps) > 1 else 1
+
+
+def _of_states(episode: Episode, leaf: Leaf) -> tuple[int, Iterator[Picture], int]:
     """The pictures of its states, and of its final state if that is known, as recorded frames show it."""
     final = episode.final_state
 
@@ -138,7 +146,7 @@ def _of_states(episode: Episode, leaf: Leaf) -> tuple[int, Iterator[Picture]]:
         if final is not None:
             yield leaf.get(final)
 
-    return len(episode) + (final is not None), (as_picture(value, leaf) for value in values())
+    return len(episode) + (final is not None), (as_picture(value, leaf) for value in values()), 1
 
 
 def as_picture(value: Array, leaf: Leaf) -> Picture:
