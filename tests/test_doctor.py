@@ -603,6 +603,20 @@ def test_a_terminal_reward_far_from_all_others_is_an_outlier(tmp_path: Path) -> 
     assert "among terminal steps; the furthest is 1e+06" in finding.message
 
 
+def test_rewards_that_are_equal_but_for_rounding_are_no_scale(tmp_path: Path) -> None:
+    """As of CarRacing, whose rewards are differences of sums: -0.1 a step, and some tiles."""
+    sums = np.cumsum([1000 / 283 if i % 10 == 5 else -0.1 for i in range(400)])
+    rewards = np.diff(sums, prepend=0.0).tolist()
+    assert len({reward for reward in rewards if reward < 0}) > 1
+    assert (
+        examine(by_hand(tmp_path / "a.mcap", [{"length": 400, "rewards": rewards}])).of("reward-outliers")
+        == ()
+    )
+    rewards[100] = 1e6
+    path = by_hand(tmp_path / "b.mcap", [{"length": 400, "rewards": rewards}])
+    assert places(found(examine(path), "reward-outliers")) == [(0, 100)]
+
+
 def test_rewards_whose_sums_overflow_are_no_outliers(tmp_path: Path) -> None:
     episodes = [{"length": 11, "rewards": [1e308] * 11}] * 3
     assert examine(by_hand(tmp_path / "a.mcap", episodes)).of("reward-outliers") == ()

@@ -17,6 +17,7 @@ from tupli_mcap.spaces.leaves import Leaf
 _SECOND = 10**9
 _SAMPLE_SIZE = 1 << 16
 _FEWEST_REWARDS = 20
+_ROUNDING = 1e-9  # of the median: rewards that differ by less are equal, but for the rounding of sums
 _KINDS = (  # of steps whose rewards are judged together
     "before the last steps of episodes",
     "among the last steps of episodes without a terminal",
@@ -199,9 +200,9 @@ def reward_outliers(measured: Measurements, *, factor: float = 300) -> Iterator[
 
     Terminal steps, the last steps of other episodes, and all steps before are judged apart, because a reward of success
     or failure, or a bonus at the end, is usual: such rewards are outliers only among their own kind. The scale is
-    1.4826 times the median absolute deviation. If most rewards are equal, it is the larger of the median's magnitude
-    and the median of the deviations that are not 0 (if there are at least three). Nothing is found if the scale is 0,
-    or below 20 rewards. Of more than 65,536 rewards, a sample gives the median and the scale.
+    1.4826 times the median absolute deviation. If most rewards are equal, up to rounding, it is the larger of the
+    median's magnitude and the median of the deviations that are not 0 (if there are at least three). Nothing is found
+    if the scale is 0, or below 20 rewards. Of more than 65,536 rewards, a sample gives the median and the scale.
     """
     for rewards in measured.statistics(Rewards):
         if rewards.sample.seen < _FEWEST_REWARDS:
@@ -232,6 +233,7 @@ def _scale(values: Array) -> tuple[float, float]:
     with np.errstate(over="ignore", invalid="ignore"):  # nothing is far from a median beyond all floats
         median = float(np.median(values))
         deviations = np.abs(values - median)
+        deviations[deviations <= _ROUNDING * abs(median)] = 0
         spread = _MAD_TO_STD * float(np.median(deviations))
     if spread > 0:
         return median, spread
