@@ -53,10 +53,9 @@ class Tokens:
         epoch: that of the password which was checked before; SignInError if the user has another one by now, or is
         deleted.
         """
-        now = epoch_of(connection, user)
-        if now is None or epoch not in (None, now):
+        current = epoch_of(connection, user)
+        if current is None or epoch not in (None, current):
             raise SignInError("Incorrect username or password")
-        epoch = now
         refresh = secrets.token_urlsafe(32)
         now = int(time.time())
         connection.execute(delete(REFRESH_TOKEN).where(REFRESH_TOKEN.c.expires < now))
@@ -65,7 +64,7 @@ class Tokens:
         expires = now + self._settings.refresh_seconds
         connection.execute(insert(REFRESH_TOKEN).values(**row, used=False, expires=expires))
         return {
-            "access_token": self._access(user, epoch, family),
+            "access_token": self._access(user, current, family),
             "refresh_token": refresh,
             "token_type": "bearer",
             "expires_in": self._settings.access_seconds,
@@ -133,9 +132,8 @@ class Tokens:
         caller has a new password by now, or is deleted."""
         if scope not in ("read", "write") or not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError("expected a name, and the scope 'read' or 'write'")
-        if (
-            epoch_of(connection, caller.name) != caller.epoch
-        ):  # a new password revokes a token that is just being made
+        # a new password revokes a token that is just being made
+        if epoch_of(connection, caller.name) != caller.epoch:
             raise SignInError("this sign-in has ended; sign in again")
         if days is not None and not 1 <= days <= _MOST_DAYS:
             raise StorageError(
