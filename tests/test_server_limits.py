@@ -483,6 +483,27 @@ def test_who_does_not_take_the_answer_is_cut_off(tmp_path: Path) -> None:
             assert len(ended(connection)) < 64 << 20
 
 
+def test_the_unfinished_uploads_of_a_deleted_user_are_deleted(tmp_path: Path) -> None:
+    library = Library(Settings(tmp_path / "served"))
+    library.first_password()
+    with library.database.writing() as connection:
+        accounts.create_user(connection, "ann", "no hash")
+        admin, ann = (accounts.caller_named(connection, name) for name in ("admin", "ann"))
+        assert admin is not None and ann is not None
+    for caller in (admin, ann):
+        upload = library.begin_upload(caller, 5, hashlib.sha256(b"hello").hexdigest(), 0)
+        assert isinstance(upload, Upload)
+        with library.uploads.writing(upload) as incoming:
+            incoming.write([b"hell"])
+    assert len(list((tmp_path / "served/server/uploads").iterdir())) == 2
+    library.delete_user(admin, "ann")
+    library.look_after()
+    (left,) = (tmp_path / "served/server/uploads").iterdir()
+    with library.database.reading() as connection:
+        assert library.uploads.find(connection, admin, left.name).offset == 4
+    library.close()
+
+
 def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: Path) -> None:
     with contextlib.closing(Library(Settings(tmp_path / "served"))) as library:
         library.first_password()

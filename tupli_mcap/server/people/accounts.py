@@ -17,7 +17,7 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import ADMIN, DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
-from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, USER
+from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, UPLOAD, USER
 
 # The minimum that OWASP recommends: a sign-in takes 19 MiB, and one core.
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))
@@ -92,11 +92,12 @@ def change_password(connection: Connection, name: str, hashed: str) -> None:
 
 
 def delete_user(connection: Connection, name: str) -> bool:
-    """Deletes a user with all tokens and memberships; returns whether there was one. The name cannot be used again:
-    another user of this name would own what this user stored. DeniedError for the only admin."""
+    """Deletes a user with all tokens, memberships and unfinished uploads; returns whether there was one. The name
+    cannot be used again: another user of this name would own what this user stored. DeniedError for the only admin."""
     _demand_other_admin(connection, name)
     gone = connection.execute(delete(USER).where(USER.c.name == name)).rowcount
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.user == name))
+    connection.execute(delete(UPLOAD).where(UPLOAD.c.user == name))  # a clean-up deletes the files
     _revoke(connection, name)
     return bool(gone)
 
