@@ -1773,6 +1773,23 @@ class TestProgram:
             try:
                 part = os.read(fd, 65536)
             except OSError:  # the other end has closed
+    @pytest.mark.parametrize("columns", [None, "0"])
+    def test_a_terminal_of_unknown_size_gets_whole_tables(self, cartpole: Path, columns: str | None) -> None:
+        theirs, ours = pty.openpty()  # as `docker exec -t` and `script` open one: of 0 columns
+        named = {} if columns is None else {"COLUMNS": columns}
+        command = [str(TOOL), "episodes", str(cartpole)]
+        with subprocess.Popen(command, stdout=ours, stderr=ours, env=os.environ | named) as process:
+            try:
+                assert process.wait(60) == 0
+            finally:
+                process.kill()
+        title, *lines = os.read(theirs, 65536).decode().splitlines()
+        os.close(ours)
+        os.close(theirs)
+        assert "EPISODE  STEPS  RETURN" in title and "ENDED" in title
+        with Recording(cartpole) as recording:
+            assert len(lines) == len(recording.index)
+
                 break
             if not part:
                 break

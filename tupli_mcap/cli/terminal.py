@@ -56,7 +56,9 @@ def say_styled(*parts: tuple[str, str]) -> None:
 
     shown = [(_encodable(sys.stdout, visible(text)), style) for text, style in parts]
     _clear()
-    Console(highlight=False, soft_wrap=True).print(Text.assemble(*shown))
+    # rich takes COLUMNS=0 for a width, and would print nothing
+    console = Console(highlight=False, soft_wrap=True, width=terminal_width() or _ROOMY)
+    console.print(Text.assemble(*shown))
 
 
 def say_json(text: str) -> None:
@@ -92,11 +94,11 @@ def can_print(text: str) -> bool:
 
 
 def terminal_width() -> int | None:
-    """The width of stdout (columns); None if it is no terminal: then nothing is cut."""
-    if os.environ.get("COLUMNS", "").isdecimal():
+    """The width of stdout (columns); None if it is no terminal, or one of unknown size (0): then nothing is cut."""
+    if os.environ.get("COLUMNS", "").isdecimal() and int(os.environ["COLUMNS"]):
         return int(os.environ["COLUMNS"])
     try:
-        return os.get_terminal_size(sys.stdout.fileno()).columns
+        return os.get_terminal_size(sys.stdout.fileno()).columns or None
     except (OSError, ValueError):
         return None
 
