@@ -922,6 +922,7 @@ class TestLook:
         assert run("info", "empty.mcap", "--json").json["returns"] is None
         assert ok("episodes", "empty.mcap") == "no episodes\n"
 
+        assert run("verify", cartpole, "--rerun", "--filter", "steps > 999", "--json").err == none.err
     def test_info_of_nested_spaces_has_a_line_for_each_part(self, here: Path) -> None:
         ok("record", "Blackjack-v1", "-o", "a.mcap", "--steps", 20)
         lines = ok("info", "a.mcap").splitlines()

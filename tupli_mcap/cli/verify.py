@@ -81,7 +81,7 @@ def verify(
         print_json(told)
     elif len(reports) > 1:
         say(f"{number(len(reports) - damaged)} of {number(len(reports))} undamaged")
-    if reruns is not None and not reruns.tried and not as_json:
+    if reruns is not None and not reruns.tried:
         fail("no episode was run again: no undamaged recording has such an episode")
     if damaged or (reruns is not None and not reruns.ok):
         raise typer.Exit(1)
@@ -168,8 +168,7 @@ class _Reruns:
             seconds = time.perf_counter() - began
         except TupliError as err:
             self._found.append((name, None, str(err)))
-            if not quiet:
-                fail(str(err))
+            fail(str(err))
             return
         self._found.append((name, certificate, ""))
         if not quiet:
