@@ -720,6 +720,8 @@ class TestLook:
         assert (several.pop("path"), several.pop("paths")) == (None, ["a.mcap", "deep"])
         assert several == below
         assert pattern["episodes"] == below["episodes"]  # each counts once
+        assert below["ends"].keys() == run("info", "a.mcap", "--json").json["ends"].keys()
+        assert sum(below["ends"].values()) == below["episodes"]
         out = ok("info", "a.mcap", "deep/b.mcap", "--episodes", "0")
         assert re.search(r"^sources +a\.mcap, deep/b\.mcap\nrecordings +2$", out, re.M)
         assert re.search(r"^episodes +2 ", out, re.M)

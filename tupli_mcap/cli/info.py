@@ -83,6 +83,7 @@ def _print_many(
     sources: Sequence[str], episodes: str | None, wanted: BaseFilter | None, *, as_json: bool
 ) -> None:
     """Prints facts about the recordings of a directory, a server, or several of those, or about the chosen episodes."""
+    from tupli_mcap.messages.episodes import END_NAMES
     from tupli_mcap.recording.about.success import success_of, success_text
     from tupli_mcap.recording.describe.description import spread_of
 
@@ -90,7 +91,7 @@ def _print_many(
     are_here = not any(map(is_url, sources))  # elsewhere, nothing is opened
     headers = dataset.headers
     said = [found for header in headers if (found := success_of(header.metadata)) is not None]
-    ends: dict[str, int] = {}
+    ends = dict.fromkeys(END_NAMES, 0)
     for header in headers:
         ends[header.end] = ends.get(header.end, 0) + 1
     seeds = {header.seed for header in headers} - {None}
@@ -119,7 +120,7 @@ def _print_many(
             }
         )  # fmt: skip
         return
-    ended = ", ".join(f"{count:,} {name}" for name, count in ends.items())
+    ended = ", ".join(f"{count:,} {name}" for name, count in ends.items() if count)
     lines = {
         _kind(sources): _some(names),
         "recordings": number(recordings),
