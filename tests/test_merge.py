@@ -699,6 +699,10 @@ def test_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     assert not Path("none.mcap").exists()
     run("filter", "all.mcap", "--filter", "colour = 1", "-o", "none.mcap", code=2)
+    record(Path("text.mcap"), "text")
+    refused = ["filter", "0.mcap", "text.mcap", "--filter", "steps > 0", "-o", "none.mcap"]
+    assert "only recordings of the same spaces" in run(*refused, code=1)
+    assert run(*refused, "--dry-run", code=1) == run(*refused, code=1)
 
 
 def test_vectorised_copies_of_an_environment_are_no_other_one(

@@ -181,6 +181,7 @@ def filter_dataset(
     _check_new(kept, target, overwrite=overwrite)
     report = FilterReport(target, len(kept), kept.n_steps, count - len(kept))
     if dry_run:
+        check_mergeable(_excerpts(kept))
         return report
     return report._replace(size=save(kept, target, overwrite=overwrite).stat().st_size)
 
