@@ -648,11 +648,12 @@ def test_targets(tmp_path: Path) -> None:
     assert recover_recording(path, dry_run=True).target is None
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap"]
     recover_recording(path, other)
-    with pytest.raises(RecordingError, match=r"other\.mcap exists and is not overwritten"):
-        recover_recording(path, other)
+    for dry_run in (True, False):
+        with pytest.raises(RecordingError, match=r"other\.mcap exists and is not overwritten"):
+            recover_recording(path, other, dry_run=dry_run)
+        with pytest.raises(RecordingError, match=r"a\.mcap is never overwritten"):
+            recover_recording(path, path, overwrite=True, dry_run=dry_run)
     recover_recording(path, other, overwrite=True)
-    with pytest.raises(RecordingError, match=r"a\.mcap is never overwritten"):
-        recover_recording(path, path, overwrite=True)
     with pytest.raises(RecordingError, match="cannot be written"):
         recover_recording(path, other / "x.mcap")
     with pytest.raises(RecordingError, match="does not exist"):

@@ -155,7 +155,7 @@ def recover_recording(
     goal = recovered_path(path) if target is None else Path(target)
     check_name(goal)
     try:
-        _check(path, goal, overwrite=overwrite, dry_run=dry_run)
+        _check(path, goal, overwrite=overwrite)
     except OSError as err:
         raise RecordingError(f"{path} cannot be recovered to {goal}: {os_reason(err)}") from err
     opened = PathSource(path)
@@ -186,11 +186,9 @@ class _NothingSavedError(Exception):
         self.report = report
 
 
-def _check(path: Path, goal: Path, *, overwrite: bool, dry_run: bool) -> None:
+def _check(path: Path, goal: Path, *, overwrite: bool) -> None:
     if is_locked(path):
         raise RecordingError(f"{path} is being recorded; close its writer first, then recover it")
-    if dry_run:
-        return
     if files.is_same(goal, path):
         raise RecordingError(f"{path} is never overwritten; give another file to write to")
     if goal.exists() and not overwrite:
