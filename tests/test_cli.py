@@ -25,6 +25,7 @@ from command_line import Result, run
 from environments import Scripted
 from gymnasium.envs.classic_control import CartPoleEnv
 from mcap.writer import Writer
+from test_golden import place as golden
 from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -719,14 +720,22 @@ class TestLook:
         assert (below.pop("path"), below.pop("paths")) == (".", ["."])
         assert (several.pop("path"), several.pop("paths")) == (None, ["a.mcap", "deep"])
         assert several == below
-        assert pattern["episodes"] == below["episodes"]  # each counts once
         assert below["ends"].keys() == run("info", "a.mcap", "--json").json["ends"].keys()
         assert sum(below["ends"].values()) == below["episodes"]
+        assert pattern["episodes"] == below["episodes"]  # each counts once
         out = ok("info", "a.mcap", "deep/b.mcap", "--episodes", "0")
         assert re.search(r"^sources +a\.mcap, deep/b\.mcap\nrecordings +2$", out, re.M)
         assert re.search(r"^episodes +2 ", out, re.M)
         assert ok("info", "**/*.mcap").startswith("pattern ")
         assert fails("info", "a.mcap", "gone.mcap").startswith("gone.mcap does not exist")
+
+    def test_the_advice_to_finish_a_recording_can_be_typed(self, here: Path) -> None:
+        folder = here / "my runs"
+        folder.mkdir()
+        args = ("tag", golden("unfinished", folder), "--episodes", "all", "good=true")
+        command = fails(*args).partition("finish it with: ")[2]
+        ok(*shlex.split(command)[1:])
+        ok(*args)
 
     def test_info_names_a_run_of_several_files_once(self, here: Path) -> None:
         record_rollouts("CartPole-v1", "a.mcap", steps=20_000, max_bytes=20_000)
@@ -913,6 +922,7 @@ class TestLook:
         none = run("verify", cartpole, "--rerun", "--filter", "steps > 999")
         assert (none.code, none.err.count("\n")) == (1, 1)
         assert "no episode was run again" in none.err
+        assert run("verify", cartpole, "--rerun", "--filter", "steps > 999", "--json").err == none.err
         assert "go with --rerun" in fails("verify", cartpole, "--filter", "steps > 20", code=2)
 
     def test_info_of_an_empty_recording(self, here: Path) -> None:
@@ -924,7 +934,6 @@ class TestLook:
         assert run("info", "empty.mcap", "--json").json["returns"] is None
         assert ok("episodes", "empty.mcap") == "no episodes\n"
 
-        assert run("verify", cartpole, "--rerun", "--filter", "steps > 999", "--json").err == none.err
     def test_info_of_nested_spaces_has_a_line_for_each_part(self, here: Path) -> None:
         ok("record", "Blackjack-v1", "-o", "a.mcap", "--steps", 20)
         lines = ok("info", "a.mcap").splitlines()
@@ -1764,18 +1773,6 @@ class TestProgram:
         for line in lines:
             assert re.search("  ppo-without-normalisation-[12]  .* success=true", line)
 
-    @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
-    def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:
-        pid, fd = pty.fork()
-        if pid == 0:
-            environment = os.environ | ({"JPY_PARENT_PID": "1"} if in_notebook else {})
-            command = [str(TOOL), "record", "CartPole-v1", "-o", "a.mcap", "--steps", "30000"]
-            os.execve(TOOL, command, environment)
-        seen = b""
-        while select.select([fd], [], [], 30)[0]:
-            try:
-                part = os.read(fd, 65536)
-            except OSError:  # the other end has closed
     @pytest.mark.parametrize("columns", [None, "0"])
     def test_a_terminal_of_unknown_size_gets_whole_tables(self, cartpole: Path, columns: str | None) -> None:
         theirs, ours = pty.openpty()  # as `docker exec -t` and `script` open one: of 0 columns
@@ -1793,6 +1790,18 @@ class TestProgram:
         with Recording(cartpole) as recording:
             assert len(lines) == len(recording.index)
 
+    @pytest.mark.parametrize("in_notebook", [False, True])  # `!tupli-mcap record …` in a cell
+    def test_a_terminal_gets_a_progress_bar(self, here: Path, *, in_notebook: bool) -> None:
+        pid, fd = pty.fork()
+        if pid == 0:
+            environment = os.environ | ({"JPY_PARENT_PID": "1"} if in_notebook else {})
+            command = [str(TOOL), "record", "CartPole-v1", "-o", "a.mcap", "--steps", "30000"]
+            os.execve(TOOL, command, environment)
+        seen = b""
+        while select.select([fd], [], [], 30)[0]:
+            try:
+                part = os.read(fd, 65536)
+            except OSError:  # the other end has closed
                 break
             if not part:
                 break

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shlex
 import stat
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -72,7 +73,8 @@ def check_attachable(path: Path, *, finished: bool) -> None:
     writable."""
     if not finished:
         raise RecordingError(
-            f"{path} is not finished, so nothing can be attached to it; `tupli-mcap recover --in-place` finishes it"
+            f"{path} is not finished, so nothing can be attached to it; finish it with: "
+            f"tupli-mcap recover --in-place {shlex.quote(str(path))}"
         )
     if not os.access(path.parent, os.W_OK | os.X_OK):
         refused = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
