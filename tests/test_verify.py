@@ -6,6 +6,7 @@ import json
 import os
 import random
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -152,6 +153,25 @@ def test_a_journal_elsewhere_is_found(tmp_path: Path) -> None:
     (journal,) = directory.iterdir()
     journal.unlink()
     assert f"there is no journal at {journal}" in " ".join(tell("verify", path)[1].split())
+
+
+def test_killed_before_the_file_defines_its_channels_is_no_damage(tmp_path: Path) -> None:
+    """Its journal defines them; also those that an append adds."""
+    path = tmp_path / "a.mcap"
+    given: list[dict[str, Any]] = [{}, {"record_info": True}]
+    for options in given:
+        if (pid := os.fork()) == 0:
+            with RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path, mode="a", **options) as env:
+                container: Any = env._writer.container
+                container.define_channels = lambda: os.kill(os.getpid(), signal.SIGKILL)
+                env.reset()
+                env.step(0)
+        os.waitpid(pid, 0)
+        assert journal_path(path).exists()
+        assert verify_recording(path).errors == []
+        with RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), path, mode="a") as env:
+            roll(env, 3)
+        assert verify_recording(path).problems == []
 
 
 def test_killed_before_the_first_step_nothing_is_lost(tmp_path: Path) -> None:
