@@ -668,6 +668,19 @@ def test_returns_of_all_sizes(tmp_path: Path, returns: tuple[float, ...], mean: 
     assert "nan%" not in table.text
 
 
+def test_the_ends_of_a_histogram_are_those_of_its_bars(tmp_path: Path) -> None:
+    """Returns from 0 to 9 in bars, and two far from them."""
+    returns = [*(float(i % 10) for i in range(2000)), -1e6, 1e6]
+    episodes = [tupli_mcap.EpisodeData([0], [0], [value], [True], [False]) for value in returns]
+    space = gym.spaces.Discrete(2)
+    tupli_mcap.write_recording(tmp_path / "r.mcap", episodes, observation_space=space, action_space=space)
+    with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+        (dataset,) = told(client, "/")["datasets"]
+        page = client.get(f"/dataset/{dataset['key']}").text
+    (ends,) = re.findall(r"Distribution of return,.*?<p class=.ends.>(.*?)</p>", page, re.DOTALL)
+    assert ends == "<span>0; 1 below</span><span>9; 1 above</span>"
+
+
 @pytest.mark.filterwarnings("ignore:.*")  # of copies, and of files without their journals
 def test_every_kind_of_recording(tmp_path: Path) -> None:
     """The golden files hold every space, dtype, image and info that there is."""

@@ -148,11 +148,21 @@ def _over_time(episodes: SampledEpisodes, names: Mapping[str, str]) -> Iterator[
             drawn = (
                 _by_recording(episodes, drawable, names, what) if names else _as_one(episodes, drawable, what)
             )
-            edges, _ = bin_edges(known, _BINS)
-            counts, _ = np.histogram(known, edges)
-            ends = texts.number(float(known.min())), texts.number(float(known.max()))
-            told = f"Distribution of {title.lower()}, from {ends[0]} to {ends[1]}"
-            yield Chart(title, drawn, charts.histogram(counts, edges, ends, label=told))
+            yield Chart(title, drawn, _bars(known, title.lower()))
+
+
+def _bars(values: Array, of: str) -> Markup:
+    """A histogram of finite values; those far away from all others have no bar, and are counted at its ends."""
+    edges, _ = bin_edges(values, _BINS)
+    counts, _ = np.histogram(values, edges)
+    shown = values[(values >= edges[0]) & (values <= edges[-1])]
+    least, most = map(texts.number, (shown.min(), shown.max()) if len(shown) else (None, None))
+    below, above = int((values < edges[0]).sum()), int((values > edges[-1]).sum())
+    ends = (
+        f"{least}; {below:,} below" if below else least,
+        f"{most}; {above:,} above" if above else most,
+    )
+    return charts.histogram(counts, edges, ends, label=f"Distribution of {of}, from {ends[0]} to {ends[1]}")
 
 
 def _as_one(episodes: SampledEpisodes, values: Array, what: str) -> Markup:
@@ -210,11 +220,7 @@ def _histogram(leaf: LeafValues, i: int) -> Histogram:
         names = list(leaf.value_names) or [str(start + k) for k in range(len(counts))]
         edges, label = np.arange(len(counts) + 1.0), f"How often each value of {name} occurred"
         return Histogram(name, charts.histogram(counts, edges, (names[0], names[-1]), names, label))
-    column: Array = leaf.column(i)
-    edges, _ = bin_edges(column, _BINS)
-    counts, _ = np.histogram(column, edges)
-    ends = texts.number(float(leaf.least[i])), texts.number(float(leaf.most[i]))
-    return Histogram(name, charts.histogram(counts, edges, ends, label=f"Distribution of {name}"))
+    return Histogram(name, _bars(leaf.column(i), name))
 
 
 def _file_facts(item: Any) -> dict[str, Any]:
