@@ -25,6 +25,7 @@ from tupli_mcap import (
     RecordingError,
     TupliDataset,
     TupliEnvWrapper,
+    merge_recordings,
     rewrite_recording,
     vector,
     write_recording,
@@ -405,6 +406,23 @@ def test_episodes_without_any_end(tmp_path: Path) -> None:
     assert (finding.severity, finding.message[-12:]) == (INFO, "5 by timeout")
     assert examine(by_hand(tmp_path / "c.mcap", [{}, timeouts])).of("missing-terminals") == ()
     assert examine(by_hand(tmp_path / "d.mcap", [never])).of("missing-terminals") == ()
+
+
+@pytest.mark.parametrize("lengths", [(120,), (30, 1)])
+def test_each_run_may_end_with_an_interrupted_episode(tmp_path: Path, lengths: tuple[int, ...]) -> None:
+    """As in recordings of several runs that were merged."""
+    runs = [tmp_path / f"{i}.mcap" for i in range(4)]
+    for path in runs:
+        with RecordEpisodes(
+            gym.make("MountainCar-v0", max_episode_steps=150 if len(lengths) == 1 else 30), path
+        ) as env:
+            for length in lengths:
+                env.reset()
+                for _ in range(length):
+                    env.step(env.action_space.sample())
+    assert examine(runs).at_least(WARNING) == ()
+    merge_recordings(runs, tmp_path / "merged.mcap")
+    assert examine(tmp_path / "merged.mcap").at_least(WARNING) == ()
 
 
 class EarlyReset(gym.Wrapper[Any, Any, Any, Any]):

@@ -45,7 +45,7 @@ def missing_terminals(measured: Measurements) -> Iterator[Finding]:
 
     An info if episodes end by timeout, which is usual for tasks without an end. A warning if several episodes have
     neither flag: a learner may take them for one long episode, or bootstrap wrongly. The last episode of each
-    sub-environment may be interrupted.
+    sub-environment of a run may be interrupted.
     """
     ends: Array = measured.rows["end"]
     total, timeouts = len(ends), int((ends == TIMEOUT).sum())
@@ -69,8 +69,8 @@ def one_step_episodes(
 ) -> Iterator[Finding]:
     """Episodes of one step, if they are at least `part` of all and the median length is `usual_length` or more.
 
-    Short episodes are usual in card games and bandits. The last episode of a sub-environment does not count if it is
-    interrupted.
+    Short episodes are usual in card games and bandits. The last episode of a sub-environment of a run does not count if
+    it is interrupted.
     """
     one_step = (measured.lengths == 1) & ~_last_interrupted(measured)
     count, total = int(one_step.sum()), len(measured.rows)
@@ -84,9 +84,11 @@ def one_step_episodes(
 
 
 def _last_interrupted(measured: Measurements) -> Array:
-    """The interrupted episodes that are the last of their sub-environment (bool)."""
+    """The interrupted episodes that are the last of their sub-environment in their run (bool)."""
     is_last = np.zeros(len(measured.rows), np.bool_)
-    _, from_end = np.unique(measured.rows["env"][::-1], return_index=True)
+    runs = measured.recording.readable_places[measured.positions]
+    streams = np.stack([runs, measured.rows["env"]], axis=1)
+    _, from_end = np.unique(streams[::-1], axis=0, return_index=True)
     is_last[len(is_last) - 1 - from_end] = True
     mask: Array = is_last & (measured.rows["end"] == INTERRUPTED)
     return mask
