@@ -17,7 +17,16 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import Right
 from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import ADMIN, DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
-from tupli_mcap.server.tables import API_TOKEN, GROUP, MEMBERSHIP, PRINCIPAL, REFRESH_TOKEN, ROLE, UPLOAD, USER
+from tupli_mcap.server.tables import (
+    API_TOKEN,
+    GROUP,
+    MEMBERSHIP,
+    PRINCIPAL,
+    REFRESH_TOKEN,
+    ROLE,
+    UPLOAD,
+    USER,
+)
 
 # The minimum that OWASP recommends: a sign-in takes 19 MiB, and one core.
 _HASHES: Final = PasswordHash((Argon2Hasher(time_cost=2, memory_cost=19 << 10, parallelism=1),))
