@@ -207,6 +207,19 @@ class TestTokens:
             assert refused.status_code == 403 and "sign in with the password" in refused.text, path
         lab.ann.ask("DELETE", f"/v1/api-tokens/{made['id']}")
 
+    def test_a_machine_s_token_makes_no_admin(self, lab: Lab) -> None:
+        made = lab.admin.ask("POST", "/v1/api-tokens", {"name": "robot", "scope": "write"})
+        robot = Person(lab.url)
+        robot.headers = bearer(made["token"])
+        member = {"user": "ann", "roles": ["admin"]}
+        for method, path, told in (
+            ("PUT", "/v1/groups/global/members", [member]),
+            ("POST", "/access/groups/add-members", {"group_name": "global", "members": [member]}),
+        ):
+            refused = robot.call(method, path, told)
+            assert refused.status_code == 403 and "sign in with the password" in refused.text, path
+        lab.admin.ask("DELETE", f"/v1/api-tokens/{made['id']}")
+
     def test_the_secret_is_the_server_s_alone(self, lab: Lab) -> None:
         secret = lab.directory / "server" / "secret"
         assert (secret.stat().st_mode & 0o777, secret.parent.stat().st_mode & 0o777) == (0o600, 0o700)

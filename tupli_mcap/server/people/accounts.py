@@ -275,17 +275,22 @@ def delete_group(connection: Connection, caller: Caller, name: str) -> None:
 def add_members(
     connection: Connection, caller: Caller, group: str, members: Sequence[tuple[str, Sequence[str]]]
 ) -> None:
-    """Gives users further roles in a group. Nobody can give a right that they lack.
+    """Gives users further roles in a group. Nobody can give a right that they lack, and a token for machines none on
+    the whole server: a stolen one could else make an admin.
 
     members: names of users, each with the roles.
 
     Raises:
         NotFoundError: there is no such group, role or user.
-        DeniedError: the caller may not change the group, or lacks a right of the roles.
+        DeniedError: the caller may not change the group, lacks a right of the roles, or is a machine.
         StorageError: there are too many members or roles at a time.
     """
     _known(connection, caller, group)
     caller.demand(Right.GROUP_UPDATE, group)
+    if group == GLOBAL and caller.is_machine:
+        raise DeniedError(
+            "a token for machines gives no roles on the whole server; sign in with the password"
+        )
     _demand_few(sum(1 + len(roles) for _, roles in members))
     known = {role["role"] for role in list_roles(connection)}
     for user, roles in members:
