@@ -1773,6 +1773,20 @@ class TestProgram:
         for line in lines:
             assert re.search("  ppo-without-normalisation-[12]  .* success=true", line)
 
+    @pytest.mark.parametrize("buffered", ["", "1"])
+    @pytest.mark.parametrize(
+        ("words", "said"),
+        [("info gone.mcap --json", "gone.mcap does not exist"), ("ls", "No space left on device")],
+    )
+    def test_output_that_stdout_does_not_take(self, here: Path, words: str, said: str, buffered: str) -> None:
+        with Path("/dev/full").open("wb") as full:
+            done = subprocess.run(
+                [str(TOOL), *words.split()], stdout=full, stderr=subprocess.PIPE, text=True,
+                env=os.environ | {"PYTHONUNBUFFERED": buffered}, check=False,
+            )  # fmt: skip
+        assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+        assert done.stderr.startswith(f"error: {said}")
+
     @pytest.mark.parametrize("columns", [None, "0"])
     def test_a_terminal_of_unknown_size_gets_whole_tables(self, cartpole: Path, columns: str | None) -> None:
         theirs, ours = pty.openpty()  # as `docker exec -t` and `script` open one: of 0 columns

@@ -68,6 +68,8 @@ class _Group(TyperGroup):
             if debug and not isinstance(err, SystemExit):
                 print_traceback(err)
             code = _report(err, given, as_json=as_json)
+            with _to_nowhere_if_full():
+                flush()
         if not standalone_mode:
             return code
         sys.exit(code if isinstance(code, int) else 0)
@@ -170,7 +172,7 @@ def _report(err: BaseException, words: Sequence[str], *, as_json: bool) -> int:
         message = f"interrupted; {message or _what_is_safe(words)}"
         say_interrupted(message)
         if as_json:
-            print_json_error("Interrupted", message, INTERRUPTED)
+            _print_json_error("Interrupted", message, INTERRUPTED)
         return INTERRUPTED
     if isinstance(err, TupliError):
         code = USAGE if isinstance(err, FilterError) else FAILED  # filters come from the command line only
@@ -187,12 +189,27 @@ def _report(err: BaseException, words: Sequence[str], *, as_json: bool) -> int:
             message = f"{message.rstrip('.')}; see {context.command_path} --help"
     else:
         if as_json and isinstance(err, Exception):
-            print_json_error(kind, message, FAILED)
+            _print_json_error(kind, message, FAILED)
         raise err
     fail(message)
     if as_json:
-        print_json_error(kind, message, code)
+        _print_json_error(kind, message, code)
     return code
+
+
+def _print_json_error(kind: str, message: str, exit_code: int) -> None:
+    """Prints an error as JSON, if stdout takes it; the line on stderr says it, too."""
+    with _to_nowhere_if_full():
+        print_json_error(kind, message, exit_code)
+
+
+@contextlib.contextmanager
+def _to_nowhere_if_full() -> Iterator[None]:
+    """If stdout takes no more of what the block writes, drops it: Python would fail on it once more at exit."""
+    try:
+        yield
+    except OSError:
+        stop_writing()
 
 
 def _kind_of(err: BaseException) -> str:
