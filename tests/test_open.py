@@ -87,6 +87,8 @@ def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
         TupliError, match=r"found <Dataset .*; open a server by itself, and join datasets with \+"
     ):
         tupli_mcap.open([tupli_mcap.open(runs)])
+    with pytest.raises(TupliError, match=r"found the server http://lab:8080; open a server by itself"):
+        tupli_mcap.open(["http://lab:8080", runs])
     assert ids(tupli_mcap.open(FileStorage(runs))) == everything
     assert ids(tupli_mcap.open(runs / "a.mcap")) == everything[:12]
     with Recording(runs / "a.mcap") as recording:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, files_at, place_of
+from tupli_mcap.errors import asking
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, path_of
+from tupli_mcap.remote import is_server, is_url, path_of, shown
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import is_storage, recordings_at
 
@@ -75,6 +76,12 @@ def _files_in(source: Openable) -> Sequence[str]:
     if isinstance(source, Recording):
         return [place_of(source)]
     if isinstance(source, str | os.PathLike):
+        if isinstance(source, str) and is_server(source):
+            joined = asking("join datasets with +", "fetch its recordings with tupli-mcap pull")
+            raise DatasetError(
+                f"expected paths, patterns, and URLs of files in a list, found the server {shown(source)}; "
+                f"open a server by itself, and {joined}"
+            )
         return files_at(source)
     from tupli_mcap.storage import FileStorage
 
