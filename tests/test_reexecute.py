@@ -614,6 +614,16 @@ def test_an_environment_with_other_spaces_is_refused(tmp_path: Path) -> None:
         certify(path, env=gym.make("Pendulum-v1"))
 
 
+def test_other_spaces_of_many_dimensions_are_told_in_short(tmp_path: Path) -> None:
+    def timed(limit: int) -> gym.Env[Any, Any]:
+        return gym.wrappers.TimeAwareObservation(gym.make("Taxi-v4", max_episode_steps=limit))
+
+    path = record(tmp_path / "a.mcap", timed(200), 10)
+    told = re.escape("Box(0, 1..200, (501,), int64), found Box(0, 1..13, (501,), int64)")
+    with pytest.raises(RecordingError, match=f"the observation_space {told}$"):
+        certify(path, env=timed(13))
+
+
 def test_a_recording_without_an_environment(tmp_path: Path) -> None:
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "a.mcap", attachments={}) as env:
         roll(env, 20)

@@ -12,6 +12,7 @@ import gymnasium as gym
 
 from tupli_mcap.errors import RecordingError, brief
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.describe.description import describe_space
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.reexecute.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.reexecute.certificate import (
@@ -333,6 +334,9 @@ def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:
     for name in ("observation_space", "action_space"):
         recorded, found = getattr(recording, name), own_space(getattr(env, name))
         if recorded != found:
+            told = [describe_space(space) for space in (recorded, found)]
+            if told[0] == told[1]:  # bounds of single dimensions
+                told = [" ".join(str(space).split()) for space in (recorded, found)]
             raise RecordingError(
-                f"{recording.name}: expected an environment with the {name} {recorded}, found {found}"
+                f"{recording.name}: expected an environment with the {name} {told[0]:.300}, found {told[1]:.300}"
             )
