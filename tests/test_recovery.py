@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from counting import calls, grows
-from environments import Sampler, roll
+from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 from mcap.reader import make_reader
@@ -589,6 +589,31 @@ def killed(work: Callable[[], Any]) -> None:
         finally:
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(pid, 0)
+
+
+def test_infos_of_lost_steps_are_not_those_of_new_ones(tmp_path: Path) -> None:
+    """The journal had the steps, and the file their infos."""
+    path = tmp_path / "a.mcap"
+
+    def make(path: Path, **kwargs: Any) -> RecordEpisodes:
+        env = Scripted(
+            lambda step: np.zeros(4, np.float32), BOX, info=lambda step: {"text": "x" * 999}, length=3
+        )
+        return RecordEpisodes(env, path, mode="a", **kwargs)
+
+    abandon(path, lambda path: make(path, record_info=True, chunk_size=3000), 30)
+    journal_path(path).unlink()
+    with pytest.warns(UserWarning, match="no journal"), Recording(path) as recording:
+        kept = len(recording)
+    with pytest.warns(UserWarning, match="no journal"), make(path) as env:
+        roll(env, 30)
+    with Recording(path) as recording:
+        assert len(recording) == kept + 10
+        assert [info for episode in recording.episodes[kept:] for info in episode.infos or []] == [None] * 30
+        assert recording.episodes[-1].number >= 10
+    report = verify_recording(path)
+    assert report.ok
+    assert [problem.severity for problem in report.problems] == ["note"]
 
 
 def test_killed_again_while_appending_nothing_changes(tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class _Checker:
         self._topics: Mapping[str, int] = file.topics
         self._channels: Mapping[int, Channel] = file.contents.channels
         self._index: EpisodeIndex = file.contents.index
-        self._error = findings.error
+        self._findings, self._error = findings, findings.error
         self._rows: Array = recording.index
         self._at = {int(number): i for i, number in enumerate(self._rows["episode"])}
 
@@ -285,11 +285,12 @@ class _Checker:
         return end == INTERRUPTED and not 0 <= final_row <= row
 
     def infos(self) -> None:
-        """Checks that each info is of a step of the recording, and that each step has at most one."""
+        """Checks that each step has at most one info, and notes infos of steps that are not in the recording."""
         codec = self._recording.file.infos
         if codec is None:
             return
         last: dict[int, int] = {}
+        lost = 0
         for row, _, body in self._messages(INFO):
             place: dict[str, Any] = {"channel": INFO}
             try:
@@ -300,8 +301,13 @@ class _Checker:
             place.update(episode=number, step=step)
             i = self._at.get(number)
             if i is None or step >= int(self._rows["length"][i]):
-                if self._recording.complete:
-                    self._error("info", f"row {row} is the info of no step", **place)
+                lost += 1
             elif step <= last.get(number, -1):
                 self._error("info", f"row {row} is the second info of its step, or out of order", **place)
             last[number] = step
+        if lost and self._recording.complete:
+            self._findings.note(
+                "info",
+                f"{lost} infos are of steps that are not in the recording",
+                "nothing to be done: a power loss or a lost journal leaves such infos, and they are never shown",
+            )

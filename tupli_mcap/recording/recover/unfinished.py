@@ -20,6 +20,7 @@ from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import record
 from tupli_mcap.messages.frames import FRAME_LAYOUT
+from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import parse
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
@@ -95,7 +96,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
     store = evidence.store()
     plan = make_plan(evidence, store, layout, channels)
     beyond = max((number + 1 for number in plan.records.ignored), default=0)
-    contents.used_episodes = max(beyond, _beyond_frames(evidence, store))
+    contents.used_episodes = max(beyond, _beyond_frames(evidence, store), _beyond_infos(store, channels.info))
     episodes = [e for e in plan.episodes if e.head and e.number == e.run.episode]
     made = _Made(store)
     starts = {e.number: (e.start.row, e.start.time) for e in episodes if e.start.row is not None}
@@ -163,6 +164,14 @@ def _beyond_frames(evidence: Evidence, store: PackedStore) -> int:
             for chunk in store.chunks(channel.id):
                 beyond = max(beyond, int(store.rows(chunk, FRAME_LAYOUT.dtype)["episode"].max()) + 1)
     return beyond
+
+
+def _beyond_infos(store: PackedStore, channel: int | None) -> int:
+    """A number above those of the episodes that infos are of: the steps of some may be lost."""
+    if channel is None:
+        return 0
+    bodies = store.bodies(channel, 0, store.count(channel))
+    return max((NUMBERS.unpack_from(body)[0] + 1 for body in bodies if len(body) >= NUMBERS.size), default=0)
 
 
 def _index(
