@@ -83,6 +83,9 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         layout = StepLayout.from_metadata(steps[0].metadata)
         channels = RecordedChannels.of(evidence, layout)
         _complete(evidence, layout, channels, contents)
+        if journal is None or journal.torn:  # steps may be lost whose infos are in the file
+            beyond = _beyond_infos(evidence.store(), channels.info)
+            contents.used_episodes = max(contents.used_episodes, beyond)
         if journal is not None:
             for text in _left_out(evidence, journal, channels):
                 warn(text)
@@ -96,7 +99,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
     store = evidence.store()
     plan = make_plan(evidence, store, layout, channels)
     beyond = max((number + 1 for number in plan.records.ignored), default=0)
-    contents.used_episodes = max(beyond, _beyond_frames(evidence, store), _beyond_infos(store, channels.info))
+    contents.used_episodes = max(beyond, _beyond_frames(evidence, store))
     episodes = [e for e in plan.episodes if e.head and e.number == e.run.episode]
     made = _Made(store)
     starts = {e.number: (e.start.row, e.start.time) for e in episodes if e.start.row is not None}
