@@ -208,7 +208,8 @@ def _missing(
             ):
                 raise StorageError(
                     f"episodes of the recording {recording.uuid} are in {str(storage.root)!r} already, with other "
-                    f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong"
+                    f"contents: {name!r} differs from {recording.name!r}; delete the one that is wrong, and compact "
+                    "the storage"
                 )
     held = {number for numbers in stored_numbers.values() for number in numbers}
     missing = {uri: number for uri, number in ids.items() if number not in held}
