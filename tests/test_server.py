@@ -7,6 +7,7 @@ import base64
 import contextlib
 import hashlib
 import json
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,8 +18,6 @@ import httpx
 import jwt
 import numpy as np
 import pytest
-from pwdlib import PasswordHash
-from pwdlib.hashers.argon2 import Argon2Hasher
 from serving import PASSWORD, serving
 from test_storage import episode, query
 from typer.testing import CliRunner
@@ -451,32 +450,40 @@ def test_nothing_overtakes_the_end_of_a_sign_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
 ) -> None:
     """A request that was let in before, and is done afterwards, leaves nothing with which one is signed in."""
-    slow = PasswordHash((Argon2Hasher(time_cost=60, memory_cost=19 << 10, parallelism=1),))
-    monkeypatch.setattr(accounts, "_HASHES", slow)
+    let_in, is_over, verify = threading.Semaphore(0), threading.Event(), accounts.verify_password
+
+    def verify_slowly(*told: Any) -> bool:
+        right = verify(*told)
+        let_in.release()
+        assert is_over.wait(60)
+        return right
+
     library = Library(Settings(tmp_path))
     hashed = [accounts.hash_password(password, 8) for password in ("the old one", "the new one")]
     with library.database.writing() as connection:
         accounts.create_user(connection, "ann", hashed[0])
         ann = accounts.caller_named(connection, "ann")
     assert ann is not None
+    monkeypatch.setattr(accounts, "verify_password", verify_slowly)
     with ThreadPoolExecutor() as pool:
         begun = [
             pool.submit(library.sign_in, "ann", "the old one", "127.0.0.1"),
             pool.submit(library.change_password, ann, "ann", "a third one", old="the old one"),
         ]
-        time.sleep(0.1)
+        assert all(let_in.acquire(timeout=60) for _ in begun)
         with library.database.writing() as connection:
             if ending == "deletion":
                 accounts.delete_user(connection, "ann")
             else:
                 accounts.change_password(connection, "ann", hashed[1])
+        is_over.set()
         for each in begun:
             with pytest.raises((EndedError, NotFoundError)):
                 each.result()
     with library.database.writing() as connection:
         with pytest.raises(EndedError, match="this sign-in has ended"):
             library.tokens.create_api_token(connection, ann, "robot", "write", None)
-        assert accounts.verify_password(connection, "ann", "the new one") == (ending == "new password")
+        assert verify(connection, "ann", "the new one") == (ending == "new password")
     library.close()
 
 
