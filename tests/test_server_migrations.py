@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from postgres import Cluster
-from sqlalchemy import Boolean, MetaData, create_engine, inspect, text
+from sqlalchemy import Boolean, Engine, MetaData, create_engine, inspect, text
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import F
@@ -20,6 +23,7 @@ from tupli_mcap.server import migrations, tables
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.people import accounts
 from tupli_mcap.storage.catalog import queries, tables as catalog
+from tupli_mcap.storage.catalog.database import prepared_sqlite
 from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
@@ -149,6 +153,27 @@ def test_several_start_at_once(url: str) -> None:
         with database.reading() as connection:
             assert queries.count_episodes(connection, None) == 2
         database.close()
+
+
+def test_several_set_the_journal_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "server.sqlite"
+    with ThreadPoolExecutor(8) as pool:
+        for _ in range(150):
+            path.unlink(missing_ok=True)
+            with contextlib.closing(sqlite3.connect(path)) as connection:
+                connection.execute("CREATE TABLE first (number)")
+            engines = [
+                prepared_sqlite(create_engine(f"sqlite:///{path}"), "journal_mode = WAL") for _ in range(8)
+            ]
+            start = threading.Barrier(8)
+
+            def connect(engine: Engine, start: threading.Barrier = start) -> None:
+                start.wait()
+                engine.connect().close()
+
+            list(pool.map(connect, engines))
+            for engine in engines:
+                engine.dispose()
 
 
 def test_what_fails_in_the_middle_changes_nothing(url: str) -> None:

@@ -7,6 +7,7 @@ import functools
 import os
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -307,7 +308,7 @@ def prepared_sqlite(engine: Engine, *settings: str) -> Engine:
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
         connection.isolation_level = None  # transactions are begun below
         for setting in (f"busy_timeout = {BUSY_MS}", *settings):
-            connection.execute(f"PRAGMA {setting}")
+            _set(connection, setting)
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -316,6 +317,19 @@ def prepared_sqlite(engine: Engine, *settings: str) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
     return engine
+
+
+def _set(connection: sqlite3.Connection, setting: str) -> None:
+    """Two that change `journal_mode` at once would wait for each other; SQLite refuses one of them at once."""
+    deadline = time.monotonic() + BUSY_MS / 1000
+    while True:
+        try:
+            connection.execute(f"PRAGMA {setting}")
+            return
+        except sqlite3.OperationalError as err:
+            if err.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                raise
+        time.sleep(0.01)
 
 
 def _is_catalog(engine: Engine, path: Path) -> bool:
