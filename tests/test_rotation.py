@@ -406,6 +406,20 @@ class TestVector:
         assert set(ends_of(env.paths[:-1])) == {"terminal"}
 
 
+class TestRuns:
+    def test_all_files_of_a_series_have_the_name_of_the_first(self, tmp_path: Path) -> None:
+        path = tmp_path / "cart.mcap"
+        for _ in range(2):
+            env = RecordEpisodes(
+                gym.make("CartPole-v1"), path, mode="a", max_bytes=8000, chunk_size=1000, metadata={"lr": 1}
+            )
+            roll(env, 1000)
+            env.close()
+            assert len(env.paths) > 2
+        files = sorted(tmp_path.glob("*.mcap"))
+        assert {episode.run.name for file in files for episode in Recording(file)} == {"cart"}
+
+
 class TestStorage:
     def test_files_are_listed_when_they_are_left(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path / "lab")

@@ -165,12 +165,12 @@ class RecordedRuns(NamedTuple):
         """These runs of so many episodes, and the one that begins now.
 
         It goes on with the last one if it is of the same environment, where both are known, and the user gives it the
-        same name, metadata, tags and split, or none of them.
+        same name or none, and the same metadata, tags and split, or none of them.
         """
         last, earlier = self.runs[-1], [was for place, was in self.before if place == len(self.runs) - 1]
-        known = [_given(each) for each in (Run(), last, *earlier)]
+        known = (Run(), last, *earlier)
         alike = run.environment == last.environment or not (run.environment and last.environment)
-        if alike and _given(run) in known:
+        if alike and any(_given(replace(run, name=run.name or each.name)) == _given(each) for each in known):
             return self
         places = itertools.groupby(self.places(episodes))
         spans = [(len(list(same)), place) for place, same in places]

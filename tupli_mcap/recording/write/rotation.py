@@ -21,6 +21,7 @@ from pathlib import Path
 from tupli_mcap.errors import FormatError, RecordingError, asking, os_reason
 from tupli_mcap.files import as_file_name
 from tupli_mcap.journal.derive import LAST_ROW
+from tupli_mcap.recording.about.run import RUN_NAME, RecordedRuns, name_after
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_name, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_in_place
@@ -169,11 +170,24 @@ class Rotation:
         base = self._base
         number = max(self._number, *series(base)[1], 0) + 1  # files before it may have been moved away
         path = base.with_name(f"{base.stem}_{number:04}{base.suffix}")
+        self._options = _named_after(base, self._options)
         with self.beginning():
             writer = self._open(path, "x")
         self._paths.append(path)
         self._number = number
         return writer
+
+
+def _named_after(first: Path, options: RecordOptions) -> RecordOptions:
+    """The options of the further files of a series, whose run is called after the first one if it has no name."""
+    attachments = options.attachments or {}
+    if RUN_NAME not in attachments:
+        return options
+    media_type, data = attachments[RUN_NAME]
+    runs = RecordedRuns.from_json(data, RUN_NAME)
+    *others, last = runs.runs
+    named = runs._replace(runs=[*others, replace(last, name=last.name or name_after(first.name))])
+    return replace(options, attachments={**attachments, RUN_NAME: (media_type, named.to_json())})
 
 
 def _is_folder(path: str | os.PathLike[str]) -> bool:
