@@ -129,7 +129,7 @@ def numbers_of(kind: str, items: Any) -> Order | Sampler:
 
 @pytest.mark.parametrize("read_ahead", [0, 3])
 @pytest.mark.parametrize("kind", ["in order", "exact", "blocks", "weighted", "episodes"])
-@pytest.mark.parametrize("stop", [0, 1, 5, 12])
+@pytest.mark.parametrize("stop", [0, 1, 5, 12, 13])
 def test_a_state_goes_on_with_the_next_batch(
     dataset: TupliDataset, kind: str, read_ahead: int, stop: int
 ) -> None:

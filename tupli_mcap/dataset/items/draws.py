@@ -157,7 +157,7 @@ class Sampler:
         """Takes back batches that were drawn and not used: they come first again."""
         self._unused = [*batches, *self._unused]
 
-    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+    def state_dict(self, unused: Sequence[Array] | None = None) -> dict[str, Any]:
         """The position; weights are in it as bytes (float64), which `torch.load` also takes."""
         return {
             "kind": f"{type(self).__name__} by {self.by}",
@@ -165,7 +165,7 @@ class Sampler:
             "batch_size": self.batch_size,
             "seed": self.seed,
             "batch": self.batch,
-            "unused": [batch.tolist() for batch in (*unused, *self._unused)],
+            "unused": [batch.tolist() for batch in (*(unused or ()), *self._unused)],
             "weights": None if self._tree is None else self._tree.weights.tobytes(),
         }
 

@@ -222,7 +222,7 @@ class Batches(Generic[T]):
         self.items = items
         self.numbers = numbers
         self.read_ahead = checked_count(read_ahead, 0, "a number of batches to read ahead")
-        self._drawn: deque[tuple[Array, Future[T] | None]] = deque()
+        self._drawn: deque[tuple[Array, Future[T] | None]] | None = None  # in an iteration, what comes next
 
     def __len__(self) -> int:
         """Batches in an epoch of an `Order`.
@@ -245,21 +245,27 @@ class Batches(Generic[T]):
                         (numbers, None if pool is None else pool.submit(self.items.__getitem__, numbers))
                     )
                 if not drawn:
+                    self._drawn = None if drawn is self._drawn else self._drawn
                     return
                 numbers, future = drawn[0]
                 batch = self.items[numbers] if future is None else future.result()
                 drawn.popleft()
                 yield batch
         finally:
-            if drawn and drawn is self._drawn:
+            if drawn is self._drawn:
                 self.numbers.give_back([numbers for numbers, _ in drawn])
-                drawn.clear()
+                self._drawn = None
             if pool is not None:
                 pool.shutdown(cancel_futures=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """The position of the iteration: the next batch is the first one that was not returned."""
-        return self.numbers.state_dict([numbers for numbers, _ in self._drawn])
+        """The position of the iteration: the next batch is the first one that was not returned.
+
+        Behind the last batch of an epoch, nothing is left of that epoch; once it has ended, the next one follows.
+        """
+        return self.numbers.state_dict(
+            None if self._drawn is None else [numbers for numbers, _ in self._drawn]
+        )
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Makes the next iteration go on from a state.
@@ -268,4 +274,4 @@ class Batches(Generic[T]):
             SamplingError: it is the state of something else, or of other items.
         """
         self.numbers.load_state_dict(state)
-        self._drawn = deque()
+        self._drawn = None

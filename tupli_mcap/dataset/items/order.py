@@ -31,8 +31,9 @@ class Numbers(Protocol):
         """Takes back batches that were drawn and not used: they come first again."""
         ...
 
-    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
-        """The position, as plain numbers, strings, bytes and lists. `unused` are the last batches, to give again."""
+    def state_dict(self, unused: Sequence[Array] | None = None) -> dict[str, Any]:
+        """The position, as plain numbers, strings, bytes and lists. `unused` are the last batches, to give again; it
+        is None unless somebody draws batches early."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -122,10 +123,10 @@ class Order:
         state = self.state_dict(batches)
         self.epoch, self.batch = state["epoch"], state["batch"]
 
-    def state_dict(self, unused: Sequence[Array] = ()) -> dict[str, Any]:
+    def state_dict(self, unused: Sequence[Array] | None = None) -> dict[str, Any]:
         """The position, as plain numbers and strings. `unused` are the last batches, to give again."""
         epoch, batch = self.epoch, self.batch
-        if unused and not batch:
+        if unused is not None and not batch:  # the last batches of an epoch, even if all of them were used
             epoch, batch = epoch - 1, len(self)
         return {
             "kind": f"{type(self).__name__}, shuffle={self.shuffle}",
@@ -135,7 +136,7 @@ class Order:
             "blocks": None if self._blocks is None else self._blocks.digest,
             "seed": self.seed,
             "epoch": epoch,
-            "batch": batch - len(unused),
+            "batch": batch - len(unused or ()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
