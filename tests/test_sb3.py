@@ -25,6 +25,7 @@ from tupli_mcap import (
     open as open_dataset,
     verify_recording,
 )
+from tupli_mcap.reexecute import certify
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 pytest.importorskip("stable_baselines3")
@@ -285,6 +286,16 @@ def test_frames(tmp_path: Path) -> None:
     with VecRecordEpisodes(make_vec_env("CartPole-v1", n_envs=2), tmp_path / "run.mcap", frames=5) as venv:
         roll(venv, 20)
     assert Recording(tmp_path / "run.mcap").episodes[0].frames[0].shape == (400, 600, 3)
+
+
+def test_rewards_in_the_precision_of_a_vec_env_agree(tmp_path: Path) -> None:
+    """`DummyVecEnv` rounds rewards to float32."""
+    path = tmp_path / "run.mcap"
+    with VecRecordEpisodes(make_vec_env("Pendulum-v1", n_envs=2, seed=1), path) as venv:
+        roll(venv, 30)
+    assert certify(path).agrees
+    open_dataset(path).map(lambda episode: np.nextafter(episode.rewards, 1), tmp_path / "other.mcap")
+    assert certify(tmp_path / "other.mcap").first.leaf == "reward"
 
 
 def test_evaluation(tmp_path: Path) -> None:

@@ -73,7 +73,8 @@ class Tally:
 class Checker:
     """Compares moments with the columns of a recording.
 
-    casts: whether values were cast to the dtype of the space before they were recorded, as vector environments do.
+    casts: whether values were cast to the dtype of the space before they were recorded, as vector environments do; and
+    rewards to float32, as `DummyVecEnv` of Stable-Baselines3 does, which a recording does not say.
     """
 
     def __init__(self, layout: StepLayout, *, casts: bool) -> None:
@@ -88,7 +89,7 @@ class Checker:
         """Sets the columns to compare with; their first row is step `start`."""
         self._start = start
         self._states = [self._prepared(leaf, columns.states) for leaf in self._layout.state]
-        self._rewards = [self._prepared(leaf, columns.rewards) for leaf in self._layout.reward]
+        self._rewards = [self._prepared_reward(leaf, columns.rewards) for leaf in self._layout.reward]
         self._flags = (columns.terminals.tolist(), columns.timeouts.tolist())
 
     def state(self, step: int, state: Any, tally: Tally) -> None:
@@ -132,6 +133,16 @@ class Checker:
     def _prepared(self, leaf: Leaf, columns: Any) -> tuple[Leaf, Any, Same]:
         column = leaf.get(columns)
         return leaf, column, self._same(leaf, column)
+
+    def _prepared_reward(self, leaf: Leaf, columns: Any) -> tuple[Leaf, Any, Same]:
+        leaf, column, same = self._prepared(leaf, columns)
+        if not self._casts or leaf.kind == "variable" or self._layout.dtypes[leaf.name] != np.float64:
+            return leaf, column, same
+        return (
+            leaf,
+            column,
+            lambda i, value: same(i, value) or same(i, self._stored(leaf, np.dtype(np.float32), value)),
+        )
 
     def _same(self, leaf: Leaf, column: Any) -> Same:
         if leaf.kind == "variable":
