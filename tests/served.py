@@ -94,8 +94,8 @@ def served(directory: Path, *options: str, port: int = 0) -> Iterator[Process]:
         process.kill()
 
 
-def certificate(folder: Path) -> tuple[Path, Path]:
-    """A certificate of 127.0.0.1, and its key."""
+def certificate(folder: Path, *, of_authority: bool = False) -> tuple[Path, Path]:
+    """A certificate of 127.0.0.1, which may also sign others, as `openssl req -x509` makes it, and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
     now = datetime.datetime.now(datetime.UTC)
@@ -110,6 +110,7 @@ def certificate(folder: Path) -> tuple[Path, Path]:
         .add_extension(
             x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
         )
+        .add_extension(x509.BasicConstraints(ca=of_authority, path_length=None), critical=True)
         .sign(key, hashes.SHA256())
     )
     paths = folder / "certificate.pem", folder / "key.pem"

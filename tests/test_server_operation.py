@@ -95,6 +95,14 @@ def test_several_processes_with_a_certificate(tmp_path: Path, recording: bytes) 
     assert (fetched["status"], fetched["sent"], fetched["user"]) == (200, len(recording), "admin")
 
 
+def test_a_certificate_that_openssl_makes_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cert, key = certificate(tmp_path, of_authority=True)
+    monkeypatch.setenv("SSL_CERT_FILE", str(cert))
+    with served(tmp_path / "served", "--certificate", str(cert), "--key", str(key)) as server:
+        with pytest.raises(RecordingError, match=r"of an authority; .*CA:FALSE"):
+            Recording(f"{server.url}/run.mcap")
+
+
 def test_who_is_sending_may_finish_when_the_server_stops(tmp_path: Path, recording: bytes) -> None:
     with served(tmp_path / "served") as server:
         with httpx.Client(base_url=server.url, timeout=120) as client:

@@ -21,6 +21,11 @@ _CAUSES: Final = (
     ("ConnectionRefused", "{} refuses connections", f"check the address, or {_AGAIN}"),
     ("NetworkUnreachable", "there is no way to {}", "check the network"),
     ("HostUnreachable", "there is no way to {}", "check the network"),
+    (
+        "CaUsedAsEndEntity",
+        "the certificate of {} is that of an authority",
+        "give the server one with basicConstraints=critical,CA:FALSE",
+    ),
     ("InvalidCertificate", "the certificate of {} is not trusted here", f"check the address; {AUTHORITY}"),
     ("Content-Length", "{} does not tell how long it is", "download the file, and open that"),
     (
