@@ -33,3 +33,7 @@ def record(path: Path, gain: float, seed: int, episodes: int, **run: Any) -> Non
                 action = recorder.action_space.sample() if i % 4 == 0 else int(state[2] + gain * state[3] > 0)
                 state, _, terminated, truncated, _ = recorder.step(action)
                 done = terminated or truncated
+
+
+if __name__ == "__main__":
+    make(Path())
