@@ -269,8 +269,8 @@ class Dataset(RandomAccess):
                 is true where that is true), or a function of an `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
-            FilterError: the test names an unknown key (also of metadata), compares a key with a value that it can
-                never have, or is neither a text, an expression nor a function.
+            FilterError: the test names an unknown key (also of metadata, if nothing matches), compares a key with a
+                value that it can never have, or is neither a text, an expression nor a function.
         """
         if callable(test) and not isinstance(test, BaseFilter):
             passing = [header for header in self.headers if test(self._episode(header))]
