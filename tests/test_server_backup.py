@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,6 +140,62 @@ def test_a_backup_while_much_comes_and_goes(tmp_path: Path) -> None:
             for name in {header.recording for header in headers}:
                 assert verify_recording(tmp_path / f"backup{i}" / name).ok
             assert len(list((tmp_path / f"backup{i}").rglob("*.mcap"))) == len(headers)
+
+
+@pytest.mark.parametrize("call", ["sqlite3.connect", "os.link", "os.replace"])
+def test_a_killed_backup_is_called_again(tmp_path: Path, call: str) -> None:
+    """A new one, before and after it has a database; nothing of the killed one stays."""
+    settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
+    with signed_in(settings) as admin:
+        fill(admin)
+        before = contents(admin)
+    module, _, function = call.partition(".")
+    kill = (
+        f"import os, sys, {module}\n"
+        "from pathlib import Path\n"
+        "from tupli_mcap.server.backup import back_up\n"
+        "from tupli_mcap.server.settings import Settings\n"
+        f"{module}.{function} = {module}.dbapi2.{function} = lambda *_, **__: os.kill(os.getpid(), 9)\n"
+        "back_up(Settings(Path(sys.argv[1])), Path(sys.argv[2]))"
+    ).replace("os.dbapi2.", "os.")
+    words = [sys.executable, "-c", kill, str(settings.directory), str(backup)]
+    assert subprocess.run(words, check=False).returncode == -9
+    back_up(settings, backup)
+    assert [path.name for path in (backup / "server").iterdir()] == ["server.sqlite"]
+    with signed_in(Settings(backup)) as admin:
+        assert contents(admin) == before
+
+
+def test_backups_at_the_same_time_wait_for_each_other(tmp_path: Path) -> None:
+    settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
+    with signed_in(settings) as admin:
+        fill(admin)
+        before = contents(admin)
+        with ThreadPoolExecutor(4) as pool:
+            told = list(pool.map(lambda _: back_up(settings, backup), range(4)))
+    assert sorted(each.copied for each in told) == [0, 0, 0, 3]
+    with signed_in(Settings(backup)) as admin:
+        assert contents(admin) == before
+
+
+def test_what_a_killed_restore_has_left_is_for_the_server_to_delete(tmp_path: Path) -> None:
+    settings, backup, there = Settings(tmp_path / "served"), tmp_path / "backup", Settings(tmp_path / "there")
+    with signed_in(settings) as admin:
+        fill(admin)
+        back_up(settings, backup)
+    kill = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from tupli_mcap.server.backup import restore\n"
+        "from tupli_mcap.server.settings import Settings\n"
+        "os.link = lambda *_, **__: os.kill(os.getpid(), 9)\n"
+        "restore(Path(sys.argv[1]), Settings(Path(sys.argv[2])))"
+    )
+    words = [sys.executable, "-c", kill, str(backup), str(there.directory)]
+    assert subprocess.run(words, check=False).returncode == -9
+    left = [path.name for path in there.own.iterdir() if not path.name.startswith("server.sqlite")]
+    assert left == ["making"] and list(there.making.iterdir())
+    assert restore(backup, there).users == 1
 
 
 def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:

@@ -14,13 +14,16 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from sqlalchemy import Connection, func, inspect, select, text
 
+from tupli_mcap import files
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.server.blobs import PIECE, Blobs, LostError, blobs_of
@@ -29,7 +32,6 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, METADATA, PENDING, UPLOAD, USER
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.database import remove_database
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
 from tupli_mcap.storage.texts import unescape_text
 
@@ -59,8 +61,7 @@ def back_up(settings: Settings, target: Path) -> Copied:
             a file cannot be read.
         FormatError: a file does not have the SHA-256 in the database.
     """
-    source_blobs, target_blobs = blobs_of(settings), blobs_of(Settings(target))
-    sqlite = _sqlite_of(target)
+    source_blobs, sqlite = blobs_of(settings), _sqlite_of(target)
     if not settings.database and not _sqlite_of(settings.directory).exists():
         raise StorageError(
             f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
@@ -75,20 +76,42 @@ def back_up(settings: Settings, target: Path) -> Copied:
             f"expected a backup or nothing in {str(target)!r}, found the data of a server, or a backup that was "
             "served; choose another directory"
         )
-    new = sqlite.with_name("server.sqlite.new")  # also what an interrupted backup has left
-    if target.exists() and any(target.iterdir()) and not (sqlite.exists() or new.exists()):
+    # an interrupted backup has left one of both
+    own, new = sqlite.parent, sqlite.with_name("server.sqlite.new")
+    is_empty = not target.exists() or all(each == own and not any(own.iterdir()) for each in target.iterdir())
+    if not (is_empty or sqlite.exists() or new.exists()):
         raise StorageError(
             f"expected a backup or nothing in {str(target)!r}, found other files; choose another directory"
         )
-    sqlite.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    own.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with _alone(own):
+        return _back_up(settings, source_blobs, target, new)
+
+
+@contextlib.contextmanager
+def _alone(directory: Path) -> Iterator[None]:
+    """Waits until no other backup goes into a directory; none does within the block."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        files.hold(fd)
+        yield
+    finally:
+        os.close(fd)
+
+
+def _back_up(settings: Settings, source_blobs: Blobs, target: Path, new: Path) -> Copied:
+    """Backs up into the directory of a backup, whose next database is at `new` until it is complete."""
+    target_blobs, sqlite, making = blobs_of(Settings(target)), _sqlite_of(target), Settings(target).making
     with contextlib.closing(Database(settings.database_url, _UNLIMITED)) as source:
         for attempt in range(_ATTEMPTS):
-            remove_database(new)
+            _empty(new)
+            shutil.rmtree(making, ignore_errors=True)  # left by an interrupted backup
+            making.mkdir()
             with contextlib.closing(Database(f"sqlite:///{new}", _UNLIMITED)) as made:
                 _copy_tables(source, made)
                 contents = _contents(made)
             try:
-                copied = _copy_files(contents, source_blobs, target_blobs, sqlite.parent)
+                copied = _copy_files(contents, source_blobs, target_blobs, making)
                 break
             except LostError:
                 if attempt == _ATTEMPTS - 1:
@@ -96,11 +119,19 @@ def back_up(settings: Settings, target: Path) -> Copied:
     for suffix in ("-wal", "-shm"):
         sqlite.with_name(sqlite.name + suffix).unlink(missing_ok=True)
     new.replace(sqlite)
+    shutil.rmtree(making, ignore_errors=True)
     known = {target / name for name in contents.files}
     for path in [*(target / "artifacts").rglob("*"), *(target / "recordings").rglob("*")]:
         if path.is_file() and path not in known:
             path.unlink()  # of an earlier backup
     return copied
+
+
+def _empty(database: Path) -> None:
+    """Makes the file of a database without tables. It is there at any time, as an interrupted backup is known by it."""
+    for suffix in ("-wal", "-shm", "-journal"):  # of an interrupted backup
+        database.with_name(database.name + suffix).unlink(missing_ok=True)
+    database.write_bytes(b"")
 
 
 def restore(backup: Path, settings: Settings) -> Copied:
@@ -117,7 +148,9 @@ def restore(backup: Path, settings: Settings) -> Copied:
         )
     settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.own)))
+        # the server deletes what is left there by a killed process
+        settings.making.mkdir(exist_ok=True)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.making)))
         # a copy, because opening it upgrades the tables of an earlier version
         copy = folder / "server.sqlite"
         shutil.copyfile(_sqlite_of(backup), copy)
