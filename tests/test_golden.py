@@ -117,6 +117,26 @@ def test_reads_what_the_environment_returned(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", UNFINISHED)
+def test_what_was_killed_while_it_was_finished_can_be_finished(name: str, tmp_path: Path) -> None:
+    path = place(name, tmp_path)
+    journal = tmp_path / f"{name}.mcap.journal"
+    kept = journal.read_bytes()
+    finish_recording(path)
+    whole = path.read_bytes()
+    summary = int.from_bytes(whole[-28:-20], "little")
+    for end in (summary, len(whole) - 37):  # nothing of the summary, and all but the footer
+        path.write_bytes(whole[:end])
+        journal.write_bytes(kept)
+        report = finish_recording(path)
+        assert (report.target, report.damaged, report.finished) == (str(path), [], False)
+        assert not journal.exists()
+        with Recording(path) as recording:
+            assert recording.complete
+            assert_same(list(as_read(recording)), expected(name))
+        assert verify_recording(path).ok
+
+
+@pytest.mark.parametrize("name", UNFINISHED)
 def test_what_was_not_finished_can_be_in_its_place(name: str, tmp_path: Path) -> None:
     path = place(name, tmp_path)
     before = path.read_bytes()

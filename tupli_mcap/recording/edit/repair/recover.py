@@ -220,6 +220,8 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
         FormatError: it is no recording.
     """
     report = recover_recording(path, dry_run=True)
+    if report.damaged and not report.bytes_skipped:  # killed while it wrote the end, which holds no data
+        report.finished, report.damaged = False, []
     if report.lost or report.damaged or report.notes or report.journal not in ("none", "used"):
         raise RecordingError(
             f"{path}: something in it is lost or damaged, so it is not changed; recover it into a new file"
