@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,19 @@ def test_of_an_image_in_the_states(kind: str, shape: tuple[int, ...], tmp_path: 
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera(shape)))[1]
     assert episode.video(tmp_path / f"film{kind}").pictures == 6
     np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90, 50], atol=6)
+
+
+@pytest.mark.parametrize("kind", [".mp4", ".gif"])
+def test_of_which_the_disk_takes_no_more(kind: str, tmp_path: Path) -> None:
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[1]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))  # EFBIG, as ENOSPC from the same call
+    try:
+        with pytest.raises(RecordingError, match=rf"^{tmp_path}/film{kind} cannot be written: File too"):
+            episode.video(tmp_path / f"film{kind}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 
 
 def test_of_a_camera_or_of_an_image_by_choice(tmp_path: Path) -> None:

@@ -151,7 +151,8 @@ def write_movie(path: Path, kind: str, pictures: Iterator[Picture], count: int, 
         _write_mp4(av, path, first, rest, fps)
     except av.FFmpegError as err:
         if isinstance(err, OSError):  # a full disk, say
-            raise
+            # as a plain one, of which the name of the file can be changed
+            raise OSError(err.errno, err.strerror, str(path)) from err
         raise failed from err
 
 
