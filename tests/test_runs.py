@@ -6,6 +6,7 @@ import datetime
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -1090,6 +1091,27 @@ class TestCommands:
         assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
         command(verb, str(paths[0]), str(paths[3]), *rest, *dry)
         assert (paths[0].read_bytes() == before["a.mcap"]) == bool(dry)
+
+    def test_a_full_disk_ends_it_and_what_was_changed_is_named(self, tmp_path: Path) -> None:
+        paths = [record(tmp_path / f"{name}.mcap") for name in "ab"]
+        with RecordEpisodes(gym.make("CartPole-v1"), paths[1], mode="a") as env:
+            for seed in range(50):
+                env.reset(seed=seed)
+                while not any(env.step(seed % 2)[2:4]):
+                    pass
+        before = paths[1].read_bytes()
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        limit = paths[0].stat().st_size + 2000
+        assert limit < len(before)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))  # EFBIG, as ENOSPC from the same call
+        try:
+            result = CliRunner().invoke(app, ["tag", *map(str, paths), "--episodes", "all", "good=true"])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert result.exit_code == 1
+        assert result.stderr.startswith(f"error: {paths[1]}") and "File too large" in result.stderr
+        assert result.stderr.endswith(f"; changed before that: {paths[0]}\n")
+        assert Recording(paths[0]).annotations.said and paths[1].read_bytes() == before
 
     def test_a_recording_is_named_as_it_was_given(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

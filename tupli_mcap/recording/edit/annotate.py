@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from tupli_mcap.errors import Gathered, RecordingError, warn
+from tupli_mcap.errors import Gathered, RecordingError, TupliError, warn
 from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
     ANNOTATIONS_NAME,
@@ -165,6 +165,8 @@ def change_all(
 ) -> list[_Change]:
     """Changes several recordings, or none of them if one cannot be changed; returns what `change` returned of each.
 
+    What only shows while they are changed, such as a full disk, ends it; the error names those that were changed.
+
     Args:
         change: takes a path, and whether it is a dry run, in which it raises the errors of the change itself.
         gathered: errors of other recordings that were to be changed, too.
@@ -182,7 +184,18 @@ def change_all(
             with gathered.keep():
                 found.append(change(path, True))
     gathered.raise_all()
-    return found if dry_run else [change(path, False) for path in paths]
+    if dry_run:
+        return found
+    found = []
+    for path in paths:
+        try:
+            found.append(change(path, False))
+        except TupliError as err:
+            if not found:
+                raise
+            changed = ", ".join(map(str, paths[: len(found)]))
+            raise type(err)(f"{err}; changed before that: {changed}") from err
+    return found
 
 
 def _places(path: str | os.PathLike[str], recording: Recording, runs: Sequence[int] | None) -> Sequence[int]:
