@@ -196,6 +196,28 @@ def test_infos_and_metadata_are_those_of_their_steps(tmp_path: Path, infos: Info
             assert set(info) <= {"n", "TimeLimit.truncated", "elapsed_steps", "_elapsed_steps", "reconfigure"}
 
 
+def test_infos_of_ale_at_an_end_are_those_of_the_reset(tmp_path: Path) -> None:
+    ale = pytest.importorskip("ale_py.vector_env")
+    mode = gym.vector.AutoresetMode.SAME_STEP
+    inner = ale.AtariVectorEnv("breakout", 2, autoreset_mode=mode, episodic_life=True)
+    told: list[list[int]] = [[], []]  # in the batches that ended an episode
+    with RecordEpisodes(inner, tmp_path / "r.mcap", record_info=["frame_number"]) as env:
+        env.action_space.seed(0)
+        env.reset(seed=1)
+        for _ in range(60):
+            _, _, terminals, _, infos = env.step(env.action_space.sample())
+            assert "final_info" not in infos
+            for i in np.flatnonzero(terminals):
+                told[i].append(int(infos["frame_number"][i]))
+    assert all(told)
+    with Recording(tmp_path / "r.mcap") as recording:
+        for i in range(2):
+            first, *others = [episode for episode in recording.episodes if episode.env == i]
+            assert [episode.reset_info["frame_number"] for episode in others] == told[i][: len(others)]
+            assert first.infos is not None
+            assert not first.infos[-1] and first.infos[-2]
+
+
 def test_a_dict_of_final_states(tmp_path: Path) -> None:
     """As ManiSkill gives those of an environment whose observations are dicts."""
 

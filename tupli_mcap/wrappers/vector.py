@@ -115,6 +115,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         self._watches = options.has_callbacks
         watch = [RecordEpisodes._watch] * options.has_callbacks + [RecordEpisodes._film] * bool(options.every)
         self._parts = (*watch, RecordEpisodes._end, RecordEpisodes._go_on)
+        self._is_ale = type(env.unwrapped).__module__ == "ale_py.vector_env"
         spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
         self._open(path, options, spaces, n)
 
@@ -130,11 +131,15 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         work.state = BEGUN
         try:
             result = self.env.step(actions)
-            states, rewards, terminals, timeouts, infos = result
+            states, rewards, terminals, timeouts, infos = told = result
         except BaseException:  # some sub-environments may have taken the step
             self._recorder.refuse()
             work.state = DONE
             raise
+        if self._is_ale and "final_obs" in infos:
+            # of those that ended, the other infos are of the reset, and no `final_info` says so
+            infos = {**infos, "final_info": {}}
+            told = states, rewards, terminals, timeouts, infos
         try:
             stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
         except StepError:
@@ -143,7 +148,7 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         except BaseException as err:
             self._writer.stop(err)
             raise
-        refusal = self._finish_step((stepped, actions), result)
+        refusal = self._finish_step((stepped, actions), told)
         work.finish()
         if self._autoreset.doubt:
             doubt, self._autoreset.doubt = self._autoreset.doubt, ""
