@@ -636,6 +636,34 @@ def test_an_environment_of_the_other_kind_is_told_its_class(tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
+def test_a_vector_environment_that_is_also_a_single_one_is_a_vector_one(tmp_path: Path) -> None:
+    """As EnvPool's are."""
+
+    class Both(Batches, gym.Env[Any, Any]): ...
+
+    with pytest.raises(RecordingError, match=r"vector environment Both; use tupli_mcap\.vector\.RecordE"):
+        RecordSingle(Both(), tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_infos_where_the_spaces_are_those_of_one_sub_environment(tmp_path: Path) -> None:
+    """As EnvPool's are."""
+    inner = Batches(lambda: {"n": np.arange(N)})
+    inner.observation_space, inner.action_space = inner.single_observation_space, inner.single_action_space
+    seen: list[tuple[Any, Any]] = []
+    with RecordEpisodes(
+        inner,
+        tmp_path / "r.mcap",
+        record_info=True,
+        step_callback=lambda step: seen.append((step.state.tolist(), int(step.action))) or {},
+    ) as env:
+        env.reset()
+        env.step(np.arange(N))
+    assert seen == [([0, 0], i) for i in range(N)]
+    with Recording(tmp_path / "r.mcap") as recording:
+        assert [episode.infos for episode in recording.episodes] == [[{"n": i}] for i in range(N)]
+
+
 def test_an_environment_without_the_spaces_of_one_is_told_so(tmp_path: Path) -> None:
     """As SuperSuit's are."""
 

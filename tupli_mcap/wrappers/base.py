@@ -234,7 +234,8 @@ def drawn_seed(env: gym.Env[Any, Any]) -> int | None:
 def check_kind(env: object, *, vector: bool) -> None:
     """Raises RecordingError unless an environment is Gymnasium's, and single or a vector one as expected; the latter
     must say the spaces of one sub-environment."""
-    if not isinstance(env, gym.vector.VectorEnv if vector else gym.Env):
+    is_vector = isinstance(env, gym.vector.VectorEnv)  # EnvPool's are also a gym.Env
+    if is_vector is not vector or not (vector or isinstance(env, gym.Env)):
         raise wrong_kind(env, "a vector environment" if vector else "a single environment")
     for name in ("single_observation_space", "single_action_space") if vector else ():
         if not hasattr(env, name):
@@ -248,10 +249,10 @@ def wrong_kind(env: object, expected: str) -> RecordingError:
     """The error for an object that is no environment, or is one of the other kind; it names the right recorder."""
     libraries = {cls.__module__.partition(".")[0] for cls in type(env).__mro__}
     name = type(env).__name__
-    if isinstance(env, gym.Env):
-        found = f"the single environment {name}; use tupli_mcap.RecordEpisodes"
-    elif isinstance(env, gym.vector.VectorEnv):
+    if isinstance(env, gym.vector.VectorEnv):
         found = f"the vector environment {name}; use tupli_mcap.vector.RecordEpisodes"
+    elif isinstance(env, gym.Env):
+        found = f"the single environment {name}; use tupli_mcap.RecordEpisodes"
     elif "stable_baselines3" in libraries:
         found = f"the VecEnv {name} of Stable-Baselines3; use tupli_mcap.sb3.VecRecordEpisodes"
     elif "pettingzoo" in libraries:

@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector.utils import iterate
+from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import SpaceError, StepError, warn
@@ -117,6 +117,9 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         self._parts = (*watch, RecordEpisodes._end, RecordEpisodes._go_on)
         self._is_ale = type(env.unwrapped).__module__ == "ale_py.vector_env"
         spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
+        # the environment's own `observation_space` may be that of one sub-environment, as EnvPool's is
+        self._observations = batch_space(spaces.observation_space, n)
+        self._actions = batch_space(spaces.action_space, n)
         self._open(path, options, spaces, n)
 
     def _recorder_of(self, writer: RecordingWriter) -> VectorRecorder:
@@ -270,13 +273,13 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
 
     def _each_state(self, states: Any) -> list[Any]:
         """A copy: the environments may reuse their arrays."""
-        return copy.deepcopy(list(iterate(self.env.observation_space, states)))
+        return copy.deepcopy(list(iterate(self._observations, states)))
 
     def _asked(self, before: Any, stepped: Any, actions: Any, result: Any) -> list[dict[str, Any]]:
         """The infos to record, by sub-environment; puts metadata into `_texts`."""
         _, rewards, terminals, timeouts, infos = result
         entries: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        chosen = list(iterate(self.env.action_space, actions))
+        chosen = list(iterate(self._actions, actions))
         taken, n = np.flatnonzero(stepped).tolist(), self.num_envs
         found = dict(zip(taken, infos_of(infos, taken, n), strict=True))
         if self._autoreset.mode == "SameStep" and (ended := self._recorder.ended):
