@@ -17,6 +17,7 @@ import httpx
 import numpy as np
 import pytest
 from serving import PASSWORD, serving
+from test_server import token_of
 
 from tupli_mcap import RecordEpisodes, Recording
 from tupli_mcap.errors import StorageError
@@ -117,6 +118,37 @@ def test_a_recording_comes_back_bit_for_bit_in_any_part(place: RunningServer, la
             str(size),
             tag,
         )
+
+
+own_bytes = pytest.mark.parametrize("place", ["directory", "bucket"], indirect=True)
+"""Where the server sends them itself."""
+
+
+@own_bytes
+@pytest.mark.parametrize("asked", ["items=0-1", "bytes=3-1", "bytes=0-1,3-4", "bytes=a-b", "bytes=-", ""])
+def test_what_is_no_single_range_counts_as_none(place: RunningServer, asked: str) -> None:
+    item = place.admin.store_artifact(b"gusts", ArtifactMetadata(name="wind"))
+    token = token_of(place.admin)
+    answer = httpx.get(f"{place.url}/v1/artifacts/{item.id}", headers={"Range": asked, **token})
+    assert (answer.status_code, answer.content) == (200, b"gusts")
+
+
+@own_bytes
+def test_a_range_beyond_the_end_is_refused_as_every_request_is(place: RunningServer) -> None:
+    item = place.admin.store_artifact(b"gusts", ArtifactMetadata(name="wind"))
+    headers = {"Range": "bytes=5-", **token_of(place.admin)}
+    answer = httpx.get(f"{place.url}/v1/artifacts/{item.id}", headers=headers)
+    assert (answer.status_code, answer.headers["Content-Range"]) == (416, "bytes */5")
+    assert answer.json() == {"detail": "expected a range of 5 bytes", "error": "StorageError"}
+
+
+@own_bytes
+@pytest.mark.parametrize("form", ["{}", "W/{}", '"another", {}', "*"])
+def test_a_version_that_the_caller_has_is_not_sent(place: RunningServer, form: str) -> None:
+    item = place.admin.store_artifact(b"gusts", ArtifactMetadata(name="wind"))
+    headers = {"If-None-Match": form.format(f'"{item.id}"'), **token_of(place.admin)}
+    answer = httpx.get(f"{place.url}/v1/artifacts/{item.id}", headers=headers)
+    assert (answer.status_code, answer.content) == (304, b"")
 
 
 def test_nothing_is_left_of_what_is_deleted(place: RunningServer, large: Path) -> None:

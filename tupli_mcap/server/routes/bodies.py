@@ -17,6 +17,7 @@ from urllib.parse import quote
 from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
 from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from tupli_mcap.page.answers import attachment
 from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, lost
@@ -33,7 +34,7 @@ BODY: Final = {
     307: {"description": "The bytes are at another address."},
 }
 """The part of the OpenAPI document for the answers of `body_of`."""
-_RANGE: Final = re.compile(r"bytes=(\d{0,19})-(\d{0,19})")
+_RANGE: Final = re.compile(r"bytes=(\d{0,19})-(\d{0,19})", re.IGNORECASE)
 
 
 def body_of(
@@ -56,7 +57,7 @@ def body_of(
     """
     blobs, settings = library.blobs, library.settings
     tag = f'"{digest}"'
-    if request.headers.get("If-None-Match") == tag:
+    if _is_among(tag, request.headers.get("If-None-Match", "").replace("W/", "")):
         return Response(status_code=304, headers={"ETag": tag})
     is_bucket = isinstance(blobs, BucketBlobs)
     if isinstance(blobs, BucketBlobs) and settings.presigned and request.method == "GET" and not headers:
@@ -71,15 +72,21 @@ def body_of(
         return Response(headers=told, media_type=MEDIA)
     _check_version(request, tag)
     headers = {**(headers or {}), "ETag": tag, **named}
+    part = _range(request, tag, size)
     if not is_bucket:
-        return _File(blobs.place(name), headers=headers, media_type=MEDIA)
-    return _from_bucket(blobs, request, name, size, tag, headers)
+        sent = _File if part else _WholeFile
+        return sent(blobs.place(name), headers=headers, media_type=MEDIA)
+    return _from_bucket(blobs, request, name, size, part, headers)
 
 
 def _from_bucket(
-    blobs: Blobs, request: Request, name: str, size: int, tag: str, headers: dict[str, str]
+    blobs: Blobs,
+    request: Request,
+    name: str,
+    size: int,
+    part: tuple[int, int] | None,
+    headers: dict[str, str],
 ) -> Response:
-    part = _range(request, tag, size)
     start, stop = part or (0, size)
     headers |= {"Content-Length": str(stop - start), "Accept-Ranges": "bytes"}
     if part:
@@ -96,6 +103,14 @@ class _File(FileResponse):
     chunk_size = 1 << 18  # larger ones are kept by the allocator, for each thread
 
 
+class _WholeFile(_File):
+    """A file, whatever range the request names: one that is not valid, or several, count as none (RFC 9110)."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]
+        await super().__call__({**scope, "headers": headers}, receive, send)
+
+
 async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) -> AsyncIterator[bytes]:
     yield first
     for begin in range(start + PIECE, stop, PIECE):
@@ -104,16 +119,22 @@ async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) 
 
 def _check_version(request: Request, tag: str) -> None:
     wanted = request.headers.get("If-Match")
-    if wanted is not None and wanted.strip() != "*" and tag not in map(str.strip, wanted.split(",")):
+    if wanted is not None and not _is_among(tag, wanted):
         raise HTTPException(412, "this has changed; open it again")
 
 
+def _is_among(tag: str, wanted: str) -> bool:
+    return wanted.strip() == "*" or tag in map(str.strip, wanted.split(","))
+
+
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
-    """The requested range of bytes; None for all."""
+    """The requested range of bytes; None for all, which also answers what is no valid range, and several ones."""
     found = _RANGE.fullmatch(request.headers.get("Range", "").strip())
     if found is None or not any(found.groups()) or request.headers.get("If-Range", tag) != tag:
         return None
     first, last = found.groups()
+    if first and last and int(first) > int(last):
+        return None
     start = int(first) if first else max(0, size - int(last))
     stop = min(int(last) + 1, size) if first and last else size
     if start >= size or start >= stop:
