@@ -233,10 +233,29 @@ def test_lists_come_in_pages(tmp_path: Path) -> None:
             answer = httpx.post(f"{admin.url}/v1/benchmarks/list", json=told, headers=token_of(admin)).json()
             return [benchmarks.index(item["id"]) for item in answer["items"]], answer["next"]
 
-        assert page({}) == ([0, 1, 2], "3")
-        assert page({"cursor": "3", "limit": 2}) == ([3, 4], "5")
-        assert page({"cursor": "6", "limit": 1000}) == ([6], None)
+        first, cursor = page({})
+        assert first == [0, 1, 2]
+        second, cursor = page({"cursor": cursor, "limit": 2})
+        assert second == [3, 4]
+        assert page({"cursor": cursor, "limit": 1000}) == ([5, 6], None)
         assert page({"offset": 2, "limit": 0}) == ([], None)
+
+
+def test_a_page_lacks_nothing_where_items_are_deleted_meanwhile(tmp_path: Path) -> None:
+    with server_with(tmp_path / "served") as admin:
+        ids = [admin.store_artifact(b"%d" % i, ArtifactMetadata(name=f"a{i}")).id for i in range(6)]
+
+        def page(cursor: str | None) -> Any:
+            told = {"limit": 2, "cursor": cursor}
+            url = f"{admin.url}/v1/artifacts/list"
+            answer = httpx.post(url, json=told, headers=token_of(admin)).json()
+            return [ids.index(item["id"]) for item in answer["items"]], answer["next"]
+
+        first, cursor = page(None)
+        admin.delete_artifact(ids[0])
+        admin.delete_artifact(ids[1])  # the one that the cursor names
+        second, cursor = page(cursor)
+        assert (first, second, page(cursor)) == ([0, 1], [2, 3], ([4, 5], None))
 
 
 @pytest.mark.parametrize("with_tuples", [False, True])

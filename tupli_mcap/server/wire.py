@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import json
 import math
 import re
@@ -27,7 +28,13 @@ from tupli_mcap.errors import (
 )
 from tupli_mcap.page.answers import error_page, wants_page
 from tupli_mcap.recording.edit.merge import UnmergeableError
-from tupli_mcap.schema import ArtifactMetadata, BaseFilter, parse_filter
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    ArtifactMetadataItem,
+    BaseFilter,
+    BenchmarkHeader,
+    parse_filter,
+)
 from tupli_mcap.server.blobs import LostError
 from tupli_mcap.server.database import DiskFullError, TooLongError, UnavailableError
 from tupli_mcap.server.people.access import DeniedError
@@ -36,12 +43,14 @@ from tupli_mcap.server.people.limits import FullError, TooManyError
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
+from tupli_mcap.storage.base import age
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.texts import first_defect
 
 _MOST_VALUES: Final = 20_000
 _LONGEST_TEXT: Final = 20_000  # characters of a filter
 _MOST_METADATA: Final = 64 << 10  # bytes of JSON
+_CURSOR: Final = re.compile("([0-9]{1,20})-([0-9a-f]{64})")
 _MOST_OFFSET: Final = 1 << 53  # larger numbers in JSON are not exact in all programs
 
 _STATUS: Final[dict[type[TupliError], int]] = {
@@ -177,13 +186,20 @@ def listed(items: Iterable[BaseModel], following: str | None = None) -> Response
     return answer({"items": list(items), "next": following})
 
 
-def paged(items: Sequence[BaseModel], told: Listing, most: int) -> Response:
-    """A page of a list that is complete in memory."""
-    if told.cursor is not None and not re.fullmatch("[0-9]{1,18}", told.cursor):
-        raise StorageError("expected the cursor of the page before; list from the beginning")
-    start = told.offset + int(told.cursor or 0)
+def paged(
+    items: Sequence[BenchmarkHeader] | Sequence[ArtifactMetadataItem], told: Listing, most: int
+) -> Response:
+    """A page of a list that is complete in memory, oldest first. Its cursor names the last item, and not how many there
+    were: one of them may be deleted before the next page."""
+    start = told.offset
+    if told.cursor is not None:
+        last = _CURSOR.fullmatch(told.cursor)
+        if last is None:
+            raise StorageError("expected the cursor of the page before; list from the beginning")
+        start += bisect.bisect_right(items, (int(last[1]), last[2]), key=age)
     stop = start + (most if told.limit is None else min(told.limit, most))
-    return listed(items[start:stop], str(stop) if start < stop < len(items) else None)
+    more = start < stop < len(items)
+    return listed(items[start:stop], "{}-{}".format(*age(items[stop - 1])) if more else None)
 
 
 def _as_json(value: Any) -> Any:

@@ -297,7 +297,12 @@ def with_tuples(
 
 def oldest_first(items: Iterable[_Item]) -> list[_Item]:
     """Sorts benchmarks or artifacts by the time of their creation."""
-    return sorted(items, key=lambda item: (time_ns(item.created_at) or 0, item.id))
+    return sorted(items, key=age)
+
+
+def age(item: BenchmarkHeader | ArtifactMetadataItem) -> tuple[int, str]:
+    """What a benchmark or an artifact is sorted by: its time in nanoseconds, and its id."""
+    return time_ns(item.created_at) or 0, item.id
 
 
 def new_name(name: str = "") -> str:
