@@ -219,6 +219,26 @@ def test_a_body_of_many_defects_is_refused_at_the_first_one(
         assert len(refused.json()["detail"]) <= 3  # of one item
 
 
+@pytest.mark.parametrize(
+    ("body", "media", "why"),
+    [
+        (
+            b'{"limit": 2}',
+            "application/x-www-form-urlencoded",
+            "and Content-Type: application/json, found appl",
+        ),
+        (b"", None, "and Content-Type: application/json, found none"),
+        (b'{"limit": ', "application/json", "found a mistake at character 10: Expecting value"),
+    ],
+)
+def test_a_body_that_is_no_json_is_told_why(tmp_path: Path, body: bytes, media: str | None, why: str) -> None:
+    with server_with(tmp_path / "served") as admin:
+        headers = {**token_of(admin), **({"Content-Type": media} if media else {})}
+        answer = httpx.post(f"{admin.url}/v1/episodes/list", content=body, headers=headers)
+        assert answer.status_code == 400
+        assert answer.json()["detail"].startswith(f"expected JSON as the body, {why}")
+
+
 def test_lists_come_in_pages(tmp_path: Path) -> None:
     with server_with(tmp_path / "served", max_page=3) as admin:
         benchmarks = [admin.store_benchmark(query(name=f"b{i}")).id for i in range(7)]

@@ -229,6 +229,18 @@ class _Refusal(JSONResponse):
         return json.dumps(content).encode()
 
 
+def _defect(request: Request, found: dict[str, Any]) -> str:
+    """What is wrong with a request, in words."""
+    kind, (part, *inside) = found["type"], found["loc"]
+    media = request.headers.get("Content-Type", "none")
+    if kind == "json_invalid":
+        return f"expected JSON as the body, found a mistake at character {inside[0]}: {found['ctx']['error']}"
+    if part == "body" and not inside and "json" not in media:
+        return f"expected JSON as the body, and Content-Type: application/json, found {media:.80}"
+    what = "there is no such field" if kind == "extra_forbidden" else found["msg"]
+    return f"expected another request: {'.'.join(map(str, inside)) or 'its body'}: {what}"
+
+
 def tell_errors(app: FastAPI) -> None:
     """Makes the application answer errors of this package, and invalid requests."""
 
@@ -237,11 +249,7 @@ def tell_errors(app: FastAPI) -> None:
         defects = [{name: each[name] for name in ("type", "loc", "msg")} for each in err.errors()]
         if not request.url.path.startswith("/v1/"):  # PyTupli's client expects this form
             return _Refusal({"detail": defects}, 422)
-        where = ".".join(str(part) for part in defects[0]["loc"][1:])
-        is_unknown = defects[0]["type"] == "extra_forbidden"
-        what = "there is no such field" if is_unknown else defects[0]["msg"]
-        detail = f"expected another request: {where or 'its body'}: {what}"
-        return _Refusal({"detail": detail, "error": "StorageError"}, 400)
+        return _Refusal({"detail": _defect(request, err.errors()[0]), "error": "StorageError"}, 400)
 
     @app.exception_handler(HTTPException)
     async def _tell_refusal(request: Request, err: HTTPException) -> Response:
